@@ -1,0 +1,1 @@
+"""The rig as a whole: operator, recorder, report, launch files, configuration."""

@@ -1,0 +1,1 @@
+"""What every node and command of the rig shares: parameters, diagnostics, error exits."""

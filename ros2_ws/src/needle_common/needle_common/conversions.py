@@ -1,0 +1,61 @@
+"""ROS time, quality of service and diagnostics, to and from plain data."""
+
+from __future__ import annotations
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from needle_common.diagnostics import Diagnostic
+
+NANOSECONDS = 1_000_000_000
+
+RELIABLE = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE
+)
+# A lock-step simulation sends the 25 joint states of a step at once: more than a depth of 10 keeps.
+JOINT_STATES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.RELIABLE
+)
+LATCHED = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST,
+    depth=1,
+    reliability=ReliabilityPolicy.RELIABLE,
+    durability=DurabilityPolicy.TRANSIENT_LOCAL,
+)
+HOLD = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+IMAGES = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.RELIABLE
+)
+IMAGES_BEST_EFFORT = QoSProfile(
+    history=HistoryPolicy.KEEP_LAST, depth=2, reliability=ReliabilityPolicy.BEST_EFFORT
+)
+
+
+def to_nanoseconds(stamp: Time) -> int:
+    """Return a message's stamp in ns since the clock's epoch, exactly."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def to_stamp(nanoseconds: int) -> Time:
+    """Return the message stamp of a time in ns since the clock's epoch."""
+    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    return Time(sec=sec, nanosec=nanosec)
+
+
+def to_diagnostic_status(name: str, hardware_id: str, diagnostic: Diagnostic) -> DiagnosticStatus:
+    """Return the message of one line of health; `name` is `node: part`."""
+    return DiagnosticStatus(
+        level=bytes([diagnostic.level]),
+        name=name,
+        message=diagnostic.message,
+        hardware_id=hardware_id,
+        values=[KeyValue(key=key, value=value) for key, value in diagnostic.values.items()],
+    )
+
+
+def values_of(status: DiagnosticStatus) -> dict[str, str]:
+    """Return the key-value pairs of a DiagnosticStatus as a dictionary."""
+    return {pair.key: pair.value for pair in status.values}

@@ -1,0 +1,31 @@
+"""The exceptions a user of the rig can meet, each with the value and the bound in it."""
+
+from __future__ import annotations
+
+
+class UserError(Exception):
+    """A bad argument, file or set-up that one line explains; commands exit with code 2."""
+
+
+class OutOfBoundsError(UserError, ValueError):
+    """A value outside its bounds.
+
+    Parameters
+    ----------
+    name : str
+        What the value is called where the user wrote it.
+    value : float
+        The offending value, in `unit`.
+    lower, upper : float
+        The inclusive bounds, in `unit`.
+    unit : str
+        The unit of all three ("-" where there is none).
+    """
+
+    def __init__(self, name: str, value: float, lower: float, upper: float, unit: str) -> None:
+        super().__init__(f"{name} = {value:g} {unit} is outside [{lower:g}, {upper:g}] {unit}")
+        self.name = name
+        self.value = value
+        self.lower = lower
+        self.upper = upper
+        self.unit = unit

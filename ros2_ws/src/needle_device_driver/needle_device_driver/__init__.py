@@ -1,0 +1,1 @@
+"""Motion supervisor of the insertion and rotation axes: states, limits, hold, stop."""

@@ -1,0 +1,1 @@
+"""Stands in for the rig: needle plant, tissue, stereo renderer, simulated axes."""
