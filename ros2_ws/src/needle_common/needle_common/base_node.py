@@ -11,6 +11,7 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE
@@ -68,6 +69,7 @@ def run_node(
     parameters: type,
     args: list[str] | None = None,
     spin: Callable[[Node], int] | None = None,
+    signal_handlers: SignalHandlerOptions = SignalHandlerOptions.ALL,
 ) -> int:
     """Run a node until a signal ends it; `--help` explains it instead.
 
@@ -83,6 +85,8 @@ def run_node(
         Command line with the program's name; sys.argv by default.
     spin : callable, optional
         Takes the node, runs it and returns the exit code; by default spins until shut down.
+    signal_handlers : SignalHandlerOptions, optional
+        rclpy's handlers; NO for a node that has last messages to send and handles signals itself.
 
     Returns
     -------
@@ -99,7 +103,7 @@ def run_node(
         print(f"error: unknown argument {own[0]!r}; see --help", file=sys.stderr)
         return EXIT_BAD_INPUT
     try:
-        rclpy.init(args=argv)
+        rclpy.init(args=argv, signal_handler_options=signal_handlers)
     # rclpy raises its own private types for a bad command line
     except Exception as error:  # noqa: BLE001
         print(f"error: {_first_line(error)}", file=sys.stderr)
@@ -122,7 +126,11 @@ def run_node(
 def _spin(node: Node) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    executor.spin()
+    try:
+        executor.spin()
+    finally:
+        # An executor that outlives the context complains when it is collected.
+        executor.shutdown()
     return EXIT_DONE
 
 

@@ -1,0 +1,206 @@
+"""The `operator` executable: keeps the hold in simulation, in a person's stead."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.client import Client
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rclpy.task import Future
+from sensor_msgs.msg import Joy
+from std_srvs.srv import SetBool, Trigger
+
+from needle_bringup.operator_parameters import OperatorParameters
+from needle_bringup.operator_sequence import (
+    DISABLE,
+    PREPARATION,
+    OperatorSequence,
+    ServiceCall,
+)
+from needle_bringup.progress import Progress
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_common.conversions import HOLD, LATCHED, to_stamp, values_of
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.parameters import NodeParameters
+
+HELP = """\
+operator: stands in for the person who holds the needle's switch, in simulation.
+
+Confirms that the needle is out, homes, enables, starts the controller, then keeps the hold until
+the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Draws the
+progress. Never use it on a rig that moves a real needle: there a person holds.
+
+Publishes   device/hold
+Subscribes  needle/controller_status, device/status
+Calls       device/confirm_needle_out, device/home, device/enable, plane_controller/start
+Exit code   0 when the depth was reached, 1 otherwise, 2 for bad parameters, 130 when interrupted
+"""
+
+DISABLE_TIMEOUT = 1.0
+RELEASES = 3
+
+
+class OperatorNode(Node):
+    """Shell around `OperatorSequence`: calls what it asks for and tells it what was heard."""
+
+    def __init__(self) -> None:
+        super().__init__("operator")
+        self._parameters = NodeParameters(self, OperatorParameters)
+        values = self._parameters.values
+        self._sequence = OperatorSequence(
+            time.monotonic(), wait_timeout=values.wait_timeout, stall_timeout=values.stall_timeout
+        )
+        self._progress = Progress(sys.stderr)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._service_clients: dict[str, Client[Any, Any]] = {
+            call.service: self.create_client(
+                Trigger if call.data is None else SetBool, call.service
+            )
+            for call in PREPARATION
+        }
+        self._last_stamp = 0
+        self._hold = self.create_publisher(Joy, "device/hold", HOLD)
+        self._controller_status = self.create_subscription(
+            DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
+        )
+        self._device_status = self.create_subscription(
+            DiagnosticStatus, "device/status", self._on_device_status, LATCHED
+        )
+        # The hold must not follow simulated time: steady clock.
+        self.create_timer(1.0 / values.hold_rate, self._on_timer, clock=STEADY_CLOCK)
+
+    @property
+    def ended(self) -> bool:
+        """Whether the run is over, by success, failure or signal."""
+        return self._sequence.outcome is not None
+
+    def interrupt(self) -> None:
+        """End the run at the next turn of the loop."""
+        self._sequence.interrupt()
+
+    def finish(self, executor: SingleThreadedExecutor) -> int:
+        """Release the hold, disable the drives, say how it went; returns the exit code."""
+        outcome = self._sequence.outcome
+        assert outcome is not None
+        disabled: Future[Any] | None = None
+        if self._sequence.touched:
+            self._send_hold(pressed=False)
+            disabled = self._call(DISABLE)
+            # The hold is best effort: a release worth sending is worth sending again.
+            for _ in range(RELEASES - 1):
+                executor.spin_once(timeout_sec=0.02)
+                self._send_hold(pressed=False)
+        deadline = time.monotonic() + DISABLE_TIMEOUT
+        while disabled is not None and not disabled.done() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.05)
+        self._progress.close(f"operator: {outcome.reason}")
+        if outcome.interrupted:
+            return EXIT_INTERRUPTED
+        return EXIT_DONE if outcome.done else EXIT_MISSED
+
+    def _on_timer(self) -> None:
+        if self._sequence.hold:
+            self._send_hold(pressed=True)
+        else:
+            self._sequence.see_missing(self._missing())
+        self._sequence.check_time(time.monotonic())
+        self._advance()
+
+    def _advance(self) -> None:
+        call = self._sequence.next_call(time.monotonic())
+        if call is not None:
+            self._call(call).add_done_callback(self._on_answer)
+        self._report()
+
+    def _on_answer(self, future: Future[Any]) -> None:
+        answer = future.result()
+        if answer is not None:
+            self._sequence.take_answer(answer.success, answer.message, time.monotonic())
+            self._advance()
+
+    def _on_controller_status(self, message: DiagnosticStatus) -> None:
+        self._sequence.see_controller(values_of(message), time.monotonic())
+        if self._sequence.steering and self._sequence.depth is not None:
+            self._progress.show(self._sequence.insertion, self._sequence.depth)
+
+    def _on_device_status(self, message: DiagnosticStatus) -> None:
+        self._sequence.see_device(values_of(message))
+        self._advance()
+
+    def _missing(self) -> list[str]:
+        missing = [
+            f"service {name}"
+            for name, client in self._service_clients.items()
+            if not client.service_is_ready()
+        ]
+        for subscription in (self._controller_status, self._device_status):
+            if not subscription.get_publisher_count():
+                missing.append(f"publisher of {subscription.topic_name}")
+        if not self._hold.get_subscription_count():
+            missing.append("subscriber of device/hold")
+        return missing
+
+    def _call(self, call: ServiceCall) -> Future[Any]:
+        request = Trigger.Request() if call.data is None else SetBool.Request(data=call.data)
+        return self._service_clients[call.service].call_async(request)
+
+    def _send_hold(self, *, pressed: bool) -> None:
+        # Stamps must increase whatever the system clock does.
+        self._last_stamp = max(time.time_ns(), self._last_stamp + 1)
+        message = Joy()
+        message.header.stamp = to_stamp(self._last_stamp)
+        message.header.frame_id = self.get_name()
+        message.axes = [self._parameters.values.speed_scale if pressed else 0.0]
+        message.buttons = [int(pressed)]
+        self._hold.publish(message)
+
+    def _report(self) -> None:
+        if self._sequence.hold:
+            message = "the hold is pressed"
+        elif self.ended:
+            message = "the hold is released"
+        else:
+            message = "prepares the rig"
+        self._diagnostics.set("hold", Diagnostic(Level.OK, message))
+
+
+def main() -> int:
+    """Run the operator; returns its exit code."""
+    signalled = False
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        nonlocal signalled
+        signalled = True
+
+    # rclpy's own handlers would shut the context down before the release could go out.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, on_signal)
+
+    def spin(node: Node) -> int:
+        assert isinstance(node, OperatorNode)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            while not node.ended:
+                if signalled:
+                    node.interrupt()
+                executor.spin_once(timeout_sec=0.05)
+            return node.finish(executor)
+        finally:
+            executor.shutdown()
+
+    return run_node(
+        OperatorNode,
+        help_text=HELP,
+        parameters=OperatorParameters,
+        spin=spin,
+        signal_handlers=SignalHandlerOptions.NO,
+    )

@@ -1,0 +1,202 @@
+"""What the operator stand-in does, in which order, and when it gives up: no ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class ServiceCall:
+    """One service to call.
+
+    Attributes
+    ----------
+    service : str
+        Its relative name.
+    data : bool or None
+        The request of a std_srvs/SetBool; None for a std_srvs/Trigger.
+    """
+
+    service: str
+    data: bool | None = None
+
+
+PREPARATION = (
+    ServiceCall("device/confirm_needle_out", True),
+    ServiceCall("device/home"),
+    ServiceCall("device/enable", True),
+    ServiceCall("plane_controller/start"),
+)
+DISABLE = ServiceCall("device/enable", False)
+# A rig that has not found all its partners yet refuses with this beginning: ask again.
+NOT_YET = "waiting for"
+RETRY_AFTER = 0.1
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How the run ended.
+
+    Attributes
+    ----------
+    done : bool
+        Whether the controller reached its depth.
+    reason : str
+        One line for the person at the terminal.
+    interrupted : bool
+        Whether a signal ended it.
+    """
+
+    done: bool
+    reason: str
+    interrupted: bool = False
+
+
+class OperatorSequence:
+    """Prepares the rig, keeps the hold while it steers, and ends with an outcome.
+
+    All times are readings of one steady clock [s].
+
+    Parameters
+    ----------
+    now : float
+        Time of the start.
+    wait_timeout : float
+        How long the rig may take to get ready (partners, each service call's answer) [s].
+    stall_timeout : float
+        How long steering may show no progress [s].
+    """
+
+    def __init__(self, now: float, *, wait_timeout: float, stall_timeout: float) -> None:
+        self._wait_timeout = wait_timeout
+        self._stall_timeout = stall_timeout
+        self._deadline = now + wait_timeout
+        self._missing: Sequence[str] = ("everything",)
+        self._prepared = 0
+        self._pending = False
+        self._retry_at = now
+        self._refusal = ""
+        self._homed = False
+        self._steered = False
+        self._progress: tuple[str, ...] = ()
+        self._progress_at = now
+        self.insertion = 0.0
+        self.depth: float | None = None
+        self.outcome: Outcome | None = None
+
+    @property
+    def steering(self) -> bool:
+        """Whether the preparation is over and the run is not."""
+        return self._prepared == len(PREPARATION) and self.outcome is None
+
+    @property
+    def hold(self) -> bool:
+        """Whether the hold is pressed."""
+        return self.steering
+
+    @property
+    def touched(self) -> bool:
+        """Whether the drives may have been enabled, so that they must be disabled."""
+        return self._prepared >= 2
+
+    def see_missing(self, missing: Sequence[str]) -> None:
+        """Take the list of partners that are not there (empty: all are)."""
+        self._missing = missing
+
+    def next_call(self, now: float) -> ServiceCall | None:
+        """Return the service to call now; its answer goes to `take_answer`."""
+        waits = self._pending or bool(self._missing) or now < self._retry_at
+        if waits or self.outcome is not None or self._prepared == len(PREPARATION):
+            return None
+        call = PREPARATION[self._prepared]
+        if call.service == "device/enable" and not self._homed:
+            return None
+        self._pending = True
+        return call
+
+    def take_answer(self, success: bool, message: str, now: float) -> None:
+        """Take the answer to the call under way."""
+        self._pending = False
+        if self.outcome is not None:
+            return
+        call = PREPARATION[self._prepared]
+        if success:
+            self._prepared += 1
+            self._refusal = ""
+            self._deadline = now + self._wait_timeout
+            self._progress_at = now
+        elif message.startswith(NOT_YET):
+            self._refusal = message
+            self._retry_at = now + RETRY_AFTER
+        else:
+            self._end(f"{call.service} was refused: {message}")
+
+    def see_device(self, values: Mapping[str, str]) -> None:
+        """Take the key-values of device/status."""
+        self._homed = values.get("homed") == "true"
+        if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
+            self._end(f"device {values['state']}: {_why(values)}")
+
+    def see_controller(self, values: Mapping[str, str], now: float) -> None:
+        """Take the key-values of needle/controller_status."""
+        self.insertion = _number(values.get("insertion_m")) or 0.0
+        self.depth = _number(values.get("depth_m"))
+        progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
+        if progress != self._progress:
+            self._progress, self._progress_at = progress, now
+        if not self.steering:
+            return
+        state = values.get("state", "")
+        if state == "DONE":
+            self.outcome = Outcome(
+                True, f"inserted {self.insertion * 1e3:.1f} mm in {values.get('step')} steps"
+            )
+        elif state == "FAULT":
+            self._end(f"plane_controller FAULT: {_why(values)}")
+        elif state == "IDLE" and self._steered:
+            self._end(f"plane_controller stopped: {_why(values)}")
+        elif state in ("STEERING", "WAITING_FOR_TIP"):
+            self._steered = True
+
+    def interrupt(self) -> None:
+        """Take a signal to end."""
+        if self.outcome is None:
+            self.outcome = Outcome(False, "interrupted", interrupted=True)
+
+    def check_time(self, now: float) -> None:
+        """End the run where the rig took too long."""
+        if self.outcome is not None:
+            return
+        if self._prepared < len(PREPARATION):
+            if now >= self._deadline:
+                self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self._hangs()}")
+        elif now >= self._progress_at + self._stall_timeout:
+            state = self._progress[0] if self._progress else "silent"
+            self._end(
+                f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
+                f"(plane_controller is {state})"
+            )
+
+    def _hangs(self) -> str:
+        call = PREPARATION[self._prepared].service
+        if self._missing:
+            return "missing " + ", ".join(self._missing)
+        if self._pending:
+            return f"no answer from {call}"
+        return self._refusal or f"device/status does not say homed, {call} has to wait"
+
+    def _end(self, reason: str) -> None:
+        if self.outcome is None:
+            self.outcome = Outcome(False, reason)
+
+
+def _why(values: Mapping[str, str]) -> str:
+    return values.get("reason") or values.get("fault") or "no reason given"
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        return float(text) if text else None
+    except ValueError:
+        return None

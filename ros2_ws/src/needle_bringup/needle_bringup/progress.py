@@ -1,0 +1,55 @@
+"""How far the needle is in, shown to the person at the terminal."""
+
+from __future__ import annotations
+
+from typing import TextIO
+
+from tqdm import tqdm
+
+
+class Progress:
+    """A bar on a terminal, a line for every quarter elsewhere.
+
+    Parameters
+    ----------
+    stream : TextIO
+        Where to show it, usually stderr.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._terminal = stream.isatty()
+        self._bar: tqdm[None] | None = None
+        self._shown_quarter = 0
+
+    def show(self, insertion: float, depth: float) -> None:
+        """Show that the needle is `insertion` of `depth` in [m]."""
+        if depth <= 0.0:
+            return
+        if self._terminal:
+            self._show_bar(insertion, depth)
+            return
+        quarter = int(4.0 * insertion / depth + 1e-6)
+        if quarter > self._shown_quarter:
+            self._shown_quarter = quarter
+            print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self._stream, flush=True)
+
+    def close(self, line: str) -> None:
+        """Take the bar away and leave one line."""
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+        print(line, file=self._stream, flush=True)
+
+    def _show_bar(self, insertion: float, depth: float) -> None:
+        if self._bar is None:
+            tqdm.monitor_interval = 0  # its thread would outlive the bar
+            self._bar = tqdm(
+                total=round(depth * 1e3, 1),
+                unit="mm",
+                file=self._stream,
+                leave=False,
+                bar_format="inserted {bar} {n:.0f}/{total:.0f} mm, {elapsed}, {remaining} left",
+            )
+        self._bar.n = min(insertion * 1e3, float(self._bar.total))
+        self._bar.refresh()
