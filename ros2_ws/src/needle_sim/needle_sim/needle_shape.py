@@ -49,11 +49,9 @@ class NeedleShape:
         at_bend = self.bend_distance * np.tan(self.lean)
         return_length = 2.0 * at_bend / np.tan(self.bend_angle - self.lean)
         behind_bend = np.clip((distance - self.bend_distance) / return_length, 0.0, 1.0)
-        return np.where(
-            distance < self.bend_distance,
-            distance * np.tan(self.lean),
-            at_bend * (1.0 - behind_bend) ** 2,
-        )
+        distal = distance * np.tan(self.lean)
+        behind = at_bend * (1.0 - behind_bend) ** 2
+        return np.asarray(np.where(distance < self.bend_distance, distal, behind))
 
     def middle_line(
         self,
