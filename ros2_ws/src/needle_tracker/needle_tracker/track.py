@@ -1,0 +1,249 @@
+"""Whether a measured tip is believed: physical gates, and the track's state.
+
+Nothing here looks at images: measured tips and insertions come in as arguments, decisions go out as
+data.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.search_grid import Reach
+from needle_tracker.triangulation import SpatialTip
+
+Array = NDArray[np.float64]
+
+
+class TrackState(enum.Enum):
+    """What the tracker knows about the needle."""
+
+    SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
+    CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
+    TRACKING = "TRACKING"
+    LOST = "LOST"  # was tracked and is not seen; found again only where it can have got to
+    ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
+
+
+@dataclasses.dataclass(frozen=True)
+class GateSettings:
+    """Bounds that a believed tip keeps.
+
+    Attributes
+    ----------
+    reach : Reach
+        What the needle can do.
+    surface_height : float
+        x of the phantom's surface [m].
+    least_distance : float
+        Least distance from the entry at which a tip can be seen [m].
+    tip_lean : float
+        Largest angle between the visible end and the path (pre-bend) [rad].
+    insertion_margin : float
+        Tolerance between tip and insertion [m].
+    step_margin : float
+        Tolerance of a move beyond the insertion in between [m].
+    free_step : float
+        Largest move per pair where the insertion is not known [m].
+    max_disagreement : float
+        Largest disagreement of the views along the needle [m].
+    max_miss_px : float
+        Largest distance of the tip from the image lines [px].
+    max_depth_sigma : float
+        Largest standard deviation in any direction [m].
+    confirm_pairs : int
+        Successive pairs that agree before a tip is believed without a known insertion.
+    lost_after : int
+        Successive pairs without a believed tip until the track is lost.
+    forget_after : int
+        Successive pairs without a believed tip until the last place no longer counts.
+    """
+
+    reach: Reach
+    surface_height: float
+    least_distance: float
+    tip_lean: float
+    insertion_margin: float
+    step_margin: float
+    free_step: float
+    max_disagreement: float
+    max_miss_px: float
+    max_depth_sigma: float
+    confirm_pairs: int
+    lost_after: int
+    forget_after: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Anchor:
+    """The last believed tip."""
+
+    position: Array
+    direction: Array
+    insertion: float | None
+
+
+def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) -> str | None:
+    """Return why a measured tip cannot be the needle's, None where it can.
+
+    Parameters
+    ----------
+    tip : SpatialTip
+        Measured tip in `rig`.
+    insertion : float or None
+        Length of needle in the phantom at the exposure [m], None where unknown.
+    settings : GateSettings
+        The bounds.
+
+    Returns
+    -------
+    str or None
+        Short reason, the same for the same gate (it is counted by).
+    """
+    distance = float(np.linalg.norm(tip.position))
+    reach = settings.reach
+    if tip.disagreement > settings.max_disagreement:
+        return "views disagree along the needle"
+    if tip.disagreement_across > settings.max_miss_px:
+        return "views disagree across the needle"
+    if math.sqrt(float(np.linalg.eigvalsh(tip.covariance)[-1])) > settings.max_depth_sigma:
+        return "too uncertain"
+    if tip.position[0] > settings.surface_height:
+        return "above the surface"
+    if distance < settings.least_distance:
+        return "too close to the entry"
+    if distance > reach.length + settings.insertion_margin:
+        return "beyond the longest insertion"
+    off_axis = math.acos(min(max(float(tip.position[2]) / distance, -1.0), 1.0))
+    if off_axis > float(reach.chord_angle(np.array(distance))):
+        return "outside the reachable cone"
+    path_length = distance if insertion is None else max(insertion, distance)
+    heading_limit = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
+    if math.acos(min(max(float(tip.direction[2]), -1.0), 1.0)) > heading_limit:
+        return "direction not reachable"
+    if insertion is not None:
+        if distance > insertion + settings.insertion_margin:
+            return "farther than the insertion"
+        if distance < reach.shortest_chord(insertion) - settings.insertion_margin:
+            return "short of the insertion"
+    return None
+
+
+class Track:
+    """State of the track, advanced once per image pair.
+
+    Parameters
+    ----------
+    settings : GateSettings
+        The bounds.
+    """
+
+    def __init__(self, settings: GateSettings) -> None:
+        self._settings = settings
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.state = TrackState.SEARCHING
+        self.anchor: Anchor | None = None
+        self._misses = 0
+        self._agreeing = 0
+
+    def enter(self) -> None:
+        """Note that the needle is in the entry zone, where it cannot be seen."""
+        self.reset()
+        self.state = TrackState.ENTRY
+
+    def predict(self, insertion: float | None) -> Anchor | None:
+        """Return where the tip should be now, None where there is no idea.
+
+        Parameters
+        ----------
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+
+        Returns
+        -------
+        Anchor or None
+            The last believed tip, moved on along its direction by the insertion since.
+        """
+        if self.anchor is None or self.state is TrackState.LOST:
+            return None
+        position = self.anchor.position
+        if insertion is not None and self.anchor.insertion is not None:
+            position = position + (insertion - self.anchor.insertion) * self.anchor.direction
+        return dataclasses.replace(self.anchor, position=position, insertion=insertion)
+
+    def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
+        """Return why a measured tip is not believed, None where it passes all gates."""
+        reason = refusal(tip, insertion, self._settings)
+        if reason is None and self.anchor is not None:
+            move = float(np.linalg.norm(tip.position - self.anchor.position))
+            if move > self._largest_move(insertion):
+                return "too far from the last tip"
+        return reason
+
+    def accept(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Take a tip that passed `judge`; return whether it is believed from now on."""
+        if self.state is not TrackState.TRACKING:
+            known = insertion is not None
+            self._agreeing = self._agreeing + 1 if self.state is TrackState.CONFIRMING else 1
+            wanted = 1 if known else self._settings.confirm_pairs
+            confirmed = self._agreeing >= wanted
+            self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
+        self._misses = 0
+        self.anchor = Anchor(tip.position, tip.direction, insertion)
+        return self.state is TrackState.TRACKING
+
+    def miss(self) -> None:
+        """Note a pair without a believed tip."""
+        settings = self._settings
+        self._misses += 1
+        if self.state is TrackState.TRACKING:
+            if self._misses >= settings.lost_after:
+                self.state = TrackState.LOST
+        elif self.state is not TrackState.LOST:
+            self.reset()
+        if self.state is TrackState.LOST and self._misses >= settings.forget_after:
+            self.reset()
+
+    def _largest_move(self, insertion: float | None) -> float:
+        anchor = self.anchor
+        if anchor is None:
+            return math.inf
+        if insertion is not None and anchor.insertion is not None:
+            return abs(insertion - anchor.insertion) + self._settings.step_margin
+        return self._settings.free_step * (self._misses + 1)
+
+
+def tip_at_entry(insertion: float, hole_tolerance: float, entry_angle: float) -> SpatialTip:
+    """Return the tip of a needle that is too short to be seen.
+
+    Parameters
+    ----------
+    insertion : float
+        Length of needle beyond the entry point [m].
+    hole_tolerance : float
+        Standard deviation of the path's place at the entry [m].
+    entry_angle : float
+        Standard deviation of the heading at the entry [rad].
+
+    Returns
+    -------
+    SpatialTip
+        On the z axis of `rig`, with the covariance that follows.
+    """
+    sideways = math.hypot(hole_tolerance, insertion * math.sin(entry_angle))
+    along = math.hypot(hole_tolerance, insertion * (1.0 - math.cos(entry_angle)))
+    return SpatialTip(
+        np.array([0.0, 0.0, insertion]),
+        np.diag([sideways**2, sideways**2, along**2]),
+        np.array([0.0, 0.0, 1.0]),
+        np.diag([entry_angle**2, entry_angle**2, 0.0]),
+        0.0,
+        0.0,
+    )

@@ -1,0 +1,169 @@
+"""Two image tips to one tip in space: tight across the needle, loose along it.
+
+Across the shaft an image says a lot (the line is fitted to some forty rows of pixels), along it
+little (where a bevelled end fades). Each camera's measurement is weighted accordingly, so that the
+badly seen end hardly touches the depth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.refraction import RefractedCamera
+from needle_tracker.tip_fit import ImageTip
+
+Array = NDArray[np.float64]
+
+_ITERATIONS = 12
+
+
+@dataclasses.dataclass(frozen=True)
+class SpatialTip:
+    """The tip in `rig`.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        The visible end [m].
+    covariance : ndarray, shape (3, 3)
+        Of the position [m^2].
+    direction : ndarray, shape (3,)
+        Unit vector along the visible shaft near the tip, towards the tip.
+    direction_covariance : ndarray, shape (3, 3)
+        Of the direction [-]; zero along it.
+    disagreement : float
+        By how much the cameras disagree about the end along the shaft [m].
+    disagreement_across : float
+        By how much the end misses the two shaft lines [px].
+    """
+
+    position: Array
+    covariance: Array
+    direction: Array
+    direction_covariance: Array
+    disagreement: float
+    disagreement_across: float
+
+
+def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, Array]) -> Array:
+    """Return the point halfway between two refracted rays at their closest, in `rig` [m].
+
+    Parameters
+    ----------
+    views : pair of RefractedCamera
+        Left and right.
+    tips : pair of ndarray, shape (2,)
+        Pixels, left and right.
+
+    Returns
+    -------
+    ndarray, shape (3,)
+        NaN for parallel rays.
+    """
+    rays = [view.rays(tip) for view, tip in zip(views, tips, strict=True)]
+    (p, a), (q, b) = rays
+    cosine = float(a @ b)
+    denominator = 1.0 - cosine * cosine
+    if not denominator > 1e-9:
+        return np.full(3, np.nan)
+    between = q - p
+    along_a = float(between @ a - cosine * (between @ b)) / denominator
+    along_b = float(cosine * (between @ a) - between @ b) / denominator
+    return np.asarray(0.5 * (p + along_a * a + q + along_b * b))
+
+
+def triangulate(
+    views: tuple[RefractedCamera, RefractedCamera], tips: tuple[ImageTip, ImageTip]
+) -> SpatialTip | None:
+    """Return the tip that fits both images best.
+
+    Gauss-Newton on the four image residuals (across and along the shaft, per camera), each over its
+    standard deviation; the covariance is the inverse of the normal matrix.
+
+    Parameters
+    ----------
+    views : pair of RefractedCamera
+        Left and right.
+    tips : pair of ImageTip
+        The needle's end in the left and right image.
+
+    Returns
+    -------
+    SpatialTip or None
+        None where the two views do not determine a point (or one above the surface).
+    """
+    position = midpoint(views, (tips[0].point, tips[1].point))
+    if not np.all(np.isfinite(position)):
+        return None
+    axes = [
+        np.stack([[-tip.direction[1], tip.direction[0]], tip.direction]) for tip in tips
+    ]  # rows: across, along
+    sigmas = np.array([s for tip in tips for s in (tip.sigma_across, tip.sigma_along)])
+    for _ in range(_ITERATIONS):
+        jacobians = [view.jacobian(position) for view in views]
+        rows = np.concatenate([axis @ j for axis, j in zip(axes, jacobians, strict=True)])
+        residual = np.concatenate(
+            [
+                axis @ (tip.point - view.project(position))
+                for axis, tip, view in zip(axes, tips, views, strict=True)
+            ]
+        )
+        weighted = rows / sigmas[:, None]
+        normal = weighted.T @ weighted
+        if not np.all(np.isfinite(normal)) or np.linalg.cond(normal) > 1e12:
+            return None
+        step = np.linalg.solve(normal, weighted.T @ (residual / sigmas))
+        position = position + step
+        if float(np.abs(step).max()) < 1e-10:
+            break
+    else:
+        return None
+    heading = _shaft_direction(jacobians, axes, [tip.sigma_angle for tip in tips])
+    if heading is None:
+        return None
+    direction, direction_covariance = heading
+    if direction_covariance.trace() > 1.0:
+        return None
+    # Residual along the shaft in the images, as lengths along the shaft in space.
+    scales = [float(axis[1] @ j @ direction) for axis, j in zip(axes, jacobians, strict=True)]
+    along = abs(residual[1] / scales[0] - residual[3] / scales[1])
+    return SpatialTip(
+        position,
+        np.linalg.inv(normal),
+        direction,
+        direction_covariance,
+        float(along),
+        float(max(abs(residual[0]), abs(residual[2]))),
+    )
+
+
+def _shaft_direction(
+    jacobians: list[Array], axes: list[Array], sigma_angles: list[float]
+) -> tuple[Array, Array] | None:
+    """Return the shaft's direction in `rig`, and its covariance.
+
+    Seen through a camera's Jacobian J, the direction d runs along the image line: n . J d = 0 with n
+    across the line. So d is across both J^T n: the intersection of two planes.
+    """
+    normals = [j.T @ axis[0] for j, axis in zip(jacobians, axes, strict=True)]
+    cross = np.cross(normals[0], normals[1])
+    length = float(np.linalg.norm(cross))
+    sine = length / float(np.linalg.norm(normals[0]) * np.linalg.norm(normals[1]))
+    if not sine > 1e-3:
+        return None
+    direction = cross / length
+    if float(axes[0][1] @ jacobians[0] @ direction) < 0.0:
+        direction = -direction
+    if float(axes[1][1] @ jacobians[1] @ direction) <= 0.0:
+        return None
+    # Turning an image line by da moves its n by -da t (t along): dn = -da J^T t.
+    covariance = np.zeros((3, 3))
+    for i in range(2):
+        change = -jacobians[i].T @ axes[i][1]
+        turned = np.cross(change, normals[1]) if i == 0 else np.cross(normals[0], change)
+        across = (turned - direction * float(direction @ turned)) / length
+        covariance += sigma_angles[i] ** 2 * np.outer(across, across)
+    return direction, covariance
