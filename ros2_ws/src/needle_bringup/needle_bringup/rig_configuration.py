@@ -1,0 +1,167 @@
+"""The rig's parameters, and what one run changes in them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from needle_bringup.installed import find_shared
+from needle_bringup.simulate_options import SimulateOptions
+from needle_common.errors import UserError
+
+RIG_FILE = "config/rig.yaml"
+NODES = ("recorder", "sim_rig", "stereo_tracker", "plane_controller", "operator")
+
+# Parameter that simulate sets -> the option that it comes from.
+OPTIONS = {
+    "level": "--level",
+    "seed": "--seed",
+    "initial_pitch": "--initial",
+    "initial_roll": "--initial",
+    "target_offset": "--initial",
+    "torsion_play": "--play-deg",
+    "torsion_lag": "--lag-mm",
+    "real_time_factor": "--real-time-factor",
+    "tip_noise": "--noise-mm",
+    "bag": "--bag",
+    "preset": "--controller",
+    "depth": "--depth-mm",
+}
+
+Parameters = dict[str, dict[str, Any]]
+
+
+def read_parameters(path: Path) -> Parameters:
+    """Return a ROS parameter file as node name -> parameter name -> value.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read, is no such file, or names a node that the rig does not have.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}: not YAML{where}: {getattr(error, 'problem', error)}") from error
+    if not isinstance(document, Mapping):
+        raise UserError(f"{path}: not a ROS parameter file (NODE: {{ros__parameters: ...}})")
+    parameters: Parameters = {}
+    for key, section in document.items():
+        name = str(key).removeprefix("/")
+        if name not in NODES:
+            raise UserError(f"{path}: unknown node '{key}' (known: {', '.join(NODES)})")
+        if not isinstance(section, Mapping) or list(section) != ["ros__parameters"]:
+            raise UserError(f"{path}: '{key}' wants one entry, ros__parameters")
+        values = section["ros__parameters"]
+        if not isinstance(values, Mapping):
+            raise UserError(f"{path}: '{key}' wants NAME: VALUE pairs under ros__parameters")
+        parameters[name] = {str(k): value for k, value in values.items()}
+    return parameters
+
+
+def merge(*layers: Parameters) -> Parameters:
+    """Return the layers as one; later ones win, parameter by parameter."""
+    merged: Parameters = {}
+    for layer in layers:
+        for node, values in layer.items():
+            merged[node] = {**merged.get(node, {}), **values}
+    return merged
+
+
+def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
+    """Return the nodes that a run needs."""
+    return tuple(n for n in NODES if n != "stereo_tracker" or options.level != "tip")
+
+
+def rig_parameters() -> Parameters:
+    """Return the rig's own configuration, config/rig.yaml."""
+    return read_parameters(find_shared("needle_bringup", RIG_FILE))
+
+
+def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
+    """Return what the command line sets in the nodes that the run needs.
+
+    Parameters
+    ----------
+    options : SimulateOptions
+        The command line.
+    bag : Path
+        The bag's folder.
+    """
+    sim_rig: dict[str, Any] = {
+        "level": options.level,
+        "seed": options.seed,
+        "initial_pitch": math.radians(options.initial_pitch_deg),
+        "initial_roll": math.radians(options.initial_roll_deg),
+        "torsion_play": math.radians(options.play_deg),
+        "torsion_lag": options.lag_mm * 1e-3,
+        "real_time_factor": options.real_time_factor,
+        "wait_for_recorder": True,
+    }
+    if options.noise_mm is not None:
+        sim_rig["tip_noise"] = options.noise_mm * 1e-3
+    parameters: Parameters = {
+        "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
+        "sim_rig": sim_rig,
+        "stereo_tracker": {},
+        "plane_controller": {
+            "preset": options.controller,
+            "depth": options.depth_mm * 1e-3,
+            "target_offset": -options.initial_x_mm * 1e-3,
+        },
+        "operator": {},
+    }
+    for node, values in parameters.items():
+        values["use_sim_time"] = node != "recorder"
+    return {node: parameters[node] for node in nodes_of(options)}
+
+
+def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> None:
+    """Refuse a parameter file that contradicts the command line.
+
+    Raises
+    ------
+    UserError
+        If the file sets what an option sets, or a node that this level does not run.
+    """
+    reserved = command_line_parameters(options, Path())
+    for node, values in given.items():
+        if node not in reserved:
+            raise UserError(f"{path}: {node} does not run at level {options.level}")
+        for name in values:
+            if name in reserved[node]:
+                option = OPTIONS.get(name)
+                hint = f"use {option}" if option else "simulate sets it itself"
+                raise UserError(f"{path}: {node}: {name} does not go into the file, {hint}")
+
+
+def run_info(options: SimulateOptions) -> dict[str, Any]:
+    """Return what the bag says about how it was made."""
+    return {
+        "level": options.level,
+        "controller": options.controller,
+        "seed": options.seed,
+        "initial_x_mm": options.initial_x_mm,
+        "initial_pitch_deg": options.initial_pitch_deg,
+        "initial_roll_deg": options.initial_roll_deg,
+        "noise_mm": options.noise_mm,
+        "depth_mm": options.depth_mm,
+        "play_deg": options.play_deg,
+        "lag_mm": options.lag_mm,
+        "real_time_factor": options.real_time_factor,
+    }
+
+
+def write_parameters(path: Path, parameters: Parameters) -> None:
+    """Write a ROS parameter file."""
+    document = {node: {"ros__parameters": values} for node, values in parameters.items()}
+    path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")

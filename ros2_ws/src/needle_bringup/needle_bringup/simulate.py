@@ -1,0 +1,233 @@
+"""Supervises one simulated run: starts the nodes, waits, ends them, reports. No ROS in here."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from types import FrameType
+
+from needle_bringup.installed import find_executable, find_shared
+from needle_bringup.node_process import NodeProcess, stop, wait_for
+from needle_bringup.rig_configuration import (
+    Parameters,
+    command_line_parameters,
+    merge,
+    nodes_of,
+    read_parameters,
+    refuse_reserved,
+    rig_parameters,
+    write_parameters,
+)
+from needle_bringup.ros_domain import own_domain
+from needle_bringup.simulate_options import SimulateOptions, parse
+from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.errors import UserError
+
+PACKAGES = {
+    "recorder": "needle_bringup",
+    "sim_rig": "needle_sim",
+    "stereo_tracker": "needle_tracker",
+    "plane_controller": "needle_controller",
+    "operator": "needle_bringup",
+}
+LOGS = "logs"
+PARAMETERS = "parameters.yaml"
+METADATA = "metadata.yaml"
+POLL = 0.05
+# rclpy's own log files would double those in LOGS.
+ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
+# The recorder writes out what it still holds: a slow disk may take its time.
+RECORDER_GRACE = 30.0
+# Set by scripts/simulate: when the command was given, in seconds since the epoch.
+STARTED_AT = "NEEDLE_STARTED_AT"
+
+
+class Interruption:
+    """SIGINT, SIGTERM and SIGHUP as a flag that is looked at between steps."""
+
+    def __init__(self) -> None:
+        self._seen = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # nohup's wish is to outlive the terminal
+            if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue
+            signal.signal(number, self._take)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has come."""
+        if self._seen:
+            raise KeyboardInterrupt
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        self._seen = True
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `simulate`; returns its exit code."""
+    interruption = Interruption()
+    if STARTED_AT in os.environ:
+        _end_with_parent()
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: simulate(parse(words), interruption))
+
+
+def simulate(options: SimulateOptions, interruption: Interruption) -> int:
+    """Run one simulation as asked.
+
+    Parameters
+    ----------
+    options : SimulateOptions
+        What to run.
+    interruption : Interruption
+        Tells when to give up.
+
+    Returns
+    -------
+    int
+        0 converged, 1 ran but missed.
+
+    Raises
+    ------
+    UserError
+        Where something is broken or missing.
+    KeyboardInterrupt
+        After an interrupt, when everything has ended.
+    """
+    started_at = float(os.environ.get(STARTED_AT) or time.time())
+    given: Parameters = {}
+    if options.params is not None:
+        given = read_parameters(options.params)
+        refuse_reserved(options.params, given, options)
+    executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
+    bag = _make_folder(options)
+    parameters = merge(rig_parameters(), command_line_parameters(options, bag), given)
+    parameters["recorder"].setdefault(
+        "calibration_file",
+        parameters["sim_rig"].get("calibration_file")
+        or str(find_shared("needle_tracker", "config/calibration.yaml")),
+    )
+    interruption.check()
+    try:
+        with own_domain() as domain:
+            write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
+            done = _run_nodes(executables, bag, domain, interruption)
+        return _report(options, bag, started_at, interruption, done=done)
+    finally:
+        if not (bag / METADATA).exists():
+            shutil.rmtree(bag, ignore_errors=True)
+
+
+def _run_nodes(
+    executables: dict[str, str], bag: Path, domain: int, interruption: Interruption
+) -> bool:
+    """Run the graph until the operator ends; whether the needle reached its depth."""
+    logs = bag / LOGS
+    logs.mkdir()
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        # The terminal's stderr is the operator's progress; what nodes log goes to their files.
+        "RCUTILS_LOGGING_USE_STDOUT": "1",
+        "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+        "PYTHONUNBUFFERED": "1",
+    }
+    nodes: dict[str, NodeProcess] = {}
+    print(f"recording into {bag} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
+    failure = ""
+    try:
+        for name, executable in executables.items():
+            interruption.check()
+            nodes[name] = NodeProcess(
+                name,
+                [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
+                environment=environment,
+                log=logs / f"{name}.log",
+                show_errors=name == "operator",
+            )
+        operator = nodes["operator"]
+        while operator.exit_code is None and not failure:
+            interruption.check()
+            failure = _first_dead(nodes)
+            wait_for([operator], POLL)
+        failure = failure or _first_dead(nodes)
+        if failure or operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
+            raise UserError(failure or operator.describe_end())
+        return operator.exit_code == EXIT_DONE
+    finally:
+        _stop_nodes(nodes)
+
+
+def _first_dead(nodes: dict[str, NodeProcess]) -> str:
+    """Say which node ended although it should run; an empty text if none did."""
+    for name, node in nodes.items():
+        if name != "operator" and node.exit_code is not None:
+            return node.describe_end()
+    return ""
+
+
+def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
+    """End the operator, then the others, then the recorder that still records their ends."""
+    operator, recorder = nodes.get("operator"), nodes.get("recorder")
+    rest = [node for node in nodes.values() if node not in (operator, recorder)]
+    warnings = stop([operator]) if operator else []
+    warnings += stop(rest)
+    warnings += stop([recorder], RECORDER_GRACE) if recorder else []
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def _report(
+    options: SimulateOptions,
+    bag: Path,
+    started_at: float,
+    interruption: Interruption,
+    *,
+    done: bool,
+) -> int:
+    """Make summary and report from the bag; the exit code."""
+    raise NotImplementedError
+
+
+def _make_folder(options: SimulateOptions) -> Path:
+    if options.bag is not None:
+        folders = [options.bag]
+    else:
+        name = time.strftime(f"%Y-%m-%d_%H-%M-%S_{options.level}_{options.controller}")
+        root = _checkout() / "bags"
+        folders = [root / name, *(root / f"{name}_{number}" for number in range(2, 100))]
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise UserError(f"cannot make the folder {folder}: {error.strerror}") from error
+        return folder
+    raise UserError(f"{folders[0]} exists already; give a new folder")
+
+
+def _checkout() -> Path:
+    """Return the checkout's folder; the current one where the package runs without it."""
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "scripts" / "simulate").is_file():
+            return folder
+    return Path.cwd()
+
+
+def _end_with_parent() -> None:
+    """Take SIGTERM when scripts/simulate is killed outright."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+    if os.getppid() == 1:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,154 @@
+from needle_bringup.operator_sequence import PREPARATION, OperatorSequence, Outcome, ServiceCall
+
+
+def fresh() -> OperatorSequence:
+    return OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+
+
+def outcome(sequence: OperatorSequence) -> Outcome | None:
+    """Return the outcome; a call, so that mypy does not take it for settled once it was None."""
+    return sequence.outcome
+
+
+def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
+    sequence.see_missing([])
+    sequence.see_device({"homed": "true", "state": "DISABLED"})
+    calls = []
+    while (call := sequence.next_call(now)) is not None:
+        calls.append(call)
+        sequence.take_answer(True, "", now)
+    return calls
+
+
+def steering(**values: str) -> dict[str, str]:
+    return {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"} | values
+
+
+def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    sequence.see_device({"homed": "true"})
+    for expected in PREPARATION:
+        assert not sequence.hold
+        assert sequence.next_call(1.0) == expected
+        assert sequence.next_call(1.0) is None, "one call at a time"
+        sequence.take_answer(True, "", 1.0)
+    assert sequence.hold
+
+
+def test_calls_nothing_while_a_partner_is_missing() -> None:
+    sequence = fresh()
+    assert sequence.next_call(1.0) is None
+    sequence.see_missing(["service device/home"])
+    assert sequence.next_call(1.0) is None
+    sequence.check_time(29.9)
+    assert outcome(sequence) is None
+    sequence.check_time(30.0)
+    assert sequence.outcome is not None
+    assert not sequence.outcome.done
+    assert "service device/home" in sequence.outcome.reason
+    assert not sequence.touched
+
+
+def test_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    assert sequence.next_call(1.0) == PREPARATION[0]
+    sequence.take_answer(False, "waiting for a subscriber of joint_states", 1.0)
+    assert sequence.next_call(1.05) is None
+    assert sequence.next_call(1.2) == PREPARATION[0]
+    sequence.take_answer(False, "the needle is in", 1.2)
+    assert sequence.outcome is not None
+    assert "the needle is in" in sequence.outcome.reason
+    assert sequence.next_call(2.0) is None
+
+
+def test_a_service_that_never_answers_is_named() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    sequence.next_call(1.0)
+    sequence.check_time(31.0)
+    assert sequence.outcome is not None
+    assert "no answer from device/confirm_needle_out" in sequence.outcome.reason
+
+
+def test_waits_for_homing_before_it_enables() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    for _ in range(2):
+        assert sequence.next_call(1.0) is not None
+        sequence.take_answer(True, "", 1.0)
+    assert sequence.next_call(1.0) is None
+    sequence.see_device({"homed": "true"})
+    assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
+
+
+def test_done_is_success_and_releases_the_hold() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(), 2.0)
+    assert sequence.hold
+    sequence.see_controller(steering(state="DONE", step="120", insertion_m="0.12"), 3.0)
+    assert sequence.outcome is not None
+    assert sequence.outcome.done
+    assert not sequence.hold
+
+
+def test_the_done_of_an_earlier_run_does_not_count() -> None:
+    sequence = fresh()
+    sequence.see_controller(steering(state="DONE"), 0.5)
+    prepare(sequence)
+    assert sequence.outcome is None
+
+
+def test_fault_release_and_stop_end_the_run_with_their_reason() -> None:
+    for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
+        sequence = fresh()
+        prepare(sequence)
+        sequence.see_controller(steering(), 2.0)
+        sequence.see_controller(steering(state=state, reason=reason), 3.0)
+        assert sequence.outcome is not None
+        assert not sequence.outcome.done
+        assert reason in sequence.outcome.reason
+        assert not sequence.hold
+    for state in ("FAULT", "ESTOPPED"):
+        sequence = fresh()
+        prepare(sequence)
+        sequence.see_device({"homed": "true", "state": state, "reason": "button"})
+        assert sequence.outcome is not None
+        assert "button" in sequence.outcome.reason
+
+
+def test_the_idle_before_steering_is_no_stop() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(state="IDLE"), 2.0)
+    assert sequence.outcome is None
+
+
+def test_no_progress_releases_the_hold() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(), 10.0)
+    sequence.see_controller(steering(), 60.0)
+    sequence.check_time(69.9)
+    assert outcome(sequence) is None
+    sequence.check_time(70.0)
+    assert not sequence.hold
+    assert sequence.outcome is not None
+    assert "no progress for 60 s at 3.0 mm" in sequence.outcome.reason
+
+
+def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
+    sequence = fresh()
+    sequence.interrupt()
+    assert sequence.outcome is not None
+    assert sequence.outcome.interrupted
+    sequence.see_missing([])
+    assert sequence.next_call(1.0) is None
+    finished = fresh()
+    prepare(finished)
+    finished.see_controller(steering(state="DONE"), 3.0)
+    finished.interrupt()
+    assert finished.outcome is not None
+    assert finished.outcome.done

@@ -1,0 +1,82 @@
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+
+from needle_bringup.rig_configuration import (
+    command_line_parameters,
+    merge,
+    nodes_of,
+    read_parameters,
+    refuse_reserved,
+    rig_parameters,
+    write_parameters,
+)
+from needle_bringup.simulate_options import SimulateOptions
+from needle_common.errors import UserError
+
+
+def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
+    options = SimulateOptions(initial_x_mm=-3.0, initial_pitch_deg=2.0, depth_mm=80.0)
+    parameters = command_line_parameters(options, Path("bags/x"))
+    assert parameters["plane_controller"]["target_offset"] == pytest.approx(0.003)
+    assert parameters["plane_controller"]["depth"] == pytest.approx(0.08)
+    assert parameters["sim_rig"]["initial_pitch"] == pytest.approx(math.radians(2.0))
+
+
+def test_only_the_nodes_of_the_level_run() -> None:
+    assert "stereo_tracker" not in nodes_of(SimulateOptions(level="tip"))
+    assert "stereo_tracker" in nodes_of(SimulateOptions(level="camera"))
+
+
+def test_later_layers_win_one_parameter_at_a_time() -> None:
+    merged = merge({"a": {"x": 1, "y": 2}}, {"a": {"y": 3}, "b": {}})
+    assert merged == {"a": {"x": 1, "y": 3}, "b": {}}
+
+
+def test_a_written_file_reads_back(tmp_path: Path) -> None:
+    parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
+    write_parameters(tmp_path / "p.yaml", parameters)
+    assert read_parameters(tmp_path / "p.yaml") == parameters
+
+
+def test_the_rig_file_names_known_nodes() -> None:
+    assert rig_parameters()
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("controller: {ros__parameters: {x: 1}}", "unknown node 'controller'"),
+        ("plane_controller: {parameters: {x: 1}}", "ros__parameters"),
+        ("plane_controller: {ros__parameters: [1]}", "NAME: VALUE"),
+        ("[1, 2", "not YAML"),
+        ("just text", "not a ROS parameter file"),
+        ("", "not a ROS parameter file"),
+    ],
+)
+def test_a_bad_file_is_named_in_one_line(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_parameters(path)
+    assert named in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_file_may_not_contradict_the_command_line() -> None:
+    path = Path("p.yaml")
+    options = SimulateOptions(level="tip", noise_mm=1.0)
+    with pytest.raises(UserError, match="--depth-mm"):
+        refuse_reserved(path, {"plane_controller": {"depth": 0.1}}, options)
+    with pytest.raises(UserError, match="does not run at level tip"):
+        refuse_reserved(path, {"stereo_tracker": {}}, options)
+    refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
+
+
+def test_every_yaml_of_the_package_parses() -> None:
+    folder = Path(__file__).parents[1] / "config"
+    for path in folder.glob("*.yaml"):
+        assert yaml.safe_load(path.read_text())
