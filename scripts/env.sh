@@ -1,11 +1,85 @@
-# Source this to get the workspace's environment: `source scripts/env.sh`.
-unset LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
-_needle_root="$(cd "$(dirname "${BASH_SOURCE[0]}")/.." && pwd)"
-. "$_needle_root/.venv/bin/activate"
-export AMENT_PREFIX_PATH="$_needle_root/.venv"
-. "$_needle_root/ros2_ws/install/setup.bash"
-export ROS_PYTHON_CHECK_FIELDS=1
-export ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST
-export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
-export FASTRTPS_DEFAULT_PROFILES_FILE="$_needle_root/ros2_ws/src/needle_bringup/config/fastdds.xml"
-unset _needle_root
+# Source this, in bash or zsh: the environment for `ros2 run`, Python and the tests.
+#
+#     source scripts/env.sh
+#
+# A ROS_DOMAIN_ID or ROS_AUTOMATIC_DISCOVERY_RANGE that is already set stays as it is.
+# shellcheck shell=bash
+
+# Print list $2 (colons between its items) with item $1 first, and only once.
+_needle_prepend() {
+    local rest=":$2:"
+    while [ "${rest#*":$1:"}" != "$rest" ]; do
+        rest="${rest%%":$1:"*}:${rest#*":$1:"}"
+    done
+    rest="${rest#:}"
+    rest="${rest%:}"
+    printf '%s' "$1${rest:+:$rest}"
+}
+
+_needle_env() {
+    [ -z "${ZSH_VERSION:-}" ] || emulate -L sh
+    local root="$1" mode="" rest="" package="" paths="${PYTHONPATH:-}" prefixes="${AMENT_PREFIX_PATH:-}"
+    if [ -r "$root/.venv/.needle-setup" ]; then
+        read -r mode rest <"$root/.venv/.needle-setup" || true
+    fi
+    if [ -z "$mode" ] || [ ! -d "$root/ros2_ws/install" ]; then
+        echo "env.sh: this checkout is not set up yet (or only half): run $root/scripts/setup" >&2
+        return 1
+    fi
+    if [ "$mode" = ros ] && [ "${ROS_DISTRO:-}" != jazzy ]; then
+        echo "env.sh: set up for ROS 2 Jazzy as installed: source its setup.bash first, or run $root/scripts/setup" >&2
+        return 1
+    fi
+    if [ "$mode" = wheels ]; then
+        if [ -n "${ROS_DISTRO:-}" ] && [ "${prefixes#*/opt/ros/}" != "$prefixes" ]; then
+            echo "env.sh: set up for PyPI's wheels, but ROS 2 $ROS_DISTRO is sourced: run $root/scripts/setup, or use a new shell" >&2
+            return 1
+        fi
+        # Libraries of another environment would be loaded in place of the wheels' own.
+        unset LD_LIBRARY_PATH _ROS_WHEELS_BOOTSTRAP_COMPLETE
+        # The message packages of the wheels are found in the environment itself.
+        prefixes="$root/.venv"
+    fi
+    for package in "$root"/ros2_ws/install/*/share/ament_index/resource_index/packages/*; do
+        [ -e "$package" ] || continue
+        package="${package##*/}"
+        prefixes="$(_needle_prepend "$root/ros2_ws/install/$package" "$prefixes")"
+        paths="$(_needle_prepend "$root/ros2_ws/build/$package" "$paths")"
+    done
+    unset PYTHONHOME
+    export AMENT_PREFIX_PATH="$prefixes"
+    export PYTHONPATH="$paths"
+    export VIRTUAL_ENV="$root/.venv"
+    PATH="$(_needle_prepend "$root/.venv/bin" "$PATH")"
+    export PATH
+    # Without it, an int in a float field is sent as garbage, silently.
+    export ROS_PYTHON_CHECK_FIELDS=1
+    # No packet leaves this machine unless asked for.
+    export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+    export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
+    # Shared memory that holds camera images.
+    export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_bringup/config/fastdds.xml"
+}
+
+if [ -n "${BASH_VERSION:-}" ]; then
+    _needle_file="${BASH_SOURCE[0]}"
+elif [ -n "${ZSH_VERSION:-}" ]; then
+    eval '_needle_file="${(%):-%x}"'
+else
+    _needle_file=""
+fi
+_needle_code=0
+if [ -n "$_needle_file" ]; then
+    _needle_env "$(CDPATH='' builtin cd -- "$(dirname -- "$_needle_file")/.." >/dev/null && pwd -P)" || _needle_code=$?
+else
+    echo "env.sh: this is for bash and zsh" >&2
+    _needle_code=1
+fi
+unset -f _needle_env _needle_prepend
+unset _needle_file
+if [ "$_needle_code" -ne 0 ]; then
+    unset _needle_code
+    # Only a shell that is sourcing this can return; a script that runs it ends.
+    return 1 2>/dev/null || exit 1
+fi
+unset _needle_code

@@ -1,0 +1,108 @@
+"""Renew the pinned requirements: `python scripts/lib/lock.py` (Python 3.11 or newer, and `uv`).
+
+Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
+`requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
+numpy that apt's message packages were compiled against). Only files that Linux x86-64 with CPython
+3.10-3.13 can install are hashed; no address of an index goes into a lock.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import tomllib  # type: ignore[import-not-found]
+
+ROOT = Path(__file__).resolve().parents[2]
+APT_NUMPY = "numpy==1.26.4"
+PYTHONS = ("310", "311", "312", "313")
+IMPLIED = re.compile(
+    r"(implementation_name|platform_\w+|sys_platform) [!=]= '\w+'"
+    r"|python_full_version (< '3\.14'|>= '3\.10')"
+)
+
+
+def resolve(requirements: list[str], *options: str) -> list[dict[str, Any]]:
+    """Return uv's resolution of the requirement lines, one entry per package and version."""
+    with tempfile.TemporaryDirectory() as folder:
+        source, result = Path(folder, "requirements.in"), Path(folder, "pylock.toml")
+        source.write_text("\n".join(requirements) + "\n", encoding="utf-8")
+        command = [os.environ.get("UV", "uv"), "pip", "compile", "--quiet", "--universal"]
+        command += ["--no-python-downloads", *options, str(source), "-o", str(result)]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+        packages: list[dict[str, Any]] = tomllib.loads(result.read_text("utf-8"))["packages"]
+        return packages
+
+
+def installable(file_name: str, pythons: tuple[str, ...]) -> bool:
+    """Return whether a wheel's tags fit Linux x86-64 (glibc) and one of the Python versions."""
+    python, abi, platform = file_name.removesuffix(".whl").split("-")[-3:]
+    if platform != "any" and not ("manylinux" in platform and platform.endswith("x86_64")):
+        return False
+    if "py3" in python.split("."):
+        return True
+    if abi == "abi3":
+        return int(python.removeprefix("cp")) <= int(pythons[-1])
+    return python.removeprefix("cp") in pythons and abi == python
+
+
+def entry(package: dict[str, Any], pythons: tuple[str, ...]) -> str:
+    """Return a package as requirement lines with the hashes of its usable wheels."""
+    marker = package.get("marker", "")
+    if " or " not in marker:
+        marker = " and ".join(m for m in marker.split(" and ") if not IMPLIED.fullmatch(m))
+    hashes = sorted(
+        wheel["hashes"]["sha256"]
+        for wheel in package.get("wheels", [])
+        if installable(wheel.get("name") or wheel["url"].rsplit("/", 1)[1], pythons)
+    )
+    name = f"{package['name']}=={package['version']}"
+    if not hashes:
+        print(f"{name}: no wheel fits, pip builds the source archive")
+        hashes = [package["sdist"]["hashes"]["sha256"]]
+    return " \\\n    ".join(
+        [name + (f" ; {marker}" if marker else ""), *(f"--hash=sha256:{value}" for value in hashes)]
+    )
+
+
+def write(
+    name: str, purpose: str, packages: list[dict[str, Any]], pythons: tuple[str, ...]
+) -> None:
+    """Write one lock file."""
+    lines = [f"# {purpose} Renew with: python scripts/lib/lock.py"]
+    lines += [entry(package, pythons) for package in packages]
+    (ROOT / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    print(f"{name}: {len(packages)} packages")
+
+
+def main() -> int:
+    """Renew both lock files."""
+    wanted = [
+        line
+        for name in ("requirements.in", "requirements-dev.in")
+        for line in (ROOT / name).read_text("utf-8").splitlines()
+        if line and not line.startswith("#")
+    ]
+    write(
+        "requirements.lock",
+        "Linux x86-64, CPython 3.10-3.13.",
+        resolve(wanted, "--python-version", "3.10"),
+        PYTHONS,
+    )
+    without_ros = [line for line in wanted if not line.startswith("ros-")] + [APT_NUMPY]
+    write(
+        "requirements-ros.lock",
+        "Ubuntu 24.04 (CPython 3.12) beside ROS 2 Jazzy from apt.",
+        resolve(without_ros, "--python-version", "3.12"),
+        ("312",),
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

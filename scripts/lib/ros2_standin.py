@@ -1,0 +1,132 @@
+"""A small `ros2` for environments without ROS 2's own command line (there is none on PyPI).
+
+It knows `ros2 run PKG EXE [args]` and `ros2 pkg executables [PKG]`, with the exit codes of the real
+one. scripts/setup puts it into the virtual environment; it uses the standard library only.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import NoReturn
+
+HELP = """\
+usage: ros2 run PACKAGE EXECUTABLE [arguments]
+       ros2 pkg executables [PACKAGE]
+
+This is a small stand-in that scripts/setup installed: PyPI has no ros2 command line. It runs the
+nodes and tools of this workspace. For everything else (topic, bag, launch, ...) install ROS 2
+Jazzy, source it and run scripts/setup again.
+"""
+
+
+def fail(code: int, text: str) -> NoReturn:
+    """Print one line and end."""
+    print(f"ros2: {text}", file=sys.stderr)
+    sys.exit(code)
+
+
+def prefixes() -> dict[str, Path]:
+    """Return the sourced packages and where they are installed, nearest first."""
+    found: dict[str, Path] = {}
+    for prefix in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        index = Path(prefix, "share", "ament_index", "resource_index", "packages")
+        if index.is_dir():
+            for marker in index.iterdir():
+                found.setdefault(marker.name, Path(prefix))
+    if not found:
+        fail(1, "no packages found: source scripts/env.sh first")
+    return found
+
+
+def executables(package: str, prefix: Path) -> dict[str, Path]:
+    """Return a package's executables by name."""
+    folder = prefix / "lib" / package
+    if not folder.is_dir():
+        return {}
+    return {
+        path.name: path
+        for path in sorted(folder.iterdir())
+        if path.is_file() and os.access(path, os.X_OK)
+    }
+
+
+def suggest(name: str, known: list[str]) -> str:
+    """Return a hint at what may have been meant."""
+    close = difflib.get_close_matches(name, known, n=3)
+    if close:
+        return f"; did you mean {' or '.join(close)}?"
+    return f"; there is {', '.join(sorted(known))}" if known else ""
+
+
+def find_package(package: str) -> Path:
+    """Return where a package is installed; ends with a hint where it is not."""
+    found = prefixes()
+    if package not in found:
+        ours = [name for name, prefix in found.items() if executables(name, prefix)]
+        fail(1, f"package '{package}' not found{suggest(package, ours)}")
+    return found[package]
+
+
+def run(package: str, executable: str, arguments: list[str]) -> NoReturn:
+    """Become the executable: signals reach it and its exit code is ours."""
+    found = executables(package, find_package(package))
+    if executable not in found:
+        hint = suggest(executable, list(found)) or " (it has none)"
+        fail(1, f"package '{package}' has no executable '{executable}'{hint}")
+    path = str(found[executable])
+    with Path(path).open("rb") as file:
+        script = file.read(2) == b"#!" and b"python" in file.readline() + file.readline()
+    # Python ignores SIGPIPE, and what it becomes would inherit that.
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    sys.stdout.flush()
+    try:
+        # Through the interpreter, as a first line cannot name one in a path with a space.
+        if script:
+            os.execv(sys.executable, [sys.executable, path, *arguments])
+        os.execv(path, [path, *arguments])
+    except OSError as error:
+        fail(1, f"cannot run {path}: {error.strerror}")
+
+
+def list_executables(package: str | None) -> int:
+    """Print `package executable` lines, of all packages or of one."""
+    found = prefixes() if package is None else {package: find_package(package)}
+    for name, prefix in sorted(found.items()):
+        for executable in executables(name, prefix):
+            print(f"{name} {executable}")
+    return 0
+
+
+def main(arguments: list[str]) -> int:
+    """Do what the command line says."""
+    match arguments:
+        case [] | ["-h" | "--help", *_] | ["run" | "pkg", "-h" | "--help", *_]:
+            print(HELP, end="")
+            return 0
+        case ["run", package, executable, *rest]:
+            run(package, executable, rest)
+        case ["run", *_]:
+            fail(2, "usage: ros2 run PACKAGE EXECUTABLE [arguments]")
+        case ["pkg", "executables", "-h" | "--help"]:
+            print(HELP, end="")
+            return 0
+        case ["pkg", "executables"]:
+            return list_executables(None)
+        case ["pkg", "executables", package]:
+            return list_executables(package)
+        case [command, *_]:
+            fail(
+                2,
+                "this stand-in knows only `ros2 run` and `ros2 pkg executables`; "
+                f"`ros2 {command}` needs an installed ROS 2 Jazzy (ros2 --help)",
+            )
+    return 2
+
+
+if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    sys.exit(main(sys.argv[1:]))
