@@ -26,7 +26,7 @@ from needle_bringup.operator_sequence import (
 )
 from needle_bringup.progress import Progress
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.cli import EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.conversions import HOLD, LATCHED, to_stamp, values_of
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
@@ -41,7 +41,8 @@ progress. Never use it on a rig that moves a real needle: there a person holds.
 Publishes   device/hold
 Subscribes  needle/controller_status, device/status
 Calls       device/confirm_needle_out, device/home, device/enable, plane_controller/start
-Exit code   0 when the depth was reached, 1 otherwise, 2 for bad parameters, 130 when interrupted
+Exit code   0 when the depth was reached, 1 when it was not, 2 when the rig did not get ready or for
+            bad parameters, 130 when interrupted
 """
 
 DISABLE_TIMEOUT = 1.0
@@ -104,6 +105,8 @@ class OperatorNode(Node):
         self._progress.close(f"operator: {outcome.reason}")
         if outcome.interrupted:
             return EXIT_INTERRUPTED
+        if not outcome.prepared:
+            return EXIT_BAD_INPUT
         return EXIT_DONE if outcome.done else EXIT_MISSED
 
     def _on_timer(self) -> None:

@@ -44,12 +44,15 @@ class Outcome:
         Whether the controller reached its depth.
     reason : str
         One line for the person at the terminal.
+    prepared : bool
+        Whether the rig got ready at all.
     interrupted : bool
         Whether a signal ended it.
     """
 
     done: bool
     reason: str
+    prepared: bool = True
     interrupted: bool = False
 
 
@@ -188,7 +191,7 @@ class OperatorSequence:
 
     def _end(self, reason: str) -> None:
         if self.outcome is None:
-            self.outcome = Outcome(False, reason)
+            self.outcome = Outcome(False, reason, prepared=self._prepared == len(PREPARATION))
 
 
 def _why(values: Mapping[str, str]) -> str:
