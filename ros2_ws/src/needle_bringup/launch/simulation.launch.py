@@ -1,0 +1,93 @@
+"""The simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
+
+    ros2 launch needle_bringup simulation.launch.py level:=tip operator:=true bag:=bags/by_launch
+
+`scripts/simulate` does the same without `launch`, and reports.
+"""
+
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch.conditions import IfCondition, LaunchConfigurationEquals, LaunchConfigurationNotEquals
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from launch import LaunchDescription
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Return the graph of a simulated run."""
+    rig = str(Path(get_package_share_directory("needle_bringup")) / "config" / "rig.yaml")
+    params = LaunchConfiguration("params")
+    sim_time = {"use_sim_time": True}
+    operator = Node(
+        package="needle_bringup",
+        executable="operator",
+        parameters=[rig, params, sim_time],
+        output="screen",
+        condition=IfCondition(LaunchConfiguration("operator")),
+    )
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("level", default_value="camera", description="tip or camera"),
+            DeclareLaunchArgument("seed", default_value="1", description="seed of all noise"),
+            DeclareLaunchArgument(
+                "real_time_factor", default_value="1.0", description="0.0: lock step"
+            ),
+            DeclareLaunchArgument(
+                "controller", default_value="paper", description="paper or open_loop"
+            ),
+            DeclareLaunchArgument(
+                "operator", default_value="false", description="let the stand-in keep the hold"
+            ),
+            DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
+            DeclareLaunchArgument(
+                "params", default_value=rig, description="parameter file on top of rig.yaml"
+            ),
+            Node(
+                package="needle_bringup",
+                executable="recorder",
+                parameters=[rig, params, {"bag": LaunchConfiguration("bag")}],
+                condition=LaunchConfigurationNotEquals("bag", ""),
+            ),
+            Node(
+                package="needle_sim",
+                executable="sim_rig",
+                parameters=[
+                    rig,
+                    params,
+                    sim_time,
+                    {
+                        "level": LaunchConfiguration("level"),
+                        "seed": ParameterValue(LaunchConfiguration("seed"), value_type=int),
+                        "real_time_factor": ParameterValue(
+                            LaunchConfiguration("real_time_factor"), value_type=float
+                        ),
+                    },
+                ],
+                output="screen",
+            ),
+            Node(
+                package="needle_tracker",
+                executable="stereo_tracker",
+                parameters=[rig, params, sim_time],
+                output="screen",
+                condition=LaunchConfigurationEquals("level", "camera"),
+            ),
+            Node(
+                package="needle_controller",
+                executable="plane_controller",
+                parameters=[rig, params, sim_time, {"preset": LaunchConfiguration("controller")}],
+                output="screen",
+            ),
+            operator,
+            # The run is over with the operator; without one, with Ctrl-C.
+            RegisterEventHandler(
+                OnProcessExit(target_action=operator, on_exit=[EmitEvent(event=Shutdown())])
+            ),
+        ]
+    )
