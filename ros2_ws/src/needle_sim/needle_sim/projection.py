@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike
 from needle_sim.se3 import FloatArray
 from needle_sim.stereo_rig import Camera
 
-# The slope's equation is concave and increasing: Newton needs 4 steps to the last digit at 45 deg.
-_NEWTON_STEPS = 6
+# The slope's equation is concave and increasing: Newton is at the last digit after 3 steps.
+_NEWTON_STEPS = 4
 
 
 def camera_centre(camera: Camera) -> FloatArray:

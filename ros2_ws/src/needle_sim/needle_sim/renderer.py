@@ -25,9 +25,10 @@ _ENTRY_RIM = 34.0
 # Lens and pixel: an edge rises over about 2 px, as with a well focused 16 mm lens.
 _BLUR_PX = 0.7
 _NOISE = 3.0
-# The sensor's noise at 65536 equally likely levels: one 16-bit draw a pixel takes a third of the time
-# of a normal one.
+# The sensor's noise at 65536 equally likely levels: one 16-bit draw a pixel takes a third of the
+# time of a normal one.
 _NOISE_TABLE = (_NOISE * ndtri((np.arange(65536) + 0.5) / 65536.0)).astype(np.float32)
+_NOISE_BAND_ROWS = 32
 _MOTTLE = 1.5
 _MOTTLE_SIZE_PX = 15.0
 _LINE_SPACING = 0.0003
@@ -117,7 +118,10 @@ class _View:
         image = self._background.copy()
         if len(line):
             self._draw_tube(image, line, diameter, _NEEDLE)
-        image += _NOISE_TABLE.take(rng.integers(0, 65536, image.shape, dtype=np.uint16))
+        # In bands that stay in the cache: large temporaries cost more than the noise itself.
+        for top in range(0, len(image), _NOISE_BAND_ROWS):
+            band = image[top : top + _NOISE_BAND_ROWS]
+            band += _NOISE_TABLE.take(rng.integers(0, 65536, band.shape, dtype=np.uint16))
         # Rounds and saturates.
         return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
 
