@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from needle_common.errors import OutOfBoundsError, UserError
 from numpy.typing import NDArray
+
+from needle_common.errors import OutOfBoundsError, UserError
 
 SIDES = ("left", "right")
 _DISTORTION_MODEL = "plumb_bob"

@@ -195,10 +195,10 @@ def _noise(values: NDArray[np.float32]) -> float:
 def _best_path(
     evidence: Ridge, steps: NDArray[np.int_], start: tuple[int, int] | None
 ) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-    """Return rows and columns of the path with the largest sum of evidence, or None if no sum > 0.
+    """Return rows and columns of the path with the most evidence, None if no sum is positive.
 
-    The path starts in the first row (within `start`, if given), may end in any row and moves at most
-    `steps[row]` columns sideways from a row to the next.
+    The path starts in the first row (within `start`, if given), may end in any row and moves at
+    most `steps[row]` columns sideways from a row to the next.
     """
     rows, columns = evidence.shape
     total = np.empty_like(evidence)

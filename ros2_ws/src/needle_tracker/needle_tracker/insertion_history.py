@@ -40,7 +40,7 @@ class InsertionHistory:
         self._samples.append((stamp, insertion))
 
     def is_bracketed(self, stamp: int) -> bool:
-        """Return whether a sample at or after `stamp` [ns] has come, so that no other can matter."""
+        """Return whether a sample at or after `stamp` [ns] has come: no later one can matter."""
         return bool(self._samples) and self._samples[-1][0] >= stamp
 
     def at(self, stamp: int) -> float | None:

@@ -97,6 +97,7 @@ def make_search_grid(
     row_pitch: float = 0.5e-3,
     angle_pitch: float = math.radians(0.25),
     parallax_angle: float = math.radians(6.0),
+    body_offset: float = 1.0e-3,
     border_px: int = 6,
 ) -> SearchGrid:
     """Lay the grid out for one camera.
@@ -115,6 +116,8 @@ def make_search_grid(
         Angle between columns [rad].
     parallax_angle : float
         Room for needles above and below the plane x = 0, which appear displaced sideways [rad].
+    body_offset : float
+        How far the shaft lies beside the tip's path, with a pre-bend of 10 deg over 9 mm [m].
     border_px : int
         Width of the image's border that is not searched [px].
 
@@ -124,9 +127,9 @@ def make_search_grid(
         The grid.
     """
     distances = np.arange(first_distance, reach.length, row_pitch)
-    limit = reach.chord_angle(distances) + parallax_angle
+    limit = reach.chord_angle(distances) + np.arctan2(body_offset, distances) + parallax_angle
     # Close to the entry the hole's tolerance would ask for any angle.
-    widest = min(float(limit[len(limit) // 4 :].max()) + 2.0 * angle_pitch, math.radians(75.0))
+    widest = min(float(limit[len(limit) // 4 :].max()), math.radians(75.0))
     half = math.ceil(widest / angle_pitch)
     angles = angle_pitch * np.arange(-half, half + 1)
     points = np.stack(
@@ -148,5 +151,8 @@ def make_search_grid(
         )
     reachable = inside & (np.abs(angles)[None, :] <= limit[:, None])
     return SearchGrid(
-        distances, angles, np.nan_to_num(pixels, nan=-1e3).astype(np.float32), reachable
+        np.asarray(distances, dtype=np.float64),
+        angles,
+        np.nan_to_num(pixels, nan=-1e3).astype(np.float32),
+        reachable,
     )

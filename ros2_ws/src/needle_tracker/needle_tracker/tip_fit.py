@@ -8,6 +8,7 @@ the tip.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import cv2
@@ -74,7 +75,7 @@ def fit_tip(image: Image, path: Path, settings: DetectionSettings) -> ImageTip |
     """
     end, direction = _coarse_line(path.pixels)
     behind = min(float(_BEHIND_PX), float(np.linalg.norm(path.pixels[0] - end)) + 2.0)
-    for _ in range(_ITERATIONS):
+    for iteration in itertools.count(1):
         band = _Band.of(image, end, direction, behind, settings)
         tip_along = band.end()
         if tip_along is None:
@@ -82,28 +83,27 @@ def fit_tip(image: Image, path: Path, settings: DetectionSettings) -> ImageTip |
         fit = band.line(tip_along)
         if fit is None:
             return None
-        offset, slope = fit.offset, fit.slope
         normal = np.array([-direction[1], direction[0]])
-        moved = end + tip_along * direction + (offset + slope * tip_along) * normal
-        turned = direction + slope * normal
+        moved = end + tip_along * direction + fit.offset * normal
+        turned = direction + fit.slope * normal
         turned = turned / np.linalg.norm(turned)
         settled = bool(
-            np.abs(moved - end).max() < 0.02 and abs(slope) < 2e-3  # below any noise
+            np.abs(moved - end).max() < 0.02 and abs(fit.slope) < 2e-3  # below any noise
         )
         behind = min(float(_BEHIND_PX), behind + tip_along)
         end, direction = moved, turned
         if behind < _LEAST_LINE_PX + 4.0:
             return None
-        if settled:
-            break
-    return ImageTip(
-        point=end,
-        direction=direction,
-        sigma_across=math.hypot(fit.sigma_end, _LINE_SYSTEMATIC_PX),
-        sigma_along=math.hypot(band.sigma_end(), _END_SYSTEMATIC_PX),
-        sigma_angle=math.hypot(fit.sigma_slope, _LINE_SYSTEMATIC_PX / _LINE_PX),
-        contrast=band.level / settings.needle_width_px,
-    )
+        if settled or iteration == _ITERATIONS:
+            return ImageTip(
+                point=end,
+                direction=direction,
+                sigma_across=math.hypot(fit.sigma_end, _LINE_SYSTEMATIC_PX),
+                sigma_along=math.hypot(band.sigma_end(), _END_SYSTEMATIC_PX),
+                sigma_angle=math.hypot(fit.sigma_slope, _LINE_SYSTEMATIC_PX / _LINE_PX),
+                contrast=band.level / settings.needle_width_px,
+            )
+    return None
 
 
 def _coarse_line(pixels: Array) -> tuple[Array, Array]:
@@ -194,7 +194,7 @@ class _Band:
     def _end_elsewhere(
         self, below: NDArray[np.bool_], mass: Array, half: float, level: float
     ) -> float | None:
-        """The coarse end lies beyond the tip or far short of it: look along the whole band."""
+        """Return the last crossing of the whole band, for a coarse end far from the tip."""
         crossings = np.flatnonzero(below[1:] & ~below[:-1]) + 1
         if below[0] or len(crossings) == 0:
             return None
@@ -217,25 +217,30 @@ class _Band:
         use &= self._mass > 0.5 * self.level
         if np.count_nonzero(use) < _LEAST_LINE_PX:
             return None
-        along = self.along[use]
         weights = self.darkness[use][:, near]
         centres = (weights @ self.across[near]) / weights.sum(axis=1)
-        keep = np.ones(len(along), dtype=bool)
-        for _ in range(3):
-            slope, offset = np.polyfit(along[keep], centres[keep], 1)
-            residual = centres - (offset + slope * along)
+        # From the end backwards in units of the fitted length: offset, slope and bend at the end.
+        length = float(self.along[use][-1] - self.along[use][0])
+        back = (self.along[use] - tip_along) / length
+        terms = np.stack([np.ones_like(back), back, back * back], axis=1)
+        keep = np.ones(len(back), dtype=bool)
+        for _ in range(2):
+            normal = terms[keep].T @ terms[keep]
+            solution = np.linalg.solve(normal, terms[keep].T @ centres[keep])
+            residual = centres - terms @ solution
             scale = max(1.4826 * float(np.median(np.abs(residual[keep]))), 0.02)
             keep = np.abs(residual) <= 3.0 * scale
             if np.count_nonzero(keep) < _LEAST_LINE_PX:
                 return None
-        spread = float(np.sqrt(np.mean(residual[keep] ** 2)))
-        centred = along[keep] - along[keep].mean()
-        inertia = float(centred @ centred)
         # Neighbouring rows share pixels: about every second one is new.
-        sigma_slope = spread * math.sqrt(2.0 / inertia)
-        lever = tip_along - float(along[keep].mean())
-        sigma_end = math.hypot(spread * math.sqrt(2.0 / len(centred)), sigma_slope * lever)
-        return _Line(float(offset), float(slope), sigma_end, sigma_slope)
+        spread = math.sqrt(2.0 * float(np.mean(residual[keep] ** 2)))
+        covariance = spread**2 * np.linalg.inv(normal)
+        return _Line(
+            float(solution[0]),
+            float(solution[1]) / length,
+            math.sqrt(float(covariance[0, 0])),
+            math.sqrt(float(covariance[1, 1])) / length,
+        )
 
 
 def _smooth(values: Array, width: int) -> Array:

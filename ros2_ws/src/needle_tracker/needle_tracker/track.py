@@ -104,33 +104,34 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
     str or None
         Short reason, the same for the same gate (it is counted by).
     """
-    distance = float(np.linalg.norm(tip.position))
-    reach = settings.reach
-    if tip.disagreement > settings.max_disagreement:
-        return "views disagree along the needle"
-    if tip.disagreement_across > settings.max_miss_px:
-        return "views disagree across the needle"
-    if math.sqrt(float(np.linalg.eigvalsh(tip.covariance)[-1])) > settings.max_depth_sigma:
-        return "too uncertain"
-    if tip.position[0] > settings.surface_height:
-        return "above the surface"
-    if distance < settings.least_distance:
-        return "too close to the entry"
-    if distance > reach.length + settings.insertion_margin:
-        return "beyond the longest insertion"
-    off_axis = math.acos(min(max(float(tip.position[2]) / distance, -1.0), 1.0))
-    if off_axis > float(reach.chord_angle(np.array(distance))):
-        return "outside the reachable cone"
+    reach, margin = settings.reach, settings.insertion_margin
+    distance = max(float(np.linalg.norm(tip.position)), 1e-9)
+    largest_sigma = math.sqrt(float(np.linalg.eigvalsh(tip.covariance)[-1]))
     path_length = distance if insertion is None else max(insertion, distance)
-    heading_limit = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
-    if math.acos(min(max(float(tip.direction[2]), -1.0), 1.0)) > heading_limit:
-        return "direction not reachable"
+    # Steered ever the same way, and a little more for what the margins leave open.
+    largest_turn = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
+    checks = [
+        (tip.disagreement > settings.max_disagreement, "views disagree along the needle"),
+        (tip.disagreement_across > settings.max_miss_px, "views disagree across the needle"),
+        (largest_sigma > settings.max_depth_sigma, "too uncertain"),
+        (tip.position[0] > settings.surface_height, "above the surface"),
+        (distance < settings.least_distance, "too close to the entry"),
+        (distance > reach.length + margin, "beyond the longest insertion"),
+        (
+            _angle_to_z(tip.position / distance) > float(reach.chord_angle(np.array(distance))),
+            "outside the reachable cone",
+        ),
+        (_angle_to_z(tip.direction) > largest_turn, "direction not reachable"),
+    ]
     if insertion is not None:
-        if distance > insertion + settings.insertion_margin:
-            return "farther than the insertion"
-        if distance < reach.shortest_chord(insertion) - settings.insertion_margin:
-            return "short of the insertion"
-    return None
+        shortest = reach.shortest_chord(insertion)
+        checks.append((distance > insertion + margin, "farther than the insertion"))
+        checks.append((distance < shortest - margin, "short of the insertion"))
+    return next((reason for failed, reason in checks if failed), None)
+
+
+def _angle_to_z(unit: Array) -> float:
+    return math.acos(min(max(float(unit[2]), -1.0), 1.0))
 
 
 class Track:

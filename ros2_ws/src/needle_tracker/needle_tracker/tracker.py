@@ -11,7 +11,6 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from needle_tracker.calibration import SIDES, StereoCalibration
 from needle_tracker.detection import (
@@ -146,6 +145,9 @@ class StereoTracker:
         for side, image, shape in zip(SIDES, images, self._shapes, strict=True):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
+        for side, image in zip(SIDES, images, strict=True):
+            if int(image[::8, ::8].max()) < self.settings.min_contrast:
+                return self.skip(f"{side} image is black")
         if insertion is not None and insertion < self.settings.entry_zone:
             self._paths = None
             self.track.enter()
@@ -174,6 +176,11 @@ class StereoTracker:
                 measured, tip=None, state=self.track.state, reason="not confirmed yet"
             )
         return dataclasses.replace(measured, state=self.track.state)
+
+    def skip(self, reason: str) -> Measurement:
+        """Answer a pair that cannot be looked at; it counts as one without a tip."""
+        self.track.miss()
+        return Measurement(None, self.track.state, reason)
 
     def _measure(
         self, images: tuple[Image, Image], windows: tuple[Window, Window], insertion: float | None

@@ -145,8 +145,8 @@ def _shaft_direction(
 ) -> tuple[Array, Array] | None:
     """Return the shaft's direction in `rig`, and its covariance.
 
-    Seen through a camera's Jacobian J, the direction d runs along the image line: n . J d = 0 with n
-    across the line. So d is across both J^T n: the intersection of two planes.
+    Seen through a camera's Jacobian J, the direction d runs along the image line: n . J d = 0 with
+    n across the line. So d is across both J^T n: the intersection of two planes.
     """
     normals = [j.T @ axis[0] for j, axis in zip(jacobians, axes, strict=True)]
     cross = np.cross(normals[0], normals[1])

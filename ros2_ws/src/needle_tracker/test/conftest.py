@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+
 from needle_tracker.calibration import StereoCalibration, load_calibration
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach
@@ -70,7 +72,7 @@ def draw_line(
     """Return a float image with an anti-aliased polyline with square ends, by distance."""
     image = np.full(shape, background)
     coverage = np.zeros(shape)
-    for first, second in zip(points[:-1], points[1:], strict=True):
+    for first, second in itertools.pairwise(points):
         low = np.maximum(np.floor(np.minimum(first, second) - width), 0).astype(int)
         high = np.ceil(np.maximum(first, second) + width).astype(int) + 1
         v, u = np.mgrid[low[1] : min(high[1], shape[0]), low[0] : min(high[0], shape[1])]
