@@ -1,0 +1,86 @@
+"""What the motion supervisor asks of an axis, whatever moves it."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+
+
+class AxisError(Exception):
+    """An axis could not take an order; the text says which axis and why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class AxisSnapshot:
+    """The last that an axis said about itself.
+
+    Attributes
+    ----------
+    time : float
+        When the reply arrived, on the steady clock [s].
+    position : float
+        Measured position [m or rad]; only relative while not `homed`.
+    velocity : float
+        Measured velocity [m/s or rad/s].
+    powered : bool
+        Whether the axis is able to move.
+    homed : bool
+        Whether `position` counts from the home switch.
+    moving : bool
+        Whether an order (move, homing) is under way.
+    at_home_switch : bool
+        Whether the home switch is touched.
+    fault : str
+        Why the axis refuses to move; empty: no fault.
+    """
+
+    time: float
+    position: float
+    velocity: float
+    powered: bool
+    homed: bool
+    moving: bool
+    at_home_switch: bool
+    fault: str
+
+
+class Axis(abc.ABC):
+    """One axis. Positions in m or rad, speeds in m/s or rad/s, never negative.
+
+    No order that moves waits until it is carried out; `poll` tells. Any may raise `AxisError`.
+    """
+
+    @abc.abstractmethod
+    def configure(self) -> None:
+        """Set the axis up; moves nothing."""
+
+    @abc.abstractmethod
+    def power(self, on: bool) -> None:
+        """Switch the axis on, its target being where it is, or off; moves nothing."""
+
+    @abc.abstractmethod
+    def home(self, speed: float) -> None:
+        """Start to look for the home switch, at most at `speed`; position 0 is there.
+
+        The axis is not homed from the order on until the switch is found.
+        """
+
+    @abc.abstractmethod
+    def start_move(self, target: float, speed: float) -> None:
+        """Go to `target` at `speed` and end there by itself; replaces the move before."""
+
+    @abc.abstractmethod
+    def stop(self) -> None:
+        """Stop as fast as the axis can and forget the target."""
+
+    @abc.abstractmethod
+    def reset(self) -> None:
+        """Acknowledge a fault and wait for the axis' answer; moves nothing."""
+
+    @abc.abstractmethod
+    def poll(self, now: float) -> AxisSnapshot:
+        """Return the newest reply; `now` is the steady time [s]. Sends and waits for nothing."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Stop, switch off and let go of the link. May be called twice."""

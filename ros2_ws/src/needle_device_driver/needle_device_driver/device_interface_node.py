@@ -1,0 +1,153 @@
+"""The `device/...` interface on a node: the same for real, emulated and simulated axes."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, Joy
+from std_msgs.msg import Bool, Header
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from needle_common.base_node import DiagnosticsPublisher
+from needle_common.conversions import HOLD, JOINT_STATES, LATCHED, RELIABLE, to_stamp
+from needle_device_driver.conversions import (
+    to_command,
+    to_diagnostic,
+    to_hold_message,
+    to_joint_state,
+    to_result,
+    to_status,
+)
+from needle_device_driver.reports import DeviceStatus, Notice, Reply, StepResult
+from needle_device_driver.supervisor import MotionSupervisor
+
+# Positions alone change device/status so often at most [s]; joint_states has them all.
+_STATUS_PERIOD = 0.5
+
+
+class DeviceInterface:
+    """Connects a motion supervisor to the topics and services of `device/...`.
+
+    Parameters
+    ----------
+    node : Node
+        The node that gets publishers, subscriptions and services.
+    supervisor : MotionSupervisor
+        What they speak for.
+    diagnostics : DiagnosticsPublisher
+        Where the device's health goes.
+    refuse : callable, optional
+        Returns why services are not ready yet, empty when they are; a stop, a disabling and an
+        emergency stop are never refused.
+    on_result : callable, optional
+        Called with each result after it was published.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        supervisor: MotionSupervisor,
+        diagnostics: DiagnosticsPublisher,
+        *,
+        refuse: Callable[[], str] = lambda: "",
+        on_result: Callable[[StepResult], None] = lambda _: None,
+    ) -> None:
+        self._node = node
+        self._supervisor = supervisor
+        self._diagnostics = diagnostics
+        self._refuse = refuse
+        self._on_result = on_result
+        self._told: DeviceStatus | None = None
+        self._told_at = 0.0
+        self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
+        self.results = node.create_publisher(Header, "device/result", RELIABLE)
+        self.statuses = node.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+        self.commands = node.create_subscription(
+            JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
+        )
+        self.holds = node.create_subscription(Joy, "device/hold", self._on_hold, HOLD)
+        self.estops = node.create_subscription(Bool, "device/estop", self._on_estop, RELIABLE)
+        now = time.monotonic
+        self._service("home", lambda: supervisor.home(now()))
+        self._service("retract", lambda: supervisor.retract(now()))
+        self._service("reset", lambda: supervisor.reset(now()))
+        self._service("stop", supervisor.stop, always=True)
+        self._switch("enable", lambda on: supervisor.enable(on, now()))
+        self._switch("confirm_needle_out", supervisor.confirm_needle_out)
+        self.report()
+
+    def report(self) -> None:
+        """Publish results and status changes; call it after each cycle."""
+        for event in self._supervisor.take_events():
+            if isinstance(event, StepResult):
+                self.results.publish(to_result(event))
+                self._on_result(event)
+            elif isinstance(event, Notice):
+                rule = "" if event.rule is None else f" [{event.rule.value}]"
+                self._node.get_logger().warning(event.text + rule)
+        now = time.monotonic()
+        status = self._supervisor.status(now)
+        told = self._told
+        if told == status:
+            return
+        if (
+            told is None
+            or now - self._told_at > _STATUS_PERIOD
+            or dataclasses.replace(status, insertion=told.insertion, rotation=told.rotation) != told
+        ):
+            self._tell(status, now)
+
+    def publish_joint_states(self, stamp_ns: int) -> None:
+        """Publish the measured joints, sampled at `stamp_ns`, unless they are stale."""
+        joints = self._supervisor.joints(time.monotonic())
+        if joints is not None:
+            self.joint_states.publish(to_joint_state(joints, to_stamp(stamp_ns)))
+
+    def _tell(self, status: DeviceStatus, now: float) -> None:
+        told = self._told
+        self._told, self._told_at = status, now
+        self.statuses.publish(to_status(status, self._node.get_name()))
+        self._diagnostics.set("device", to_diagnostic(status))
+        if told is None or told.state is not status.state:
+            why = f" ({status.reason})" if status.reason else ""
+            self._node.get_logger().debug(f"device: {status.state.value}{why}")
+
+    def _on_command(self, message: JointTrajectory) -> None:
+        self._supervisor.submit(
+            to_command(message), time.monotonic(), self.commands.get_publisher_count()
+        )
+        self.report()
+
+    def _on_hold(self, message: Joy) -> None:
+        self._supervisor.receive_hold(to_hold_message(message), time.monotonic())
+        self.report()
+
+    def _on_estop(self, message: Bool) -> None:
+        self._supervisor.receive_estop(bool(message.data))
+        self.report()
+
+    def _service(self, name: str, call: Callable[[], Reply], *, always: bool = False) -> None:
+        def answer(_: Any, response: Any) -> Any:
+            return self._answer(response, call, always=always)
+
+        self._node.create_service(Trigger, f"device/{name}", answer)
+
+    def _switch(self, name: str, call: Callable[[bool], Reply]) -> None:
+        def answer(request: Any, response: Any) -> Any:
+            on = bool(request.data)
+            return self._answer(response, lambda: call(on), always=not on)
+
+        self._node.create_service(SetBool, f"device/{name}", answer)
+
+    def _answer(self, response: Any, call: Callable[[], Reply], *, always: bool) -> Any:
+        why_not = "" if always else self._refuse()
+        reply = Reply(False, why_not) if why_not else call()
+        response.success, response.message = reply.success, reply.message
+        self.report()
+        return response

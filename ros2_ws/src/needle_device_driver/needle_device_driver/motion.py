@@ -1,0 +1,63 @@
+"""Both joints on one straight way, in proportion at every moment."""
+
+from __future__ import annotations
+
+import dataclasses
+
+
+@dataclasses.dataclass(frozen=True)
+class SetPoint:
+    """Where the joints shall be after the next period, and how fast they go there.
+
+    Attributes
+    ----------
+    insertion, rotation : float
+        Targets [m], [rad].
+    insertion_speed, rotation_speed : float
+        Speeds [m/s], [rad/s], not negative.
+    """
+
+    insertion: float
+    rotation: float
+    insertion_speed: float
+    rotation_speed: float
+
+
+class CoordinatedMotion:
+    """A motion whose progress is one number, so that the joints cannot part when speed changes.
+
+    Parameters
+    ----------
+    start, end : tuple of float
+        Insertion [m] and rotation [rad].
+    duration : float
+        Time at full speed [s].
+    """
+
+    def __init__(
+        self, start: tuple[float, float], end: tuple[float, float], duration: float
+    ) -> None:
+        self._start = start
+        self.end = end
+        self._duration = duration
+        self._progress = 0.0
+
+    @property
+    def complete(self) -> bool:
+        """Whether the last set-point was given."""
+        return self._progress >= 1.0
+
+    def advance(self, period: float, speed_scale: float) -> SetPoint:
+        """Return the set-point `period` [s] later at `speed_scale` (0..1) of full speed."""
+        rate = speed_scale / self._duration
+        # Progress sums up rounding; without the margin a step could take a period of nothing more.
+        self._progress += rate * period
+        if self._progress > 1.0 - 1e-9:
+            self._progress = 1.0
+        insertion, rotation = (
+            # Exactly the target at the end: start + (end - start) is not.
+            end if self.complete else start + self._progress * (end - start)
+            for start, end in zip(self._start, self.end, strict=True)
+        )
+        speeds = [rate * abs(end - start) for start, end in zip(self._start, self.end, strict=True)]
+        return SetPoint(insertion, rotation, *speeds)
