@@ -1,0 +1,398 @@
+"""The `sim_rig` executable: stands in for the rig behind the same topics and services."""
+
+from __future__ import annotations
+
+import math
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from ament_index_python.packages import get_package_share_directory
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import CameraInfo, Image
+
+from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE
+from needle_common.conversions import (
+    IMAGES,
+    LATCHED,
+    NANOSECONDS,
+    RELIABLE,
+    to_nanoseconds,
+    to_stamp,
+    values_of,
+)
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.parameters import NodeParameters
+from needle_device_driver.device_interface_node import DeviceInterface
+from needle_device_driver.reports import StepResult
+from needle_device_driver.states import Activity
+from needle_device_driver.supervisor import MotionSupervisor
+from needle_sim.bench import SimulatedBench
+from needle_sim.conversions import to_camera_info, to_image, to_tip, to_tip_pose, to_truth
+from needle_sim.lock_step import Action, LockStep
+from needle_sim.pace import Pace
+from needle_sim.parameters import SimRigParameters
+from needle_sim.renderer import StereoRenderer
+from needle_sim.stereo_rig import load_stereo_rig
+
+HELP = """\
+sim_rig: stands in for the rig, so that every other node runs as on the real one.
+
+Publishes   /clock, joint_states, device/status, device/result, sim/tip_pose (the truth);
+            level tip: needle/tip, needle/tip_pose;
+            level camera: stereo/{left,right}/image_raw, stereo/{left,right}/camera_info
+Subscribes  device/joint_trajectory, device/hold, device/estop, needle/controller_status;
+            level camera: needle/tip_pose
+Services    device/{home,retract,stop,reset}, device/{enable,confirm_needle_out}
+"""
+
+TICK_NS = 20_000_000
+TICK = TICK_NS / NANOSECONDS
+# ROS takes time 0 for "no time yet".
+START_NS = NANOSECONDS
+_CLOCK_REPEAT = 0.1
+_MATCH_CHECK = 0.02
+_IDLE = 0.01
+_CENTRELINE_SPACING = 0.001
+_RECORDER = "recorder"
+
+
+class SimRigNode(Node):
+    """Owns the clock, the simulated bench and the device interface in front of it.
+
+    Parameters
+    ----------
+    node_arguments : dict
+        Passed on to rclpy's Node (a context of its own, parameter overrides).
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("sim_rig", **node_arguments)
+        self._settings = values = NodeParameters(self, SimRigParameters).values
+        self._bench = SimulatedBench(
+            curvature=values.curvature,
+            pitch=values.initial_pitch,
+            roll=values.initial_roll,
+            torsion_play=values.torsion_play,
+            torsion_lag=values.torsion_lag,
+            tip_noise=values.tip_noise,
+            seed=values.seed,
+        )
+        self._is_camera = values.level == "camera"
+        self._lock_step: LockStep | None = None
+        self._pace: Pace | None = None
+        if values.real_time_factor > 0.0:
+            self._pace = Pace(TICK, values.real_time_factor)
+        else:
+            self._lock_step = LockStep(
+                answered=self._is_camera, reexpose_after=values.reexpose_after
+            )
+        self._supervisor = MotionSupervisor(
+            self._bench.insertion,
+            self._bench.rotation,
+            values.limits,
+            pause_on_lapse=self._lock_step is not None,
+        )
+        self._time_ns = START_NS
+        self._started = False
+        self._ended = ""
+        self._missing = "all partners"
+        self._match_checked_at = -math.inf
+        self._clock_told_at = -math.inf
+        self._exposures = 0
+        self._next_frame_ns = START_NS
+        self._supervisor.configure(time.monotonic())
+        if not self.get_parameter("use_sim_time").value:
+            # Its own time without the detour over /clock.
+            self.get_clock()._set_ros_time_is_active(True)
+            self._set_time(START_NS)
+
+        self._clock_publisher = self.create_publisher(Clock, "/clock", RELIABLE)
+        self._truth = self.create_publisher(PoseStamped, "sim/tip_pose", RELIABLE)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._device = DeviceInterface(
+            self,
+            self._supervisor,
+            self._diagnostics,
+            refuse=self._why_not_ready,
+            on_result=self._on_result,
+        )
+        self._controller_status = self.create_subscription(
+            DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
+        )
+        self._measurements: list[Publisher[Any]] = []
+        if self._is_camera:
+            self._create_cameras()
+        else:
+            self._tip = self._publisher(PointStamped, "needle/tip")
+            self._tip_pose = self._publisher(PoseWithCovarianceStamped, "needle/tip_pose")
+
+    # ---- the loop -----------------------------------------------------------------------------
+
+    def turn(self) -> float:
+        """Do what is due now.
+
+        Returns
+        -------
+        float
+            How long the loop may wait for callbacks before the next turn [s].
+        """
+        now = time.monotonic()
+        if not self._started:
+            self._start_if_matched(now)
+            self._idle(now)
+            return _IDLE
+        if self._pace is not None:
+            return self._turn_in_real_time(self._pace, now)
+        assert self._lock_step is not None
+        self._supervisor.observe(now)
+        trips = self._lock_step.watchdog_trips
+        action = self._lock_step.next_action(
+            under_way=self._supervisor.activity is not Activity.NONE,
+            may_move=self._supervisor.may_move(now),
+            held=bool(self._supervisor.status(now).hold_owner),
+            now=now,
+        )
+        if self._lock_step.watchdog_trips > trips:
+            self._supervisor.count_watchdog_trip()
+            self.get_logger().warning(
+                f"nothing heard for {self._settings.reexpose_after:g} s: exposed again"
+            )
+        if self._ended and action is Action.EXPOSE:
+            action = Action.WAIT
+        if action is Action.TICK:
+            self._tick(now)
+        elif action is Action.EXPOSE:
+            self._tick(now)
+            self._expose(now)
+        else:
+            self._idle(now)
+            return _IDLE
+        return 0.0
+
+    def close(self) -> None:
+        """Stop the simulated axes and say so."""
+        self._supervisor.close()
+        self._device.report()
+
+    def _turn_in_real_time(self, pace: Pace, now: float) -> float:
+        if pace.wait(now) > 0.0:
+            return pace.wait(now)
+        pace.tick(now)
+        self._tick(now)
+        if self._time_ns >= self._next_frame_ns and not self._ended:
+            self._next_frame_ns = self._time_ns + round(NANOSECONDS / self._settings.camera_rate)
+            self._expose(now)
+        return pace.wait(time.monotonic())
+
+    def _idle(self, now: float) -> None:
+        self._supervisor.observe(now)
+        self._supervisor.note_time(self._time_ns, now)
+        self._device.report()
+        if now - self._clock_told_at >= _CLOCK_REPEAT:
+            self._tell_time(now)
+
+    def _tick(self, now: float) -> None:
+        self._set_time(self._time_ns + TICK_NS)
+        self._supervisor.note_time(self._time_ns, now)
+        self._supervisor.drive(TICK, now)
+        self._bench.advance(TICK)
+        self._supervisor.observe(now)
+        self._end_outside_phantom()
+        self._tell_time(now)
+        self._device.publish_joint_states(self._time_ns)
+        self._device.report()
+
+    def _set_time(self, time_ns: int) -> None:
+        self._time_ns = time_ns
+        self.get_clock().set_ros_time_override(Time(nanoseconds=time_ns))
+
+    def _tell_time(self, now: float) -> None:
+        self._clock_publisher.publish(Clock(clock=to_stamp(self._time_ns)))
+        self._clock_told_at = now
+
+    def _expose(self, now: float) -> None:
+        stamp = to_stamp(self._time_ns)
+        number = self._exposures
+        self._exposures += 1
+        self._truth.publish(to_truth(self._bench.plant.T_rig_tip, stamp))
+        if self._is_camera:
+            images = self._renderer.render(
+                self._bench.plant.T_rig_tip,
+                self._bench.plant.centreline(_CENTRELINE_SPACING),
+                number,
+            )
+            for image, frame, camera, (image_raw, camera_info) in zip(
+                images, self._frames, self._cameras, self._views, strict=True
+            ):
+                camera_info.publish(to_camera_info(camera, frame, stamp))
+                image_raw.publish(to_image(image, frame, stamp))
+        else:
+            tip = self._bench.measure_tip(number)
+            self._tip_pose.publish(to_tip_pose(tip, self._settings.tip_noise, stamp))
+            self._tip.publish(to_tip(tip, stamp))
+        if self._lock_step is not None:
+            self._lock_step.exposed(self._time_ns, now)
+
+    def _end_outside_phantom(self) -> None:
+        if not self._is_camera or self._ended:
+            return
+        height = float(self._bench.tip[0])
+        if abs(height) > self._surface_height:
+            self._ended = (
+                f"the tip left the phantom: x = {height * 1e3:.2f} mm is beyond "
+                f"{math.copysign(self._surface_height, height) * 1e3:.2f} mm"
+            )
+            self._supervisor.fail(self._ended)
+
+    # ---- start --------------------------------------------------------------------------------
+
+    def _start_if_matched(self, now: float) -> None:
+        if now - self._match_checked_at < _MATCH_CHECK:
+            return
+        self._match_checked_at = now
+        self._missing = ", ".join(self._missing_partners())
+        if self._missing:
+            self._diagnostics.set(
+                "simulation", Diagnostic(Level.WARN, f"waiting for {self._missing}")
+            )
+            return
+        self._started = True
+        self._tell_time(now)
+        self._device.publish_joint_states(self._time_ns)
+        self._diagnostics.set("simulation", Diagnostic(Level.OK, "running"))
+        self.get_logger().info("all partners are there: time starts")
+
+    def _missing_partners(self) -> list[str]:
+        publishers = [self._device.joint_states, self._device.results, self._device.statuses]
+        subscriptions = [self._device.commands, self._device.holds, self._controller_status]
+        if self._is_camera:
+            publishers += [image_raw for image_raw, _ in self._views]
+            subscriptions.append(self._answers)
+        else:
+            publishers.append(self._tip)
+        missing = [
+            f"subscriber of {publisher.topic_name}"
+            for publisher in publishers
+            if publisher.get_subscription_count() == 0
+        ]
+        missing += [
+            f"publisher of {subscription.topic_name}"
+            for subscription in subscriptions
+            if subscription.get_publisher_count() == 0
+        ]
+        if not missing and self._settings.wait_for_recorder:
+            publishers += [self._truth, *self._measurements]
+            missing += [
+                f"recorder of {publisher.topic_name}"
+                for publisher in publishers
+                if all(
+                    info.node_name != _RECORDER
+                    for info in self.get_subscriptions_info_by_topic(publisher.topic_name)
+                )
+            ]
+        return missing
+
+    def _why_not_ready(self) -> str:
+        if self._ended:
+            return f"the run has ended: {self._ended}"
+        return "" if self._started else f"waiting for {self._missing}"
+
+    def _publisher(self, message_type: type, topic: str, qos: Any = RELIABLE) -> Publisher[Any]:
+        publisher = self.create_publisher(message_type, topic, qos)
+        self._measurements.append(publisher)
+        return publisher
+
+    def _create_cameras(self) -> None:
+        file = self._settings.calibration_file or str(
+            Path(get_package_share_directory("needle_tracker")) / "config" / "calibration.yaml"
+        )
+        rig = load_stereo_rig(file)
+        self._surface_height = rig.surface_height
+        self._cameras = (rig.left, rig.right)
+        self._renderer = StereoRenderer(rig, self._settings.seed)
+        self._frames = ("left_camera_optical", "right_camera_optical")
+        self._views = [
+            (
+                self._publisher(Image, f"stereo/{side}/image_raw", IMAGES),
+                self._publisher(CameraInfo, f"stereo/{side}/camera_info", IMAGES),
+            )
+            for side in ("left", "right")
+        ]
+        self._answers = self.create_subscription(
+            PoseWithCovarianceStamped, "needle/tip_pose", self._on_answer, RELIABLE
+        )
+
+    # ---- callbacks ----------------------------------------------------------------------------
+
+    def _on_result(self, _: StepResult) -> None:
+        if self._lock_step is not None:
+            self._lock_step.step_ended(time.monotonic())
+
+    def _on_controller_status(self, message: DiagnosticStatus) -> None:
+        if self._lock_step is None:
+            return
+        values = values_of(message)
+        try:
+            tip_after_ns = int(values.get("tip_after_ns") or -1)
+        except ValueError:
+            tip_after_ns = -1
+        self._lock_step.take_controller_status(
+            values.get("state", ""), values.get("awaiting", ""), tip_after_ns, time.monotonic()
+        )
+
+    def _on_answer(self, message: PoseWithCovarianceStamped) -> None:
+        if self._lock_step is not None:
+            self._lock_step.take_answer(
+                to_nanoseconds(message.header.stamp),
+                math.isfinite(message.pose.covariance[0]),
+                time.monotonic(),
+            )
+
+
+def main() -> int:
+    """Run sim_rig; returns its exit code."""
+    ended = False
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    # rclpy's own handlers would shut the context down in the middle of a tick.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+
+    def spin(node: Node) -> int:
+        assert isinstance(node, SimRigNode)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            while not ended:
+                executor.spin_once(timeout_sec=node.turn())
+            node.close()
+        finally:
+            executor.shutdown()
+        return EXIT_DONE
+
+    return run_node(
+        SimRigNode,
+        help_text=HELP,
+        parameters=SimRigParameters,
+        spin=spin,
+        signal_handlers=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
