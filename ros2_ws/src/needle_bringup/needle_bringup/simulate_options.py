@@ -207,7 +207,7 @@ def _initial(text: str) -> tuple[float, float, float]:
     return (
         _number("--initial X_MM", parts[0], -50.0, 50.0, "mm"),
         _number("--initial PITCH_DEG", parts[1], -45.0, 45.0, "deg"),
-        _number("--initial ROLL_DEG", parts[2], -360.0, 360.0, "deg"),
+        _number("--initial ROLL_DEG", parts[2], -180.0, 180.0, "deg"),
     )
 
 

@@ -1,0 +1,246 @@
+"""What the steps of the project must show: how a check is run and what it finds."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import re
+import signal
+import subprocess
+import time
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.reader import make_reader
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from needle_common.errors import UserError
+
+# Every process that a check starts carries this in its environment, so that none can hide.
+MARK = "NEEDLE_VERIFICATION"
+SHARED_MEMORY = Path("/dev/shm")
+# RTPS: first port of a domain, and how many it has.
+PORT_BASE = 7400
+PORTS_PER_DOMAIN = 250
+
+
+@dataclasses.dataclass(frozen=True)
+class Finding:
+    """One thing that a step must show.
+
+    Attributes
+    ----------
+    key : str
+        Short name, for `--json`.
+    what : str
+        What is looked at.
+    wanted : str
+        What it must be.
+    seen : str
+        What it is.
+    passed : bool
+        Whether that is good enough.
+    """
+
+    key: str
+    what: str
+    wanted: str
+    seen: str
+    passed: bool
+
+
+Check = Callable[["Workbench"], Iterator[Finding]]
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """A finished run of `scripts/simulate`.
+
+    Attributes
+    ----------
+    code : int
+        Exit code.
+    wall : float
+        Time from the command to its end [s].
+    output : str
+        stdout and stderr, as they came.
+    bag : Path
+        The folder that was asked for.
+    left_over : list of str
+        Processes that outlived the command.
+    """
+
+    code: int
+    wall: float
+    output: str
+    bag: Path
+    left_over: list[str]
+
+    @property
+    def summary(self) -> Mapping[str, Any]:
+        """summary.json's content; empty where there is none."""
+        path = self.bag / "summary.json"
+        return dict(yaml.safe_load(path.read_text("utf-8"))) if path.is_file() else {}
+
+    def log(self, node: str) -> str:
+        """Return what a node wrote."""
+        path = self.bag / "logs" / f"{node}.log"
+        return path.read_text("utf-8", errors="replace") if path.is_file() else ""
+
+    @property
+    def last_line(self) -> str:
+        """Last line of the output."""
+        return ["", *self.output.strip().splitlines()][-1]
+
+
+class StartedRun:
+    """A run of `scripts/simulate` under way.
+
+    Parameters
+    ----------
+    command : sequence of str
+        The command line.
+    bag : Path
+        The bag's folder in it.
+    """
+
+    def __init__(self, command: Sequence[str], bag: Path) -> None:
+        self._mark = uuid.uuid4().hex
+        self._bag = bag
+        self._output = bag.with_name(bag.name + ".output")
+        self._begin = time.monotonic()
+        with self._output.open("wb") as output:
+            self.process = subprocess.Popen(
+                list(command),
+                env={**os.environ, MARK: self._mark},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def output(self) -> str:
+        """What it has written so far."""
+        return self._output.read_text("utf-8", errors="replace")
+
+    def domain(self, timeout: float = 60.0) -> int:
+        """Wait until the nodes start; return their ROS_DOMAIN_ID.
+
+        Raises
+        ------
+        UserError
+            If the run ends, or the time, before that.
+        """
+        deadline = time.monotonic() + timeout
+        while time.monotonic() < deadline and self.process.poll() is None:
+            found = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
+            if found:
+                return int(found[1])
+            time.sleep(0.02)
+        raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
+
+    def wait(self, timeout: float = 300.0) -> Run:
+        """Wait for the end; a run that does not end is killed and has code -9."""
+        try:
+            code = self.process.wait(timeout)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            code = self.process.wait()
+        wall = time.monotonic() - self._begin
+        left_over = processes_with(MARK, self._mark)
+        for pid, _ in left_over:
+            os.kill(pid, signal.SIGKILL)
+        names = [f"{pid} {name}" for pid, name in left_over]
+        return Run(code, wall, self.output, self._bag, names)
+
+
+class Workbench:
+    """Where checks run what they look at.
+
+    Parameters
+    ----------
+    checkout : Path
+        The project's folder.
+    folder : Path
+        Takes the bags.
+    """
+
+    def __init__(self, checkout: Path, folder: Path) -> None:
+        self.checkout = checkout
+        self.folder = folder
+        self._runs: dict[str, Run] = {}
+
+    def start(self, name: str, *arguments: str) -> StartedRun:
+        """Start `scripts/simulate` with these arguments and a bag of this name."""
+        bag = self.folder / name
+        command = [str(self.checkout / "scripts" / "simulate"), *arguments, "--bag", str(bag)]
+        return StartedRun(command, bag)
+
+    def run(self, name: str, *arguments: str) -> Run:
+        """Run `scripts/simulate`; a name that has run before gives that run again."""
+        if name not in self._runs:
+            self._runs[name] = self.start(name, *arguments).wait()
+        return self._runs[name]
+
+
+def processes_with(name: str, value: str) -> list[tuple[int, str]]:
+    """Return (pid, command) of every process with a variable of this value in its environment."""
+    wanted = f"{name}={value}".encode()
+    found = []
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        try:
+            if wanted in (entry / "environ").read_bytes().split(b"\0"):
+                command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+                found.append((int(entry.name), command.strip()))
+        except OSError:
+            continue  # ended meanwhile, or another user's
+    return found
+
+
+def shared_memory_of(domain: int) -> list[str]:
+    """Return the shared-memory ports that a ROS domain has left behind."""
+    ports = range(
+        PORT_BASE + PORTS_PER_DOMAIN * domain, PORT_BASE + PORTS_PER_DOMAIN * (domain + 1)
+    )
+    names = {f"fastrtps_port{port}" for port in ports}
+    return sorted(path.name for path in SHARED_MEMORY.iterdir() if path.name in names)
+
+
+def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
+    """Return the messages of some topics, as they were sent, byte for byte."""
+    found: dict[str, list[bytes]] = {topic: [] for topic in topics}
+    with next(bag.glob("*.mcap")).open("rb") as stream:
+        reader = make_reader(stream)
+        for _, channel, message in reader.iter_messages(topics=list(topics)):
+            found[channel.topic].append(message.data)
+    return found
+
+
+def diagnostics(bag: Path) -> Iterator[tuple[int, str, str]]:
+    """Yield (level, name, message) of every status on /diagnostics."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for data in payloads(bag, ["/diagnostics"])["/diagnostics"]:
+        array: Any = store.deserialize_cdr(data, "diagnostic_msgs/msg/DiagnosticArray")
+        for status in array.status:
+            yield int(status.level), str(status.name), str(status.message)
+
+
+def unreadable(bag: Path) -> str:
+    """Return why a bag does not open with rosbags and mcap; an empty text if it does."""
+    try:
+        with Reader(bag) as reader:
+            count = sum(1 for _ in reader.messages())
+        data_file = next(bag.glob("*.mcap"))
+        with data_file.open("rb") as stream:
+            seen = sum(1 for _ in make_reader(stream).iter_messages())
+    # any failure to read is what is looked for
+    except Exception as error:  # noqa: BLE001
+        return f"{type(error).__name__}: {error}"
+    return "" if seen == count else f"rosbags reads {count} messages, mcap {seen}"
