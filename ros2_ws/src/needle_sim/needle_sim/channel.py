@@ -15,10 +15,13 @@ class Channel:
     ----------
     T_rig_entry : ndarray, shape (4, 4)
         Pose of the tip frame in `rig` at inserted length 0.
+    entry_angle : float
+        The tip's angle there [rad].
     """
 
-    def __init__(self, T_rig_entry: FloatArray) -> None:  # noqa: N803
-        self.T_rig_entry = T_rig_entry
+    def __init__(self, T_rig_entry: FloatArray, entry_angle: float) -> None:  # noqa: N803
+        self._entry_pose = T_rig_entry
+        self._entry_angle = entry_angle
         self.length = 0.0
         self._count = 0
         self._starts = np.empty(64)
@@ -78,7 +81,7 @@ class Channel:
         """
         insertion = np.asarray(insertion, dtype=np.float64)
         if self._count == 0:
-            return self._before_entry(insertion), np.zeros(insertion.shape)
+            return self._before_entry(insertion), np.full(insertion.shape, self._entry_angle)
         starts = self._starts[: self._count]
         index = np.clip(np.searchsorted(starts, insertion, side="right") - 1, 0, None)
         beyond = (insertion - starts[index])[..., np.newaxis]
@@ -86,9 +89,9 @@ class Channel:
         angles = self._angles[index, 0] + beyond[..., 0] * self._angles[index, 1]
         outside = insertion < 0.0
         poses[outside] = self._before_entry(insertion[outside])
-        return poses, np.where(outside, self._angles[0, 0], angles)
+        return poses, np.where(outside, self._entry_angle, angles)
 
     def _before_entry(self, insertion: FloatArray) -> FloatArray:
         straight = np.zeros((*insertion.shape, 6))
         straight[..., 2] = insertion
-        return np.asarray(self.T_rig_entry @ exp_twist(straight))
+        return np.asarray(self._entry_pose @ exp_twist(straight))

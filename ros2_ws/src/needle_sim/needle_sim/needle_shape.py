@@ -8,6 +8,9 @@ import numpy as np
 
 from needle_sim.se3 import FloatArray
 
+# A path that is shorter than this is a point in any image [m].
+_SHORTEST = 1e-6
+
 
 @dataclass(frozen=True)
 class NeedleShape:
@@ -81,7 +84,7 @@ class NeedleShape:
         steps = np.linalg.norm(np.diff(from_tip, axis=0), axis=1)
         distance_known = np.concatenate([[0.0], np.cumsum(steps)])
         length = distance_known[-1]
-        if not length > 0.0:
+        if length < _SHORTEST:
             return np.empty((0, 3))
         distance = np.linspace(length, 0.0, int(np.ceil(length / spacing)) + 1)
         line = np.stack(

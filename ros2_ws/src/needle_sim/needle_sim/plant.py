@@ -9,6 +9,9 @@ from needle_sim.channel import Channel
 from needle_sim.se3 import FloatArray, exp_twist, rotation_about_y, rotation_about_z
 from needle_sim.tissue import Torsion
 
+# Insertion at which the needle counts as out [m].
+_OUT = 1e-6
+
 
 def initial_pose(pitch: float, roll: float) -> FloatArray:
     """Return the tip's pose at the entry point: R = Rx(0) Ry(pitch) Rz(roll) at rig's origin.
@@ -56,7 +59,8 @@ class NeedlePlant:
     A needle drawn back follows its path in reverse, for nothing is cut: position and heading are
     the path's, and about its axis the tip is turned by what the base (through the torsion) turned
     since it passed there on the way in. Pushed again, it follows the same channel to its end and
-    cuts on from there. Fully drawn out (insertion <= 0) it leaves the channel behind: the next
+    cuts on from there. Fully drawn out (to 1 um, for increments add up
+    no better) it leaves the channel behind: the next
     insertion is a new one at the same entry point. Outside it moves straight along its heading.
 
     Parameters
@@ -95,7 +99,7 @@ class NeedlePlant:
         self._torsion = Torsion() if torsion is None else torsion
         self._tip_offset = tip_offset
         self._insertion: FloatArray = np.zeros(pose.shape[:-2])
-        self._channel = Channel(pose) if pose.ndim == 2 else None
+        self._channel = Channel(pose, float(self._torsion.tip_angle)) if pose.ndim == 2 else None
 
     @property
     def T_rig_tip(self) -> FloatArray:  # noqa: N802
@@ -192,9 +196,13 @@ class NeedlePlant:
         tip_angle = float(self._torsion.tip_angle)
         self._pose = np.asarray(path @ rotation_about_z(tip_angle - angle))
         self._insertion = np.asarray(insertion)
-        if insertion <= 0.0:
+        if insertion <= _OUT:
             entry, angle = channel.at(0.0)
-            self._channel = Channel(np.asarray(entry @ rotation_about_z(tip_angle - angle)))
+            entry = np.asarray(entry @ rotation_about_z(tip_angle - angle))
+            self._channel = Channel(entry, tip_angle)
+            if insertion > 0.0:
+                straight = np.array([0.0, 0.0, insertion, 0.0, 0.0, 0.0])
+                self._channel.append(entry, straight, insertion, tip_angle, 0.0)
 
     def _cut(self, length: FloatArray, tip_turned: FloatArray) -> FloatArray:
         """Move the tip by V1 dl + V2 dtheta of [KC09] eq. (2), and return that twist."""

@@ -173,6 +173,28 @@ def test_a_needle_drawn_out_starts_a_new_channel() -> None:
     )
 
 
+def test_outside_the_tip_turns_with_the_base_alone() -> None:
+    plant = inserted(NeedlePlant(initial_pose(0.1, 0.2), curvature=CURVATURE), 30, 0.02)
+    for _ in range(35):
+        plant.advance(-0.001, 0.0)
+    expected = initial_pose(0.1, 0.2 + 0.6)
+    np.testing.assert_allclose(plant.T_rig_tip[:3, :3], expected[:3, :3], atol=1e-12)
+    np.testing.assert_allclose(plant.T_rig_tip[:3, 3], -0.005 * expected[:3, 2], atol=1e-12)
+
+
+def test_increments_that_do_not_add_up_to_zero_still_leave_the_channel() -> None:
+    plant = NeedlePlant(np.eye(4), curvature=CURVATURE)
+    for _ in range(10):
+        plant.advance(0.001, 0.1)
+    plant.advance(-0.01 + 2e-7, -1.0)
+    assert plant.centreline(0.001).shape == (2, 3)
+    plant.advance(0.01, 0.0)
+    fresh = NeedlePlant(np.eye(4), curvature=CURVATURE)
+    fresh.advance(0.01 + 2e-7, 0.0)
+    np.testing.assert_allclose(plant.T_rig_tip, fresh.T_rig_tip, rtol=0, atol=1e-5)
+    assert float(np.abs(plant.centreline(0.001)[:, 0]).max()) < 1e-9
+
+
 def test_centreline_is_the_path_at_equal_distances() -> None:
     plant = wandering()
     line = plant.centreline(0.0007)

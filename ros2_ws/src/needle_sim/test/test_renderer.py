@@ -176,4 +176,13 @@ def test_a_short_path_draws_only_what_is_inside() -> None:
     plant.advance(0.004, 0.0)
     line = NeedleShape().middle_line(plant.T_rig_tip, plant.centreline(0.001), 0.0003)
     assert line[0, 2] == pytest.approx(0.0, abs=5e-5)  # as far as the bend lies beside the path
-    assert NeedleShape().middle_line(np.eye(4), np.zeros((2, 3)), 0.0003).shape == (0, 3)
+    for length in (0.0, 1e-16, 1e-9):
+        point = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, length]])
+        assert NeedleShape().middle_line(np.eye(4), point, 0.0003).shape == (0, 3)
+
+
+@pytest.mark.parametrize("length", [2e-6, 1e-4, 0.001, 0.3])
+def test_any_insertion_can_be_rendered(renderer: StereoRenderer, length: float) -> None:
+    plant = needle(5.0, 170.0, length)
+    for image in renderer.render(plant.T_rig_tip, plant.centreline(0.001), 0):
+        assert image.shape == (768, 1024)
