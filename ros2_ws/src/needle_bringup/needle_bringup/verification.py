@@ -23,9 +23,6 @@ from needle_common.errors import UserError
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
 SHARED_MEMORY = Path("/dev/shm")
-# RTPS: first port of a domain, and how many it has.
-PORT_BASE = 7400
-PORTS_PER_DOMAIN = 250
 
 
 @dataclasses.dataclass(frozen=True)
