@@ -1,0 +1,81 @@
+"""The full text of a message type's definition, from the files every ROS installation has."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from needle_common.errors import UserError
+
+_SEPARATOR = "=" * 80
+_BUILT_IN_TEXT = """
+bool byte char float32 float64 int8 uint8 int16 uint16 int32 uint32 int64 uint64 string wstring
+"""
+_BUILT_IN = frozenset(_BUILT_IN_TEXT.split())
+# A type, its bound (`string<=10`) and its array mark, then the field's name.
+_FIELD = re.compile(r"^\s*([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w")
+
+
+def share_prefixes() -> list[Path]:
+    """Return the prefixes of the ROS environment (AMENT_PREFIX_PATH), first wins."""
+    return [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
+
+
+def full_definition(type_name: str, prefixes: Iterable[Path] | None = None) -> str:
+    """Return a type's definition with those of all types it contains, as MCAP's `ros2msg` has it.
+
+    Parameters
+    ----------
+    type_name : str
+        `package/msg/Name`.
+    prefixes : iterable of Path, optional
+        Installation prefixes to search; the ROS environment's by default.
+
+    Raises
+    ------
+    UserError
+        If the .msg file of the type, or of one it contains, is not installed.
+    """
+    where = list(share_prefixes() if prefixes is None else prefixes)
+    texts: dict[str, str] = {}
+    waiting = [type_name]
+    while waiting:
+        name = waiting.pop(0)
+        if name in texts:
+            continue
+        texts[name] = _read(name, where)
+        waiting += _contained(name, texts[name])
+    parts: list[str] = []
+    for name, text in texts.items():
+        package, _, short = name.split("/")
+        parts.append(text if not parts else f"{_SEPARATOR}\nMSG: {package}/{short}\n{text}")
+    return "\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def _read(type_name: str, prefixes: list[Path]) -> str:
+    try:
+        package, kind, name = type_name.split("/")
+    except ValueError:
+        raise UserError(f"{type_name!r} is not a message type: wants package/msg/Name") from None
+    for prefix in prefixes:
+        path = prefix / "share" / package / kind / f"{name}.msg"
+        if path.is_file():
+            return path.read_text(encoding="utf-8")
+    raise UserError(f"the definition of {type_name} is not installed (AMENT_PREFIX_PATH)")
+
+
+def _contained(type_name: str, text: str) -> list[str]:
+    """Return the full names of the message types that a definition's fields have."""
+    found = []
+    for line in text.splitlines():
+        match = _FIELD.match(line.split("#", 1)[0])
+        if match is None or match[1] in _BUILT_IN:
+            continue
+        pieces = match[1].split("/")
+        package = pieces[0] if len(pieces) > 1 else type_name.partition("/")[0]
+        if pieces == ["Header"]:
+            package = "std_msgs"
+        found.append(f"{package}/msg/{pieces[-1]}")
+    return found

@@ -1,0 +1,381 @@
+"""Records every topic of the graph, with what is needed to repeat the run, into one bag."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import importlib
+import json
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any, cast
+
+import yaml
+from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from needle_bringup.bag_writer import BagTopic, OfferedQos
+from needle_bringup.message_definitions import full_definition
+from needle_bringup.parameters import ParameterSnapshots
+from needle_bringup.provenance import commit, distribution, versions
+from needle_bringup.recording import Recording
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE, EXIT_MISSED
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameters import NodeParameters
+
+HELP = """
+recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
+
+Topics that appear later are recorded too, images included. The bag also carries the message
+definitions, all nodes' parameters, the calibration file, versions and commit.
+Ctrl-C ends the recording and completes the bag.
+
+  ros2 run needle_bringup recorder --ros-args -p bag:=bags/my_run
+
+Subscribes to every topic of the graph; publishes /diagnostics.
+Exit codes: 0 the bag is whole; 1 the disk refused data; 2 bad parameters.
+"""
+
+GRAPH_PERIOD = 0.1
+DEPTH = 1000
+IMAGE_DEPTH = 20
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+# What the graph still sends when all nodes end together is waited for this long.
+LAST_WORDS = 0.3
+WARN_WAITING = 20_000
+
+
+@dataclasses.dataclass(frozen=True)
+class RecorderParameters:
+    """What the recorder can be told."""
+
+    bag: str = parameter(
+        "",
+        unit="-",
+        description="The bag's directory; empty: a new time-stamped one here.",
+        read_only=True,
+    )
+    calibration_file: str = parameter(
+        "", unit="-", description="A file to keep in the bag as calibration.yaml.", read_only=True
+    )
+    run_info: str = parameter(
+        "",
+        unit="-",
+        description="Text about the run to keep in the bag: YAML `key: value` lines or JSON.",
+        read_only=True,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
+
+
+class _Topic:
+    """One topic being recorded."""
+
+    def __init__(self, name: str, type_name: str, message_class: type) -> None:
+        self.name = name
+        self.type_name = type_name
+        self.message_class = message_class
+        self.subscription: Subscription | None = None
+        self.publishers = -1
+        self.described = False
+        self.lost = 0
+        # Source stamps of the last messages: a subscription that replaces another may get some
+        # of them again.
+        self.recent: collections.deque[int] = collections.deque(maxlen=64)
+        self.check_repeats_until = 0.0
+
+
+class Recorder(Node):
+    """Subscribes to whatever the graph has and hands it to a `Recording`."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        self._settings = NodeParameters(self, RecorderParameters).values
+        bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")
+        calibration = _read_calibration(self._settings.calibration_file)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._topics: dict[str, _Topic] = {}
+        self._refused: dict[str, str] = {}
+        self._told_error = False
+        self.bag = Path(bag)
+        self.recording = Recording(self.bag, distribution=distribution())
+        try:
+            self._write_provenance(calibration)
+            self._snapshots = ParameterSnapshots(self, self._take_parameters)
+            self._poll_graph()
+            self.create_timer(GRAPH_PERIOD, self._poll_graph, clock=STEADY_CLOCK)
+            self.create_timer(0.5, self.report, clock=STEADY_CLOCK)
+        except BaseException:
+            self.recording.close()
+            raise
+        self.get_logger().info(f"recording into {self.bag}")
+
+    def _write_provenance(self, calibration: str) -> None:
+        texts = {
+            "run_info": self._settings.run_info,
+            "versions": json.dumps(versions()),
+            "commit": commit(),
+            "calibration": calibration,
+        }
+        for key, text in texts.items():
+            self.recording.set_custom_data(key, text)
+        self.recording.add_record("needle_run", texts)
+        if calibration:
+            self.recording.add_file(
+                "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()
+            )
+
+    def _take_parameters(self, node: str, values: dict[str, Any]) -> None:
+        document = {node: {"ros__parameters": values}}
+        self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
+        self.recording.set_custom_data("parameters", yaml.safe_dump(self._snapshots.document()))
+
+    def _poll_graph(self) -> None:
+        for name, types in self.get_topic_names_and_types():
+            topic = self._topics.get(name)
+            if topic is None:
+                topic = self._new_topic(name, types)
+            if topic is not None:
+                self._subscribe(topic)
+        self._snapshots.poll()
+
+    def _new_topic(self, name: str, types: list[str]) -> _Topic | None:
+        if len(types) > 1:
+            self._refuse(name, f"{name} has several types: {', '.join(types)}")
+        if name in self._refused:
+            return None
+        try:
+            full_definition(types[0])
+            package, kind, short = types[0].split("/")
+            message_class = getattr(importlib.import_module(f"{package}.{kind}"), short)
+        except (UserError, ImportError, AttributeError) as error:
+            self._refuse(name, f"{name} is not recorded: {error}")
+            return None
+        topic = _Topic(name, types[0], message_class)
+        self._topics[name] = topic
+        return topic
+
+    def _refuse(self, name: str, why: str) -> None:
+        if name not in self._refused:
+            self._refused[name] = why
+            self.get_logger().warning(why)
+
+    def _subscribe(self, topic: _Topic) -> None:
+        publishers = self.count_publishers(topic.name)
+        if publishers == topic.publishers:
+            return
+        offers = self.get_publishers_info_by_topic(topic.name)
+        if len(offers) != publishers:
+            return  # the graph is changing under us: look again at the next poll
+        topic.publishers = publishers
+        if topic.subscription is not None and not offers:
+            return
+        qos = _matching_qos(topic.type_name, offers)
+        before = topic.subscription
+        if before is not None:
+            now = before.qos_profile
+            if (now.reliability, now.durability) == (qos.reliability, qos.durability):
+                return
+            topic.check_repeats_until = time.monotonic() + 2.0
+
+        def count_lost(event: Any) -> None:
+            topic.lost = event.total_count
+
+        topic.subscription = self.create_subscription(
+            topic.message_class,
+            topic.name,
+            lambda data, info: self._record_all(topic, data, info),
+            qos,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=count_lost),
+            raw=True,
+        )
+        if before is not None:
+            self.destroy_subscription(before)
+
+    def _record_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
+        """Take a message and all that wait behind it: the executor's round costs more than they."""
+        self._record(topic, data, info)
+        if topic.subscription is None:
+            return
+        handle = topic.subscription.handle
+        with handle:
+            for _ in range(DEPTH):
+                taken = handle.take_message(topic.message_class, True)
+                if taken is None:
+                    return
+                self._record(topic, *taken)
+
+    def _record(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
+        sent = info["source_timestamp"]
+        if sent in topic.recent and time.monotonic() < topic.check_repeats_until:
+            return
+        topic.recent.append(sent)
+        if not topic.described:
+            self._describe(topic)
+        received = info["received_timestamp"] or time.time_ns()
+        self.recording.append(topic.name, data, received, sent or received)
+
+    def _describe(self, topic: _Topic) -> None:
+        topic.described = True
+        offers = self.get_publishers_info_by_topic(topic.name)
+        known = offers or self.get_subscriptions_info_by_topic(topic.name)
+        self.recording.add_topic(
+            BagTopic(
+                name=topic.name,
+                type_name=topic.type_name,
+                definition=full_definition(topic.type_name),
+                type_hash=str(known[0].topic_type_hash) if known else "",
+                offered_qos=tuple(_offered(offer) for offer in offers),
+            )
+        )
+
+    def report(self) -> None:
+        """Publish the recording's health."""
+        recording = self.recording
+        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
+        values = {
+            "bag": str(self.bag),
+            "topics": str(len(self._topics)),
+            "messages": str(recording.messages_received),
+            "messages_waiting": str(recording.messages_waiting),
+            "messages_lost": str(sum(lost.values())),
+            "size_bytes": str(recording.bytes_received),
+        }
+        level, message = Level.OK, "recording"
+        if recording.error is not None:
+            level, message = Level.ERROR, f"recording ended: {recording.error}"
+            if not self._told_error:
+                self._told_error = True
+                self.get_logger().error(message)
+        elif lost:
+            level, message = Level.WARN, f"messages lost on {', '.join(lost)}"
+        elif recording.messages_waiting > WARN_WAITING:
+            level, message = Level.WARN, "the disk is slower than the graph"
+        elif self._refused:
+            level, message = Level.WARN, "; ".join(self._refused.values())
+        self._diagnostics.set("bag", Diagnostic(level, message, values))
+
+    def finish(self) -> int:
+        """Complete the bag; return the exit code and say one line about it."""
+        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
+        for topic in self._topics.values():
+            if not topic.described:
+                self._describe(topic)
+        if lost:
+            self.recording.set_custom_data("messages_lost", json.dumps(lost))
+        self.recording.add_file(
+            "parameters.yaml",
+            "application/yaml",
+            yaml.safe_dump(self._snapshots.document()).encode(),
+            time.time_ns(),
+        )
+        self.recording.close()
+        if self.recording.error is not None:
+            print(f"error: {self.recording.error}; the bag is not complete", file=sys.stderr)
+            return EXIT_MISSED
+        count = self.recording.messages_received
+        print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")
+        if lost:
+            print(f"warning: messages lost: {json.dumps(lost)}", file=sys.stderr)
+        return EXIT_DONE
+
+
+def _read_calibration(path: str) -> str:
+    if not path:
+        return ""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"calibration_file: cannot read {path}: {error}") from error
+
+
+def _matching_qos(type_name: str, offers: list[TopicEndpointInfo]) -> QoSProfile:
+    """Return the strictest quality of service that every publisher can serve."""
+    profiles = [offer.qos_profile for offer in offers]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = bool(profiles) and all(
+        p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles
+    )
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=IMAGE_DEPTH if type_name in IMAGE_TYPES else DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def _offered(offer: TopicEndpointInfo) -> OfferedQos:
+    qos = offer.qos_profile
+
+    def nanoseconds(duration: Duration) -> int:
+        return int(duration.nanoseconds)
+
+    return OfferedQos(
+        history=qos.history.name.lower(),
+        depth=int(qos.depth),
+        reliability=qos.reliability.name.lower(),
+        durability=qos.durability.name.lower(),
+        deadline=nanoseconds(qos.deadline),
+        lifespan=nanoseconds(qos.lifespan),
+        liveliness=qos.liveliness.name.lower(),
+        lease_duration=nanoseconds(qos.liveliness_lease_duration),
+    )
+
+
+class _StopRequest:
+    """Turns SIGINT and SIGTERM into a flag, so that one during start-up is not lost either."""
+
+    def __init__(self) -> None:
+        self.wanted = False
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, self._take)
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        self.wanted = True
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the recorder; returns the exit code."""
+    stop = _StopRequest()
+
+    def spin(node: Node) -> int:
+        recorder = cast(Recorder, node)
+        executor = SingleThreadedExecutor()
+        executor.add_node(recorder)
+        try:
+            while not stop.wanted and recorder.recording.error is None:
+                executor.spin_once(timeout_sec=0.1)
+            recorder.report()
+            end = time.monotonic() + LAST_WORDS
+            while time.monotonic() < end:
+                executor.spin_once(timeout_sec=0.05)
+            return recorder.finish()
+        finally:
+            recorder.recording.close()
+
+    return run_node(
+        Recorder,
+        help_text=HELP,
+        parameters=RecorderParameters,
+        args=args,
+        spin=spin,
+        signal_handlers=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
