@@ -94,7 +94,12 @@ def run_node(
         0 after a clean end (also by SIGINT or SIGTERM), 2 after bad parameters or arguments.
     """
     argv = list(sys.argv if args is None else args)
-    own = remove_ros_args(argv)[1:]
+    try:
+        own = remove_ros_args(argv)[1:]
+    # rclpy raises its own private types for a bad command line
+    except Exception as error:  # noqa: BLE001
+        print(f"error: {_first_line(error)}", file=sys.stderr)
+        return EXIT_BAD_INPUT
     if own in (["--help"], ["-h"]):
         print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
         print(describe(parameters))
