@@ -96,23 +96,16 @@ def run_node(
     argv = list(sys.argv if args is None else args)
     try:
         own = remove_ros_args(argv)[1:]
-    # rclpy raises its own private types for a bad command line
-    except Exception as error:  # noqa: BLE001
-        print(f"error: {_first_line(error)}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    if own in (["--help"], ["-h"]):
-        print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
-        print(describe(parameters))
-        return EXIT_DONE
-    if own:
-        print(f"error: unknown argument {own[0]!r}; see --help", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    try:
+        if own in (["--help"], ["-h"]):
+            print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
+            print(describe(parameters))
+            return EXIT_DONE
+        if own:
+            raise UserError(f"unknown argument {own[0]!r}; see --help")
         rclpy.init(args=argv, signal_handler_options=signal_handlers)
     # rclpy raises its own private types for a bad command line
     except Exception as error:  # noqa: BLE001
-        print(f"error: {_first_line(error)}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return _refuse(error)
     node: Node | None = None
     try:
         node = create()
@@ -120,8 +113,7 @@ def run_node(
     except (KeyboardInterrupt, ExternalShutdownException):
         return EXIT_DONE
     except (UserError, ParameterException) as error:
-        print(f"error: {_first_line(error)}", file=sys.stderr)
-        return EXIT_BAD_INPUT
+        return _refuse(error)
     finally:
         if node is not None:
             node.destroy_node()
@@ -137,6 +129,11 @@ def _spin(node: Node) -> int:
         # An executor that outlives the context complains when it is collected.
         executor.shutdown()
     return EXIT_DONE
+
+
+def _refuse(error: Exception) -> int:
+    print(f"error: {_first_line(error)}", file=sys.stderr)
+    return EXIT_BAD_INPUT
 
 
 def _first_line(error: Exception) -> str:
