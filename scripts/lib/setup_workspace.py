@@ -269,7 +269,7 @@ def check_space() -> None:
     free = shutil.disk_usage(ROOT).free
     if free < NEEDED_BYTES:
         raise SetupError(
-            f"disk full: {NEEDED_BYTES / 1e9:.1f} GB are needed, {ROOT} has {free / 1e9:.1f} GB free"
+            f"disk full: {ROOT} has {free / 1e9:.1f} GB free, needs {NEEDED_BYTES / 1e9:.1f} GB"
         )
 
 
@@ -425,7 +425,7 @@ def tidy_executables(name: str) -> None:
             path.unlink()
             continue
         first, _, rest = path.read_text("utf-8").partition("\n")
-        if " " in str(VENV) or len(first) > LONGEST_SHEBANG:
+        if "python" in first and (" " in first or len(first) > LONGEST_SHEBANG):
             python = shlex.quote(str(VENV_PYTHON))
             # sh runs the second line; to Python it is a string.
             first = f"#!/bin/sh\n'''exec' {python} \"$0\" \"$@\"\n'''"

@@ -1,0 +1,62 @@
+"""A pytest plugin of scripts/test: names failed stages, finds processes that tests left.
+
+scripts/test sets NEEDLE_TEST_RUN, unique to the run and inherited by every process that a test
+starts, and NEEDLE_FAILED_STAGES, with commas between the names.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+RUN = os.environ.get("NEEDLE_TEST_RUN", "")
+FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").split(",") if name]
+_left: list[str] = []
+
+
+def processes_of_run() -> dict[int, str]:
+    """Return the command lines, by process id, of what this run started and did not end."""
+    found = {}
+    mark = f"NEEDLE_TEST_RUN={RUN}".encode()
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if int(folder.name) == os.getpid() or mark not in (
+                (folder / "environ").read_bytes().split(b"\0")
+            ):
+                continue
+            command = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode().strip()
+        except OSError:
+            continue
+        if command:
+            found[int(folder.name)] = command
+    return found
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail the session, and end them, when processes are left."""
+    if not RUN:
+        return
+    limit = time.monotonic() + 2.0
+    # What was just told to end may need a moment.
+    while (left := processes_of_run()) and time.monotonic() < limit:
+        time.sleep(0.05)
+    for process, command in left.items():
+        _left.append(f"{process} {command}")
+        try:
+            os.kill(process, signal.SIGKILL)
+        except ProcessLookupError:
+            continue
+    if left and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print what else failed, right above pytest's closing line."""
+    for name in FAILED_STAGES:
+        terminalreporter.write_line(f"FAILED stage {name} (its output is at the top)", red=True)
+    for line in _left:
+        terminalreporter.write_line(f"FAILED process left behind: {line}", red=True)
