@@ -6,7 +6,6 @@ import ctypes
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -33,8 +32,8 @@ class NodeProcess:
         Its whole environment.
     log : Path
         File that takes its output.
-    show_errors : bool
-        Whether its stderr goes to ours instead (the operator's progress).
+    pass_fds : sequence of int
+        Open files that it keeps.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class NodeProcess:
         *,
         environment: Mapping[str, str],
         log: Path,
-        show_errors: bool = False,
+        pass_fds: Sequence[int] = (),
     ) -> None:
         self.name = name
         self.log = log
@@ -61,7 +60,8 @@ class NodeProcess:
                 env=dict(environment),
                 stdin=subprocess.DEVNULL,
                 stdout=output,
-                stderr=sys.stderr if show_errors else output,
+                stderr=subprocess.STDOUT,
+                pass_fds=pass_fds,
                 start_new_session=True,
                 preexec_fn=end_with_parent,  # noqa: PLW1509
             )

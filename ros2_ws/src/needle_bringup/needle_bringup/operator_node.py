@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import time
 from types import FrameType
-from typing import Any
+from typing import Any, TextIO
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.client import Client
@@ -24,7 +25,7 @@ from needle_bringup.operator_sequence import (
     OperatorSequence,
     ServiceCall,
 )
-from needle_bringup.progress import Progress
+from needle_bringup.progress import PROGRESS_FD, Progress
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.conversions import HOLD, LATCHED, to_stamp, values_of
@@ -54,12 +55,12 @@ class OperatorNode(Node):
 
     def __init__(self) -> None:
         super().__init__("operator")
-        self._parameters = NodeParameters(self, OperatorParameters)
-        values = self._parameters.values
+        self._settings = NodeParameters(self, OperatorParameters)
+        values = self._settings.values
         self._sequence = OperatorSequence(
             time.monotonic(), wait_timeout=values.wait_timeout, stall_timeout=values.stall_timeout
         )
-        self._progress = Progress(sys.stderr)
+        self._progress = Progress(_progress_stream())
         self._diagnostics = DiagnosticsPublisher(self)
         self._service_clients: dict[str, Client[Any, Any]] = {
             call.service: self.create_client(
@@ -102,6 +103,7 @@ class OperatorNode(Node):
         deadline = time.monotonic() + DISABLE_TIMEOUT
         while disabled is not None and not disabled.done() and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
+        self.get_logger().info(outcome.reason)
         self._progress.close(f"operator: {outcome.reason}")
         if outcome.interrupted:
             return EXIT_INTERRUPTED
@@ -161,7 +163,7 @@ class OperatorNode(Node):
         message = Joy()
         message.header.stamp = to_stamp(self._last_stamp)
         message.header.frame_id = self.get_name()
-        message.axes = [self._parameters.values.speed_scale if pressed else 0.0]
+        message.axes = [self._settings.values.speed_scale if pressed else 0.0]
         message.buttons = [int(pressed)]
         self._hold.publish(message)
 
@@ -173,6 +175,14 @@ class OperatorNode(Node):
         else:
             message = "prepares the rig"
         self._diagnostics.set("hold", Diagnostic(Level.OK, message))
+
+
+def _progress_stream() -> TextIO:
+    """Return where the progress goes: stderr, or what the supervisor keeps open for it."""
+    descriptor = os.environ.get(PROGRESS_FD)
+    if descriptor is None:
+        return sys.stderr
+    return os.fdopen(int(descriptor), "w", encoding="utf-8", buffering=1)
 
 
 def main() -> int:

@@ -6,6 +6,9 @@ from typing import TextIO
 
 from tqdm import tqdm
 
+# Environment variable: number of an open file that takes the progress instead of stderr.
+PROGRESS_FD = "NEEDLE_PROGRESS_FD"
+
 
 class Progress:
     """A bar on a terminal, a line for every quarter elsewhere.

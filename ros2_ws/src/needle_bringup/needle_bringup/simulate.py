@@ -15,6 +15,7 @@ from types import FrameType
 
 from needle_bringup.installed import find_executable, find_shared
 from needle_bringup.node_process import NodeProcess, stop, wait_for
+from needle_bringup.progress import PROGRESS_FD
 from needle_bringup.rig_configuration import (
     Parameters,
     command_line_parameters,
@@ -27,7 +28,7 @@ from needle_bringup.rig_configuration import (
 )
 from needle_bringup.ros_domain import own_domain
 from needle_bringup.simulate_options import SimulateOptions, parse
-from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.errors import UserError
 
 PACKAGES = {
@@ -47,6 +48,21 @@ ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
 RECORDER_GRACE = 30.0
 # Set by scripts/simulate: when the command was given, in seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
+
+
+class NodeFailedError(UserError):
+    """A node that ended before its time.
+
+    Parameters
+    ----------
+    node : NodeProcess
+        Which one.
+    """
+
+    def __init__(self, node: NodeProcess) -> None:
+        self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != "operator"
+        where = "" if self.is_bad_input else f" (all it said is in {node.log})"
+        super().__init__(node.describe_end() + where)
 
 
 class Interruption:
@@ -119,9 +135,15 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
             write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
             done = _run_nodes(executables, bag, domain, interruption)
         return _report(options, bag, started_at, interruption, done=done)
-    finally:
+    except NodeFailedError as error:
+        # Bad input leaves nothing behind; what broke leaves its logs.
+        if error.is_bad_input:
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
+    except KeyboardInterrupt:
         if not (bag / METADATA).exists():
             shutil.rmtree(bag, ignore_errors=True)
+        raise
 
 
 def _run_nodes(
@@ -133,14 +155,13 @@ def _run_nodes(
     environment = {
         **os.environ,
         "ROS_DOMAIN_ID": str(domain),
-        # The terminal's stderr is the operator's progress; what nodes log goes to their files.
-        "RCUTILS_LOGGING_USE_STDOUT": "1",
-        "RCUTILS_LOGGING_BUFFERED_STREAM": "0",
+        # Nodes write into their log files; only the operator's progress goes to the terminal.
+        PROGRESS_FD: str(sys.stderr.fileno()),
         "PYTHONUNBUFFERED": "1",
     }
     nodes: dict[str, NodeProcess] = {}
     print(f"recording into {bag} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
-    failure = ""
+    failure: NodeProcess | None = None
     try:
         for name, executable in executables.items():
             interruption.check()
@@ -149,27 +170,29 @@ def _run_nodes(
                 [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
                 environment=environment,
                 log=logs / f"{name}.log",
-                show_errors=name == "operator",
+                pass_fds=[sys.stderr.fileno()] if name == "operator" else [],
             )
         operator = nodes["operator"]
-        while operator.exit_code is None and not failure:
+        while operator.exit_code is None and failure is None:
             interruption.check()
             failure = _first_dead(nodes)
             wait_for([operator], POLL)
         failure = failure or _first_dead(nodes)
-        if failure or operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
-            raise UserError(failure or operator.describe_end())
+        if failure is None and operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
+            failure = operator
+        if failure is not None:
+            raise NodeFailedError(failure)
         return operator.exit_code == EXIT_DONE
     finally:
         _stop_nodes(nodes)
 
 
-def _first_dead(nodes: dict[str, NodeProcess]) -> str:
-    """Say which node ended although it should run; an empty text if none did."""
+def _first_dead(nodes: dict[str, NodeProcess]) -> NodeProcess | None:
+    """Return a node that ended although it should run."""
     for name, node in nodes.items():
         if name != "operator" and node.exit_code is not None:
-            return node.describe_end()
-    return ""
+            return node
+    return None
 
 
 def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:

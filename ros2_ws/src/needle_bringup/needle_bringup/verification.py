@@ -18,6 +18,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from needle_bringup.ros_domain import ports_of
 from needle_common.errors import UserError
 
 # Every process that a check starts carries this in its environment, so that none can hide.
@@ -203,10 +204,7 @@ def processes_with(name: str, value: str) -> list[tuple[int, str]]:
 
 def shared_memory_of(domain: int) -> list[str]:
     """Return the shared-memory ports that a ROS domain has left behind."""
-    ports = range(
-        PORT_BASE + PORTS_PER_DOMAIN * domain, PORT_BASE + PORTS_PER_DOMAIN * (domain + 1)
-    )
-    names = {f"fastrtps_port{port}" for port in ports}
+    names = {f"fastrtps_port{port}" for port in ports_of(domain)}
     return sorted(path.name for path in SHARED_MEMORY.iterdir() if path.name in names)
 
 
