@@ -16,6 +16,7 @@ from needle_tracker.camera_model import optical_rays, project_optical
 Array = NDArray[np.float64]
 
 _ROOT_ITERATIONS = 60
+_LEAST_DEPTH = 1e-12  # [m]: keeps Snell's law regular for points that are not below the surface
 _JACOBIAN_STEP = 1e-5  # [m]: central differences are then good to about 1e-8 relative
 
 
@@ -80,7 +81,7 @@ class RefractedCamera:
         offset = points - self._centre
         distance = np.hypot(offset[..., 1], offset[..., 2])
         depth = self.phantom.surface_height - points[..., 0]
-        crossing = self._crossing(distance, np.maximum(depth, 0.0))
+        crossing = self._crossing(distance, np.maximum(depth, _LEAST_DEPTH))
         ratio = np.divide(crossing, distance, out=np.ones_like(distance), where=distance > 0.0)
         # The point of the surface through which the camera sees the point.
         target = self._centre + offset * ratio[..., None]
@@ -107,7 +108,6 @@ class RefractedCamera:
         for _ in range(_ROOT_ITERATIONS):
             rest = distance - rho
             air, body = np.hypot(rho, height), np.hypot(rest, depth)
-            body = np.maximum(body, 1e-300)
             value = rho / air - index * rest / body
             slope = height**2 / air**3 + index * depth**2 / body**3
             low = np.where(value < 0.0, rho, low)

@@ -152,7 +152,7 @@ def make_search_grid(
     reachable = inside & (np.abs(angles)[None, :] <= limit[:, None])
     return SearchGrid(
         np.asarray(distances, dtype=np.float64),
-        angles,
+        np.asarray(angles, dtype=np.float64),
         np.nan_to_num(pixels, nan=-1e3).astype(np.float32),
         reachable,
     )

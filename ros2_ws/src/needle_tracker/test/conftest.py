@@ -72,7 +72,8 @@ def draw_line(
     """Return a float image with an anti-aliased polyline with square ends, by distance."""
     image = np.full(shape, background)
     coverage = np.zeros(shape)
-    for first, second in itertools.pairwise(points):
+    last = len(points) - 2
+    for i, (first, second) in enumerate(itertools.pairwise(points)):
         low = np.maximum(np.floor(np.minimum(first, second) - width), 0).astype(int)
         high = np.ceil(np.maximum(first, second) + width).astype(int) + 1
         v, u = np.mgrid[low[1] : min(high[1], shape[0]), low[0] : min(high[0], shape[1])]
@@ -81,10 +82,11 @@ def draw_line(
         along = (u - first[0]) * along_axis[0] + (v - first[1]) * along_axis[1]
         across = np.abs((v - first[1]) * along_axis[0] - (u - first[0]) * along_axis[1])
         cover = np.clip(0.5 * width + 0.5 - across, 0, 1)
-        cover = cover * np.clip(length + 0.5 - along, 0, 1) * np.clip(along + 0.5, 0, 1)
+        # Square ends; inside, neighbouring pieces overlap.
+        cover = cover * np.clip(length + (0.5 if i == last else 1.0) - along, 0, 1)
+        cover = cover * np.clip(along + (0.5 if i == 0 else 1.0), 0, 1)
         block = coverage[low[1] : high[1], low[0] : high[0]]
         np.maximum(block, cover, out=block)
-    # Joints of the polyline are covered twice by halves.
     return image + (level - background) * coverage
 
 

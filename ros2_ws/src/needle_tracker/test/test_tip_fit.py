@@ -1,0 +1,74 @@
+"""Sub-pixel line and end on lines that the test draws itself."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from needle_tracker.detection import DetectionSettings, Path
+from needle_tracker.tip_fit import fit_tip
+
+SETTINGS = DetectionSettings()
+
+
+def coarse_path(start: np.ndarray, end: np.ndarray, offset: np.ndarray) -> Path:
+    steps = np.arange(0.0, float(np.linalg.norm(end - start)), 3.3)
+    direction = (end - start) / np.linalg.norm(end - start)
+    pixels = start + steps[:, None] * direction + offset
+    cells = np.arange(len(steps))
+    return Path(cells, cells, pixels, 50.0)
+
+
+@pytest.mark.parametrize("bright", [False, True])
+@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, -63.0])
+def test_end_and_direction_to_a_fraction_of_a_pixel(
+    make_line: Callable[..., np.ndarray], angle_deg: float, bright: bool
+) -> None:
+    rng = np.random.default_rng(int(angle_deg) + 100)
+    settings = DetectionSettings(bright=bright)
+    along, across = [], []
+    for _ in range(12):
+        direction = np.array([math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))])
+        end = np.array([150.0, 150.0]) + rng.uniform(-0.5, 0.5, 2)
+        start = end - 100.0 * direction
+        image = make_line((300, 300), np.stack([start, end]), 4.6, 60.0 + 120 * bright, 120.0)
+        image += np.linspace(0.0, 40.0, 300)[None, :] + rng.normal(0.0, 4.0, image.shape)
+        noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
+        path = coarse_path(start, end + rng.uniform(-6, 6) * direction, rng.uniform(-1.5, 1.5, 2))
+        tip = fit_tip(noisy, path, settings)
+        assert tip is not None
+        error = tip.point - end
+        along.append(error @ direction)
+        across.append(error @ [-direction[1], direction[0]])
+        assert tip.direction @ direction > math.cos(math.radians(2.0))
+        assert abs(error @ direction) < 4.0 * tip.sigma_along
+    assert np.sqrt(np.mean(np.square(along))) < 0.25
+    assert np.sqrt(np.mean(np.square(across))) < 0.15
+
+
+def test_a_bent_shaft_does_not_pull_the_end_aside(make_line: Callable[..., np.ndarray]) -> None:
+    radius = 350.0  # [px]: 53 mm, more than the pre-bend's
+    turn = np.linspace(-0.3, 0.0, 60)
+    points = np.stack([150.0 + radius * np.sin(turn), 150.0 + radius * (1 - np.cos(turn))], axis=-1)
+    image = np.round(make_line((300, 300), points, 4.6, 60.0, 150.0)).astype(np.uint8)
+    cells = np.arange(len(points))
+    tip = fit_tip(image, Path(cells, cells, points, 50.0), SETTINGS)
+    assert tip is not None
+    np.testing.assert_allclose(tip.point, [150.0, 150.0], atol=0.1)
+    np.testing.assert_allclose(tip.direction, [1.0, 0.0], atol=0.01)
+
+
+def test_nothing_there_is_no_tip() -> None:
+    image = np.full((300, 300), 150, np.uint8)
+    path = coarse_path(np.array([50.0, 150.0]), np.array([150.0, 150.0]), np.zeros(2))
+    assert fit_tip(image, path, SETTINGS) is None
+
+
+def test_a_line_without_an_end_is_no_tip(make_line: Callable[..., np.ndarray]) -> None:
+    ends = np.array([[10.0, 150.0], [290.0, 150.0]])
+    image = np.round(make_line((300, 300), ends, 4.6, 60.0, 150.0)).astype(np.uint8)
+    path = coarse_path(np.array([50.0, 150.0]), np.array([150.0, 150.0]), np.zeros(2))
+    assert fit_tip(image, path, SETTINGS) is None
