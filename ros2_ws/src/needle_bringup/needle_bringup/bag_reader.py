@@ -1,0 +1,384 @@
+"""Typed access to a recorded run: arrays of what the graph said, straight from a bag."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bringup.bag_writer import METADATA_FILE
+from needle_common.errors import UserError
+
+Floats = npt.NDArray[np.float64]
+Stamps = npt.NDArray[np.int64]
+
+_NANOSECONDS = 1_000_000_000
+_LANDMARK = "needle/controller_status"
+SIDES = ("left", "right")
+
+
+class _HasStamp(Protocol):
+    sec: int
+    nanosec: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Series:
+    """Stamped rows of numbers.
+
+    Attributes
+    ----------
+    stamps : (N,) int64
+        Time of exposure or sampling, ROS clock [ns].
+    values : (N, K) float64
+        One row for each stamp, SI.
+    """
+
+    stamps: Stamps
+    values: Floats
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.stamps)
+
+    def at(self, stamps: Stamps) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return (indices here, indices in `stamps`) of the stamps that both have."""
+        _, here, there = np.intersect1d(self.stamps, stamps, return_indices=True)
+        return here.astype(np.int64), there.astype(np.int64)
+
+
+@dataclasses.dataclass(frozen=True)
+class Status:
+    """One DiagnosticStatus: when it was received (system clock, ns), its keys and values."""
+
+    log_time: int
+    values: dict[str, str]
+
+
+@dataclasses.dataclass(frozen=True)
+class Result:
+    """One step's end: the stamp of its command, and `succeeded` or `aborted: why`."""
+
+    log_time: int
+    stamp: int
+    outcome: str
+
+
+@dataclasses.dataclass(frozen=True)
+class HealthEvent:
+    """A part of a node that was not well: one line of /diagnostics above OK, on change."""
+
+    log_time: int
+    part: str
+    level: int
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """All that a bag says about one run, images apart (`images_near`).
+
+    Attributes
+    ----------
+    path : Path
+        The bag.
+    tips : Series
+        Measured tips in `rig`, (N, 3) [m].
+    tip_covariances : Series
+        Position covariance of every exposure's answer, (N, 9) [m^2]; infinite: no tip found.
+    truth : Series
+        Ground truth in `rig`: position and quaternion x y z w, (N, 7).
+    estimate : Series
+        Estimate in `target_plane`: position and quaternion, (N, 7).
+    reduced_state : Series
+        r = (x, beta, gamma) in `target_plane`, (N, 3) [m, rad, rad].
+    joints : Series
+        Insertion [m] and rotation [rad], (N, 2).
+    control_input : Series
+        v, u [rad/m] and accumulated rotation [rad], (N, 3).
+    controller_status, device_status : list of Status
+        In order of arrival.
+    results : list of Result
+        In order of arrival.
+    health : list of HealthEvent
+        What was not well, in order of arrival.
+    first_command : int or None
+        When the first step was commanded, system clock [ns].
+    topics : dict of str to int
+        Messages for each topic.
+    parameters : dict
+        Node name to its parameters at the start.
+    run_info, versions : dict
+        What the recorder was told about the run, and what made it.
+    calibration, commit : str
+        Text of the calibration file and the commit of the sources; empty where unknown.
+    """
+
+    path: Path
+    tips: Series
+    tip_covariances: Series
+    truth: Series
+    estimate: Series
+    reduced_state: Series
+    joints: Series
+    control_input: Series
+    controller_status: list[Status]
+    device_status: list[Status]
+    results: list[Result]
+    health: list[HealthEvent]
+    first_command: int | None
+    topics: dict[str, int]
+    parameters: dict[str, dict[str, Any]]
+    run_info: dict[str, Any]
+    versions: dict[str, str]
+    calibration: str
+    commit: str
+    namespace: str
+
+    def insertion_at(self, stamps: Stamps) -> Floats:
+        """Return the insertion [m], (N,), at ROS times [ns]; NaN where no joints were recorded."""
+        if not len(self.joints):
+            return np.full(len(stamps), np.nan)
+        start = self.joints.stamps[0]
+        return np.interp(
+            (stamps - start).astype(np.float64),
+            (self.joints.stamps - start).astype(np.float64),
+            self.joints.values[:, 0],
+        )
+
+    def last_status(self, key: str, default: str = "") -> str:
+        """Return the last value of a key of the controller's status."""
+        for status in reversed(self.controller_status):
+            if key in status.values:
+                return status.values[key]
+        return default
+
+    def parameter(self, node: str, name: str) -> Any:
+        """Return a node's parameter (last part of the node's name), None if it is not recorded."""
+        for full_name, values in self.parameters.items():
+            if full_name.rsplit("/", maxsplit=1)[-1] == node:
+                return values.get(name)
+        return None
+
+    def images_near(self, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[np.uint8]]]:
+        """Yield (index into `stamps`, side, mono image (H, W)) of images of exactly these stamps.
+
+        Raises
+        ------
+        UserError
+            If the bag cannot be read.
+        """
+        wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
+        names = {f"{self.namespace}stereo/{side}/image_raw": side for side in SIDES}
+        for topic, _, message in _messages(self.path, lambda name: name in names):
+            index = wanted.get(_nanoseconds(message.header.stamp))
+            if index is not None and message.encoding == "mono8":
+                rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
+                yield index, names[topic], rows[:, : message.width]
+
+
+def read_run(path: Path) -> Run:
+    """Read a run from its bag.
+
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 directory written by the recorder (or by rosbag2's own).
+
+    Raises
+    ------
+    UserError
+        If there is no bag, it is broken or incomplete, or it holds no needle run.
+    """
+    topics, custom = _contents(path)
+    namespace = _namespace(path, topics)
+    collected = _Collector()
+    takers = {namespace + name: taker for name, taker in collected.takers().items()}
+    takers["/diagnostics"] = collected.take_diagnostics
+    for topic, log_time, message in _messages(path, lambda name: name in takers):
+        try:
+            takers[topic](log_time, message)
+        except (AttributeError, TypeError) as error:
+            raise UserError(f"{path}: {topic} has another type than the rig's: {error}") from error
+    return Run(
+        path=path,
+        tips=collected.series("tips", 3),
+        tip_covariances=collected.series("tip_covariances", 9),
+        truth=collected.series("truth", 7),
+        estimate=collected.series("estimate", 7),
+        reduced_state=collected.series("reduced_state", 3),
+        joints=collected.series("joints", 2),
+        control_input=collected.series("control_input", 3),
+        controller_status=collected.controller_status,
+        device_status=collected.device_status,
+        results=collected.results,
+        health=collected.health,
+        first_command=collected.first_command,
+        topics=topics,
+        parameters=_parameters(custom.get("parameters", "")),
+        run_info=_mapping(custom.get("run_info", "")),
+        versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
+        calibration=custom.get("calibration", ""),
+        commit=custom.get("commit", ""),
+        namespace=namespace,
+    )
+
+
+class _Collector:
+    """Turns messages into rows, topic by topic."""
+
+    def __init__(self) -> None:
+        self._rows: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        self.controller_status: list[Status] = []
+        self.device_status: list[Status] = []
+        self.results: list[Result] = []
+        self.health: list[HealthEvent] = []
+        self.first_command: int | None = None
+        self._last_health: dict[str, tuple[int, str]] = {}
+
+    def takers(self) -> dict[str, Callable[[int, Any], None]]:
+        """Return relative topic name to what takes its messages."""
+        return {
+            "needle/tip": lambda _, m: self._add("tips", m.header, _xyz(m.point)),
+            "needle/tip_pose": lambda _, m: self._add(
+                "tip_covariances",
+                m.header,
+                tuple(np.reshape(m.pose.covariance, (6, 6))[:3, :3].ravel()),
+            ),
+            "sim/tip_pose": lambda _, m: self._add("truth", m.header, _pose(m.pose)),
+            "needle/estimate": lambda _, m: self._add("estimate", m.header, _pose(m.pose.pose)),
+            "needle/reduced_state": lambda _, m: self._add(
+                "reduced_state", m.header, _xyz(m.vector)
+            ),
+            "needle/control_input": lambda _, m: self._add(
+                "control_input", m.header, _xyz(m.vector)
+            ),
+            "joint_states": self._take_joints,
+            "device/joint_trajectory": self._take_command,
+            "device/result": self._take_result,
+            "needle/controller_status": lambda t, m: self.controller_status.append(
+                Status(t, {pair.key: pair.value for pair in m.values})
+            ),
+            "device/status": lambda t, m: self.device_status.append(
+                Status(t, {pair.key: pair.value for pair in m.values})
+            ),
+        }
+
+    def series(self, name: str, width: int) -> Series:
+        """Return one topic's rows in order of their stamps, the first of equal ones."""
+        rows = self._rows.get(name, [])
+        stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, width)
+        unique, first = np.unique(stamps, return_index=True)
+        return Series(unique, values[first])
+
+    def _add(self, name: str, header: Any, row: tuple[float, ...]) -> None:
+        self._rows.setdefault(name, []).append((_nanoseconds(header.stamp), row))
+
+    def _take_joints(self, _: int, message: Any) -> None:
+        position = dict(zip(message.name, message.position, strict=False))
+        if "insertion_joint" in position and "rotation_joint" in position:
+            row = (float(position["insertion_joint"]), float(position["rotation_joint"]))
+            self._add("joints", message.header, row)
+
+    def _take_command(self, log_time: int, _: Any) -> None:
+        if self.first_command is None:
+            self.first_command = log_time
+
+    def _take_result(self, log_time: int, message: Any) -> None:
+        self.results.append(Result(log_time, _nanoseconds(message.stamp), message.frame_id))
+
+    def take_diagnostics(self, log_time: int, message: Any) -> None:
+        """Take what is not well, where it changed."""
+        for status in message.status:
+            now = (int(status.level), str(status.message))
+            if self._last_health.get(status.name) != now and now[0] > 0:
+                self.health.append(HealthEvent(log_time, status.name, *now))
+            self._last_health[status.name] = now
+
+
+def _contents(path: Path) -> tuple[dict[str, int], dict[str, str]]:
+    """Return messages by topic and the bag's custom data."""
+    if not path.is_dir():
+        raise UserError(f"{path}: no such bag directory")
+    if not (path / METADATA_FILE).is_file():
+        if any(path.glob("*.mcap")):
+            raise UserError(f"{path}: the bag was not completed ({METADATA_FILE} is missing)")
+        raise UserError(f"{path} is not a bag: it has no {METADATA_FILE}")
+    try:
+        with Reader(path) as reader:
+            topics: dict[str, int] = {}
+            for connection in reader.connections:
+                topics[connection.topic] = topics.get(connection.topic, 0) + connection.msgcount
+        information = yaml.safe_load((path / METADATA_FILE).read_text(encoding="utf-8"))
+    except (ReaderError, OSError, ValueError, KeyError, yaml.YAMLError) as error:
+        raise _broken(path, error) from error
+    custom = information["rosbag2_bagfile_information"].get("custom_data") or {}
+    return topics, {str(key): str(value) for key, value in custom.items()}
+
+
+def _namespace(path: Path, topics: dict[str, int]) -> str:
+    found = sorted(name for name in topics if name.endswith(f"/{_LANDMARK}"))
+    if not found:
+        raise UserError(f"{path} holds no needle run: no topic {_LANDMARK} among {len(topics)}")
+    return found[0].removesuffix(_LANDMARK)
+
+
+def _messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, log time, message) in order of log time."""
+    try:
+        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
+            connections = [c for c in reader.connections if wanted(c.topic)]
+            if not connections:
+                return
+            for connection, log_time, data in reader.messages(connections=connections):
+                yield connection.topic, log_time, reader.deserialize(data, connection.msgtype)
+    except (AnyReaderError, ReaderError, OSError) as error:
+        raise _broken(path, error) from error
+
+
+def _broken(path: Path, error: Exception) -> UserError:
+    lines = str(error).splitlines()
+    return UserError(f"{path}: the bag is broken: {lines[0] if lines else type(error).__name__}")
+
+
+def _parameters(text: str) -> dict[str, dict[str, Any]]:
+    nodes = _mapping(text)
+    return {
+        str(node): dict(entry.get("ros__parameters") or {})
+        for node, entry in nodes.items()
+        if isinstance(entry, dict)
+    }
+
+
+def _mapping(text: str) -> dict[str, Any]:
+    """Return YAML or JSON text as a mapping; other text under the key `text`."""
+    try:
+        value = json.loads(text) if text.lstrip().startswith("{") else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError):
+        value = text
+    if value is None:
+        return {}
+    return value if isinstance(value, dict) else {"text": str(value)}
+
+
+def _nanoseconds(stamp: _HasStamp) -> int:
+    return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
+
+
+def _xyz(vector: Any) -> tuple[float, ...]:
+    return (float(vector.x), float(vector.y), float(vector.z))
+
+
+def _pose(pose: Any) -> tuple[float, ...]:
+    q = pose.orientation
+    return (*_xyz(pose.position), float(q.x), float(q.y), float(q.z), float(q.w))
