@@ -22,7 +22,9 @@ setup(
     maintainer_email="maintainers@needle-steering.invalid",
     description="Tip positions to the rotation of each insertion step (Kallem and Cowan 2009).",
     license="Apache-2.0",
-    entry_points={"console_scripts": [
+    entry_points={
+        "console_scripts": [
             "plane_controller = needle_controller.plane_controller_node:main",
-        ]},
+        ]
+    },
 )

@@ -1,1 +1,1 @@
-"""Tip positions to the rotation of each insertion step (Kallem and Cowan 2009)."""
+"""Steers a bevel-tip needle into a plane: tip positions to the rotation of each insertion step."""

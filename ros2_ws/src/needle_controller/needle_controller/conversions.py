@@ -1,0 +1,143 @@
+"""plane_controller's messages, to and from plain data."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3,
+    Vector3Stamped,
+)
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from needle_common.conversions import to_nanoseconds, to_stamp, values_of
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_controller.arrays import Array
+from needle_controller.estimator import Estimate
+from needle_controller.joint_history import JointSample
+from needle_controller.kinematics import angle_axes
+from needle_controller.plane_control import ControlUpdate
+from needle_controller.steering import DeviceStatus, SendStep, State, Steering
+from needle_controller.target_plane import TargetPlane, plane_from_pose
+from needle_controller.tip_gate import TipMeasurement
+
+TARGET_PLANE = "target_plane"
+INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
+_LEVELS = {State.FAULT: Level.ERROR, State.WAITING_FOR_TIP: Level.WARN}
+
+
+def to_joint_sample(message: JointState) -> JointSample:
+    """Return the two joints of a JointState, found by name.
+
+    Raises
+    ------
+    UserError
+        If one of them is missing or not finite.
+    """
+    position = dict(zip(message.name, message.position, strict=False))
+    missing = [name for name in (INSERTION_JOINT, ROTATION_JOINT) if name not in position]
+    if missing:
+        raise UserError(f"joint_states without {' and '.join(missing)}: {list(message.name)}")
+    insertion, rotation = position[INSERTION_JOINT], position[ROTATION_JOINT]
+    if not (np.isfinite(insertion) and np.isfinite(rotation)):
+        raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
+    return JointSample(to_nanoseconds(message.header.stamp), insertion, rotation)
+
+
+def to_tip(message: PointStamped) -> TipMeasurement:
+    """Return a measured tip as it came, nothing checked."""
+    point = message.point
+    return TipMeasurement(
+        to_nanoseconds(message.header.stamp),
+        message.header.frame_id,
+        np.array([point.x, point.y, point.z]),
+    )
+
+
+def to_plane(message: PoseStamped, depth: float) -> TargetPlane:
+    """Return the plane a message asks for; raises UserError as `plane_from_pose` does."""
+    p, q = message.pose.position, message.pose.orientation
+    return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w], depth)
+
+
+def to_device_status(message: DiagnosticStatus) -> DeviceStatus:
+    """Return what the protocol needs of device/status."""
+    values = values_of(message)
+    return DeviceStatus(
+        state=values.get("state", ""),
+        homed=values.get("homed", "").lower() == "true",
+        hold_owner=values.get("hold_owner", ""),
+        reason=values.get("fault", "") or values.get("reason", "") or message.message,
+    )
+
+
+def to_trajectory(step: SendStep) -> JointTrajectory:
+    """Return a step as a trajectory of one point."""
+    point = JointTrajectoryPoint(positions=[step.insertion, step.rotation])
+    nanoseconds = round(step.duration * 1e9)
+    point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
+    message = JointTrajectory(joint_names=[INSERTION_JOINT, ROTATION_JOINT], points=[point])
+    message.header.stamp = to_stamp(step.stamp_ns)
+    return message
+
+
+def to_header(stamp_ns: int) -> Header:
+    """Return a header in the frame of the target plane."""
+    return Header(stamp=to_stamp(stamp_ns), frame_id=TARGET_PLANE)
+
+
+def to_pose(estimate: Estimate, stamp_ns: int) -> PoseWithCovarianceStamped:
+    """Return the estimated pose, its covariance in the message's fixed-axis convention."""
+    message = PoseWithCovarianceStamped(header=to_header(stamp_ns))
+    pose = message.pose.pose
+    pose.position.x, pose.position.y, pose.position.z = (float(c) for c in estimate.position)
+    quaternion = Rotation.from_matrix(estimate.rotation).as_quat()
+    orientation = pose.orientation
+    orientation.x, orientation.y, orientation.z, orientation.w = (float(c) for c in quaternion)
+    turn = np.eye(6)
+    turn[3:, 3:] = angle_axes(estimate.coordinates[3:])
+    message.pose.covariance = (turn @ estimate.covariance @ turn.T).ravel()
+    return message
+
+
+def to_vector(values: Array, stamp_ns: int) -> Vector3Stamped:
+    """Return three numbers stamped in the frame of the target plane."""
+    x, y, z = (float(value) for value in values)
+    return Vector3Stamped(header=to_header(stamp_ns), vector=Vector3(x=x, y=y, z=z))
+
+
+def to_control_input(update: ControlUpdate, stamp_ns: int) -> Vector3Stamped:
+    """Return (v, u, rotation of the base since the first tip)."""
+    command = update.command
+    values = np.array([command.virtual_input, command.rotation_rate, update.turned])
+    return to_vector(values, stamp_ns)
+
+
+def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
+    """Return needle/controller_status as a line of health."""
+    values = {
+        "state": steering.state.value,
+        "step": str(steering.step),
+        "insertion_m": repr(steering.insertion),
+        "target_offset_m": repr(steering.control.plane.offset),
+        "reachable": "",
+        "reachable_depth_m": "",
+        "reason": steering.reason,
+        "awaiting": steering.awaiting.value,
+        "tip_after_ns": str(steering.tip_after_ns),
+        "tips_rejected": str(steering.tips_rejected),
+        "watchdog_trips": str(steering.watchdog_trips),
+        "preset": preset,
+        "depth_m": repr(steering.settings.depth),
+    }
+    level = _LEVELS.get(steering.state, Level.OK)
+    if steering.rejection:
+        level = max(level, Level.WARN)
+    return Diagnostic(level, steering.reason or steering.state.value, values)

@@ -1,0 +1,175 @@
+"""The parameters of plane_controller."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from needle_common.parameter_fields import check_fields, parameter
+from needle_controller.plane_control import PRESETS, ControlSettings
+from needle_controller.steering import SteeringSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneControllerParameters:
+    """All of them; a change is taken as a whole or refused.
+
+    Raises
+    ------
+    UserError
+        A value out of its bounds, or weights that give no stable gains.
+    """
+
+    preset: str = parameter(
+        "paper",
+        unit="-",
+        description="paper = observer and law of [KC09], open_loop = no rotation.",
+        choices=PRESETS,
+    )
+    curvature: float = parameter(
+        1.0 / 0.122,
+        unit="1/m",
+        description="Curvature of the needle's path in the tissue.",
+        lower=0.1,
+        upper=100.0,
+    )
+    target_offset: float = parameter(
+        0.0,
+        unit="m",
+        description="x of the wanted plane in rig, until a target_plane is given.",
+        lower=-0.1,
+        upper=0.1,
+    )
+    depth: float = parameter(
+        0.12,
+        unit="m",
+        description="Insertion at which steering is done.",
+        lower=0.0,
+        upper=1.0,
+    )
+    step_length: float = parameter(
+        0.001,
+        unit="m",
+        description="Insertion of one step; the last one ends at the depth.",
+        lower=1e-4,
+        upper=0.01,
+    )
+    nominal_speed: float = parameter(
+        0.002,
+        unit="m/s",
+        description="Insertion speed at speed scale 1.",
+        lower=1e-5,
+        upper=0.05,
+    )
+    max_rotation_per_length: float = parameter(
+        math.radians(30.0) / 0.001,
+        unit="rad/m",
+        description="Most the base is turned per inserted length.",
+        lower=0.0,
+        upper=1000.0,
+    )
+    tip_timeout: float = parameter(
+        2.0,
+        unit="s",
+        description="Time without a good tip (steady clock) until WAITING_FOR_TIP.",
+        lower=0.01,
+        upper=60.0,
+    )
+    tip_margin: float = parameter(
+        0.004,
+        unit="m",
+        description="What noise may add to a tip's distance from where the needle can be.",
+        lower=0.0,
+        upper=0.1,
+    )
+    needle_out_insertion: float = parameter(
+        0.002,
+        unit="m",
+        description="Insertion up to which the needle counts as out.",
+        lower=0.0,
+        upper=0.01,
+    )
+    retraction_tolerance: float = parameter(
+        0.0002,
+        unit="m",
+        description="Backward motion that counts as a retraction.",
+        lower=1e-6,
+        upper=0.01,
+    )
+    state_weights: tuple[float, ...] = parameter(
+        (1.0e6, 950.0, 5.3e-6),
+        unit="1/m^2, -, m^2",
+        description="Cost of s1^2, s2^2, s3^2 per inserted length.",
+        lower=0.0,
+    )
+    input_weight: float = parameter(
+        3.06e-9,
+        unit="m^4",
+        description="Cost of v^2 per inserted length.",
+        lower=0.0,
+    )
+    process_noise: tuple[float, ...] = parameter(
+        (2.07e-7, 0.0343, 109.0),
+        unit="m, 1/m, 1/m^3",
+        description="Variance per metre of white noise on the derivatives of s, for the observer.",
+        lower=0.0,
+    )
+    measurement_std: float = parameter(
+        0.001 / math.sqrt(3.0),
+        unit="m",
+        description="Standard deviation of one measured tip coordinate.",
+        lower=1e-7,
+        upper=0.1,
+    )
+    saturation_margin: float = parameter(
+        0.12,
+        unit="-",
+        description="The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
+        lower=1e-6,
+        upper=0.9,
+    )
+    demand_margin: float = parameter(
+        0.44,
+        unit="-",
+        description="The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
+        lower=1e-6,
+        upper=0.9,
+    )
+    initial_yaw_std: float = parameter(
+        math.radians(10.0),
+        unit="rad",
+        description="How well the yaw at the entry is known (covariance only).",
+        lower=0.0,
+        upper=math.pi,
+    )
+    initial_pitch_std: float = parameter(
+        math.radians(10.0),
+        unit="rad",
+        description="How well the pitch at the entry is known (covariance only).",
+        lower=0.0,
+        upper=math.pi,
+    )
+    initial_roll_std: float = parameter(
+        math.radians(30.0),
+        unit="rad",
+        description="How well the roll at the entry is known (covariance only).",
+        lower=0.0,
+        upper=math.pi,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the whole, gains included."""
+        check_fields(self)
+        self.control().gains()
+
+    def control(self) -> ControlSettings:
+        """Return what estimator and law are made of."""
+        return ControlSettings(
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(ControlSettings)}
+        )
+
+    def steering(self) -> SteeringSettings:
+        """Return the step protocol's numbers."""
+        return SteeringSettings(
+            **{f.name: getattr(self, f.name) for f in dataclasses.fields(SteeringSettings)}
+        )

@@ -1,0 +1,226 @@
+"""plane_controller: measured tips in, one insertion step at a time out."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3Stamped,
+)
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.conversions import (
+    JOINT_STATES,
+    LATCHED,
+    RELIABLE,
+    to_diagnostic_status,
+    to_nanoseconds,
+)
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.parameters import NodeParameters
+from needle_controller import conversions
+from needle_controller.parameters import PlaneControllerParameters
+from needle_controller.plane_control import PlaneControl
+from needle_controller.steering import Action, Log, PublishUpdate, SendStep, Steering
+from needle_controller.target_plane import offset_plane
+
+HELP = """
+plane_controller: steers the needle into the target plane, one insertion step per measured tip.
+
+Subscribes  needle/tip, target_plane, joint_states, device/result, device/status
+Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, needle/linearized_state,
+            needle/control_input, needle/controller_status, /diagnostics
+Services    ~/start, ~/stop
+"""
+
+# Steady time between two lines of log of one kind [s]: never every cycle.
+_LOG_PERIOD = 2.0
+
+
+class PlaneControllerNode(Node):
+    """The ROS shell of `steering.Steering`: converts, calls, publishes, reports.
+
+    Parameters
+    ----------
+    context : Context, optional
+        Where the node lives; the global context by default.
+    parameter_overrides : list of Parameter, optional
+        Parameters beside those of the command line.
+
+    Raises
+    ------
+    UserError
+        A parameter that is unknown, of the wrong type, out of bounds, or part of a bad whole.
+    """
+
+    def __init__(
+        self,
+        context: Context | None = None,
+        parameter_overrides: list[Parameter] | None = None,
+    ) -> None:
+        super().__init__(
+            "plane_controller", context=context, parameter_overrides=parameter_overrides
+        )
+        self._parameters = NodeParameters(self, PlaneControllerParameters, self._on_parameters)
+        values = self._parameters.values
+        self._target_offset = values.target_offset
+        control = PlaneControl(values.control(), offset_plane(values.target_offset))
+        self._steering = Steering(values.steering(), control)
+        self._logged: dict[str, float] = {}
+        self._bad_joints = 0
+        self._joints_complaint = ""
+        self._plane_complaint = ""
+        self._published: Diagnostic | None = None
+
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
+        self._estimates = self.create_publisher(
+            PoseWithCovarianceStamped, "needle/estimate", RELIABLE
+        )
+        self._reduced = self.create_publisher(Vector3Stamped, "needle/reduced_state", RELIABLE)
+        self._linearized = self.create_publisher(
+            Vector3Stamped, "needle/linearized_state", RELIABLE
+        )
+        self._inputs = self.create_publisher(Vector3Stamped, "needle/control_input", RELIABLE)
+        self._status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
+        self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
+        self.create_subscription(DiagnosticStatus, "device/status", self._on_device, LATCHED)
+        self.create_subscription(Header, "device/result", self._on_result, RELIABLE)
+        self.create_subscription(PoseStamped, "target_plane", self._on_plane, LATCHED)
+        self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE)
+        self.create_service(Trigger, "~/start", self._on_start)
+        self.create_service(Trigger, "~/stop", self._on_stop)
+        self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
+        self._do([])
+
+    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        reply, actions = self._steering.on_start()
+        self._do(actions)
+        response.success, response.message = reply.success, reply.message
+        return response
+
+    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        reply, actions = self._steering.on_stop()
+        self._do(actions)
+        response.success, response.message = reply.success, reply.message
+        return response
+
+    def _on_joints(self, message: JointState) -> None:
+        try:
+            sample = conversions.to_joint_sample(message)
+        except UserError as error:
+            self._bad_joints += 1
+            self._joints_complaint = str(error)
+            self._do([Log("warning", str(error), "joints")])
+            return
+        self._joints_complaint = ""
+        self._do(self._steering.on_joints(sample))
+
+    def _on_tip(self, message: PointStamped) -> None:
+        self._do(self._steering.on_tip(conversions.to_tip(message)))
+
+    def _on_result(self, message: Header) -> None:
+        self._do(self._steering.on_result(to_nanoseconds(message.stamp), message.frame_id))
+
+    def _on_device(self, message: DiagnosticStatus) -> None:
+        self._do(self._steering.on_device(conversions.to_device_status(message)))
+
+    def _on_plane(self, message: PoseStamped) -> None:
+        try:
+            plane = conversions.to_plane(message, self._parameters.values.depth)
+        except UserError as error:
+            self._plane_complaint = f"{error}; the last plane stays"
+            self._do([Log("warning", self._plane_complaint)])
+            return
+        self._plane_complaint = ""
+        self._steering.control.plane = plane
+        self._do([Log("info", f"target_plane at offset {plane.offset:g} m")])
+
+    def _on_parameters(self, values: PlaneControllerParameters) -> None:
+        self._steering.settings = values.steering()
+        self._steering.control.configure(values.control())
+        if values.target_offset != self._target_offset:
+            self._target_offset = values.target_offset
+            self._steering.control.plane = offset_plane(values.target_offset)
+        self._do([Log("info", "parameters changed")])
+
+    def _on_timer(self) -> None:
+        self._do(self._steering.on_time(time.monotonic()))
+
+    def _do(self, actions: Iterable[Action]) -> None:
+        for action in actions:
+            if isinstance(action, SendStep):
+                self._commands.publish(conversions.to_trajectory(action))
+            elif isinstance(action, PublishUpdate):
+                self._publish_update(action)
+            else:
+                self._log(action)
+        self._report()
+
+    def _publish_update(self, action: PublishUpdate) -> None:
+        update, stamp_ns = action.update, action.stamp_ns
+        estimate = update.estimate
+        self._estimates.publish(conversions.to_pose(estimate, stamp_ns))
+        self._reduced.publish(conversions.to_vector(estimate.reduced, stamp_ns))
+        self._linearized.publish(conversions.to_vector(estimate.linearized, stamp_ns))
+        self._inputs.publish(conversions.to_control_input(update, stamp_ns))
+
+    def _log(self, log: Log) -> None:
+        now = time.monotonic()
+        if log.kind:
+            if now - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
+                return
+            self._logged[log.kind] = now
+        # Not one call through a variable: rclpy knows a line by where it is called from.
+        if log.severity == "error":
+            self.get_logger().error(log.text)
+        elif log.severity == "warning":
+            self.get_logger().warning(log.text)
+        else:
+            self.get_logger().info(log.text)
+
+    def _report(self) -> None:
+        diagnostic = conversions.to_diagnostic(self._steering, self._parameters.values.preset)
+        if diagnostic == self._published:
+            return
+        self._published = diagnostic
+        name = self.get_name()
+        self._status.publish(to_diagnostic_status(f"{name}: steering", name, diagnostic))
+        self._diagnostics.set("steering", diagnostic)
+        joints = {"joint_states_refused": str(self._bad_joints)}
+        self._diagnostics.set("joint_states", _health(self._joints_complaint, joints))
+        self._diagnostics.set("target_plane", _health(self._plane_complaint, {}))
+
+
+def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
+    return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the node."""
+    sys.exit(
+        run_node(
+            PlaneControllerNode,
+            help_text=HELP,
+            parameters=PlaneControllerParameters,
+            args=args,
+        )
+    )
+
+
+if __name__ == "__main__":
+    main()
