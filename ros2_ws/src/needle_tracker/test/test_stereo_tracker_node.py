@@ -1,0 +1,282 @@
+"""The node in process: pairs, joints, bad input and what it says about them."""
+
+from __future__ import annotations
+
+import array
+import math
+import os
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, JointState
+
+from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
+from needle_common.errors import UserError
+from needle_tracker.stereo_tracker_node import StereoTrackerNode
+
+# Runs of these tests at the same time on one machine must not hear each other.
+DOMAIN = 71 + os.getpid() % 9
+LIMIT = 20.0
+INSERTION = 0.05
+
+Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
+Images = tuple[np.ndarray, np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def images(draw_pair: Drawer, make_arc: Callable[..., np.ndarray]) -> Images:
+    return draw_pair(make_arc(INSERTION, 5.0, 1.0))
+
+
+@pytest.fixture
+def context() -> Iterator[Context]:
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    yield context
+    rclpy.try_shutdown(context=context)
+
+
+class Bench:
+    """The node under test and everything around it, on one executor."""
+
+    def __init__(self, context: Context, **parameters: Any) -> None:
+        self.node = StereoTrackerNode(
+            context=context,
+            parameter_overrides=[Parameter(name, value=v) for name, v in parameters.items()],
+        )
+        self.outside = Node("outside", context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        for node in (self.node, self.outside):
+            self._executor.add_node(node)
+        self.tips: list[PointStamped] = []
+        self.poses: list[PoseWithCovarianceStamped] = []
+        self.health: defaultdict[str, tuple[int, str, dict[str, str]]] = defaultdict(
+            lambda: (-1, "", {})
+        )
+        outside = self.outside
+        outside.create_subscription(PointStamped, "needle/tip", self.tips.append, RELIABLE)
+        outside.create_subscription(
+            PoseWithCovarianceStamped, "needle/tip_pose", self.poses.append, RELIABLE
+        )
+        outside.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
+        self._joints = outside.create_publisher(JointState, "joint_states", JOINT_STATES)
+        self._images = {
+            side: outside.create_publisher(Image, f"stereo/{side}/image_raw", IMAGES)
+            for side in ("left", "right")
+        }
+        self._infos = outside.create_publisher(CameraInfo, "stereo/left/camera_info", IMAGES)
+        publishers = [self._joints, self._infos, *self._images.values()]
+        self.until(lambda: all(p.get_subscription_count() for p in publishers))
+        answers = (self.node._tip, self.node._tip_pose)
+        self.until(lambda: all(p.get_subscription_count() for p in answers))
+
+    def close(self) -> None:
+        for node in (self.node, self.outside):
+            self._executor.remove_node(node)
+            node.destroy_node()
+        self._executor.shutdown()
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            part = status.name.split(": ")[1]
+            self.health[part] = (status.level[0], status.message, values)
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    def joints(self, stamp: int, insertion: float = INSERTION) -> None:
+        message = JointState(name=["rotation_joint", "insertion_joint"], position=[0.0, insertion])
+        message.header.stamp = to_stamp(stamp)
+        self._joints.publish(message)
+
+    def image(self, side: str, stamp: int, pixels: np.ndarray, encoding: str = "mono8") -> None:
+        height, width = pixels.shape
+        message = Image(height=height, width=width, step=width, encoding=encoding)
+        message.header.stamp = to_stamp(stamp)
+        data = array.array("B")
+        data.frombytes(pixels.tobytes())
+        message.data = data
+        self._images[side].publish(message)
+
+    def camera_info(self, width: int, height: int) -> None:
+        self._infos.publish(CameraInfo(width=width, height=height))
+
+    def pair(self, stamp: int, images: Images) -> PoseWithCovarianceStamped:
+        """Publish a pair with its joint state, and return the answer."""
+        self.joints(stamp)
+        self.image("left", stamp, images[0])
+        self.image("right", stamp, images[1])
+        return self.answer()
+
+    def answer(self) -> PoseWithCovarianceStamped:
+        wanted = len(self.poses) + 1
+        self.until(lambda: len(self.poses) >= wanted)
+        return self.poses[-1]
+
+
+@pytest.fixture
+def bench(context: Context) -> Iterator[Bench]:
+    bench = Bench(context)
+    yield bench
+    bench.close()
+
+
+def found(pose: PoseWithCovarianceStamped) -> bool:
+    diagonal = np.reshape(pose.pose.covariance, (6, 6)).diagonal()
+    assert np.all(np.isfinite(diagonal)) or np.all(np.isinf(diagonal))
+    return bool(np.all(np.isfinite(diagonal)))
+
+
+def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
+    bench: Bench, images: Images, make_arc: Callable[..., np.ndarray]
+) -> None:
+    pose = bench.pair(1_020_000_000, images)
+    bench.until(lambda: len(bench.tips) == 1)
+    truth = make_arc(INSERTION, 5.0, 1.0)[-1]
+    tip = bench.tips[0]
+    assert (tip.header.frame_id, pose.header.frame_id) == ("rig", "rig")
+    assert to_nanoseconds(tip.header.stamp) == to_nanoseconds(pose.header.stamp) == 1_020_000_000
+    seen = [tip.point.x, tip.point.y, tip.point.z]
+    np.testing.assert_allclose(seen, truth, atol=0.3e-3)
+    assert seen == [pose.pose.pose.position.x, pose.pose.pose.position.y, pose.pose.pose.position.z]
+    assert found(pose)
+    covariance = np.reshape(pose.pose.covariance, (6, 6))
+    np.testing.assert_allclose(covariance, covariance.T, rtol=1e-9)
+    assert np.all(np.linalg.eigvalsh(covariance) > -1e-15)
+    assert covariance[:3, :3].trace() < 1e-6
+    bench.until(lambda: bench.health["track"][:2] == (0, "TRACKING"))
+    bench.until(lambda: bench.health["images"][:2] == (0, "pairs complete"))
+
+
+def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None:
+    assert found(bench.pair(1_000_000_000, images))
+    bench.image("left", 1_020_000_000, images[0])
+    bench.image("right", 1_020_000_000, images[1])
+    # In between only the needle's length says that this is no needle: so it was waited for.
+    bench.until(lambda: len(bench.node._queue) == 1)
+    bench.joints(1_010_000_000)
+    bench.joints(1_030_000_000, INSERTION + 0.04)
+    assert not found(bench.answer())
+    bench.until(lambda: bench.health["track"][1] == "TRACKING: short of the insertion")
+
+
+def test_without_joint_states_the_images_alone_count(context: Context, images: Images) -> None:
+    bench = Bench(context, joint_timeout=0.05, confirm_pairs=2)
+    try:
+        for number, wanted in ((1, False), (2, True)):
+            bench.image("left", number * 1_000_000, images[0])
+            bench.image("right", number * 1_000_000, images[1])
+            assert found(bench.answer()) is wanted
+        bench.until(lambda: bench.health["joints"][0] == 1)
+    finally:
+        bench.close()
+
+
+def test_in_the_entry_zone_the_insertion_is_the_tip(bench: Bench, images: Images) -> None:
+    bench.joints(5, 0.002)
+    bench.image("left", 5, images[0])
+    bench.image("right", 5, images[1])
+    pose = bench.answer()
+    assert found(pose)
+    assert pose.pose.pose.position.z == 0.002
+    bench.until(lambda: bench.health["track"][:2] == (0, "ENTRY"))
+
+
+def test_left_without_right_is_counted_and_said(bench: Bench, images: Images) -> None:
+    for stamp in range(1, 6):
+        bench.joints(stamp)
+        bench.image("left", stamp, images[0])
+    bench.image("right", 99, images[1])
+    bench.until(lambda: bench.health["images"][1].startswith("images without"))
+    level, _, values = bench.health["images"]
+    assert level == 1
+    bench.until(lambda: bench.health["images"][2]["left_without_right"] == "2")
+    assert values["pairs"] == "0"
+    assert not bench.poses
+    assert not bench.tips
+
+
+def test_one_camera_alone_is_said(bench: Bench, images: Images) -> None:
+    bench.image("left", 1, images[0])
+    bench.until(lambda: bench.health["images"][:2] == (1, "left images without right"))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "encoding", "reason"),
+    [
+        (lambda image: image, "rgb8", "right image is 'rgb8', wants 'mono8'"),
+        (lambda image: image[:480, :640], "mono8", "right image is 640x480, the calibration is"),
+    ],
+)
+def test_bad_images_are_answered_without_a_tip_and_named(
+    bench: Bench,
+    images: Images,
+    spoil: Callable[[np.ndarray], np.ndarray],
+    encoding: str,
+    reason: str,
+) -> None:
+    bench.joints(10)
+    bench.image("left", 10, images[0])
+    bench.image("right", 10, spoil(images[1]), encoding)
+    pose = bench.answer()
+    assert not found(pose)
+    assert pose.pose.pose.orientation.w == 1.0
+    bench.until(lambda: bench.health["images"][0] == 2 and reason in bench.health["images"][1])
+    bench.until(lambda: bench.health["images"][2]["pairs_refused"] == "1")
+    assert not bench.tips
+    assert found(bench.pair(20, images))
+
+
+def test_a_black_frame_is_no_tip(bench: Bench, images: Images) -> None:
+    assert not found(bench.pair(10, (images[0], np.zeros_like(images[1]))))
+    bench.until(lambda: "right image is black" in bench.health["track"][1])
+    assert bench.health["track"][0] == 1
+
+
+def test_time_running_backwards_is_no_tip(bench: Bench, images: Images) -> None:
+    assert found(bench.pair(5_000_000_000, images))
+    assert not found(bench.pair(4_990_000_000, images))
+    bench.until(lambda: "ran backwards" in bench.health["images"][1])
+    assert not found(bench.pair(5_000_000_000, images))
+    bench.until(lambda: "repeated" in bench.health["images"][1])
+    assert found(bench.pair(5_010_000_000, images))
+    # Far back a new recording has begun: its first pair is refused, the next is looked at.
+    assert not found(bench.pair(1_000_000_000, images))
+    assert found(bench.pair(1_010_000_000, images))
+    assert len(bench.tips) <= 3
+
+
+def test_a_calibration_for_another_resolution_is_said(bench: Bench) -> None:
+    bench.camera_info(640, 480)
+    bench.until(lambda: bench.health["images"][0] == 2)
+    assert "camera_info is for 640x480" in bench.health["images"][1]
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "said"),
+    [
+        ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
+        ("pair_tolerance", -1.0, "pair_tolerance"),
+        ("needle_polarity", "grey", "needle_polarity"),
+        ("pair_tolerence", 0.0, "did you mean 'pair_tolerance'"),
+        ("max_curvature", math.nan, "max_curvature"),
+    ],
+)
+def test_bad_parameters_are_one_line(context: Context, name: str, value: Any, said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        StereoTrackerNode(context=context, parameter_overrides=[Parameter(name, value=value)])
