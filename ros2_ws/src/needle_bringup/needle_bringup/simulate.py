@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 
@@ -28,7 +28,14 @@ from needle_bringup.rig_configuration import (
 )
 from needle_bringup.ros_domain import own_domain
 from needle_bringup.simulate_options import SimulateOptions, parse
-from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_MISSED,
+    JsonValue,
+    run_command,
+    write_json,
+)
 from needle_common.errors import UserError
 
 PACKAGES = {
@@ -41,6 +48,8 @@ PACKAGES = {
 LOGS = "logs"
 PARAMETERS = "parameters.yaml"
 METADATA = "metadata.yaml"
+SUMMARY = "summary.json"
+REPORT = "report.html"
 POLL = 0.05
 # rclpy's own log files would double those in LOGS.
 ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
@@ -70,11 +79,22 @@ class Interruption:
 
     def __init__(self) -> None:
         self._seen = False
+        self._at_once = False
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             # nohup's wish is to outlive the terminal
             if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
                 continue
             signal.signal(number, self._take)
+
+    @contextlib.contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal raise KeyboardInterrupt wherever the context is, not only in `check`."""
+        self._at_once = True
+        try:
+            self.check()
+            yield
+        finally:
+            self._at_once = False
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal has come."""
@@ -82,7 +102,10 @@ class Interruption:
             raise KeyboardInterrupt
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
+        first = not self._seen
         self._seen = True
+        if first and self._at_once:
+            raise KeyboardInterrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -215,7 +238,54 @@ def _report(
     done: bool,
 ) -> int:
     """Make summary and report from the bag; the exit code."""
-    raise NotImplementedError
+    # They take a second to import: not for a command line that is refused.
+    from needle_bringup.bag_reader import read_run  # noqa: PLC0415
+    from needle_bringup.report import write_report  # noqa: PLC0415
+    from needle_bringup.run_summary import summarize  # noqa: PLC0415
+
+    with interruption.at_once():
+        run = read_run(bag)
+        write_report(run, bag)
+        summary = summarize(run, wall_s=time.time() - started_at)
+        for path in (bag / SUMMARY, options.json):
+            if path is not None:
+                write_json(path, summary)
+    print(describe(summary, bag))
+    return EXIT_DONE if summary["converged"] else EXIT_MISSED
+
+
+def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
+    """Return the result as a person reads it.
+
+    Parameters
+    ----------
+    summary : mapping
+        The content of summary.json.
+    bag : Path
+        The run's folder.
+    """
+
+    def figure(key: str, digits: int = 2) -> str:
+        value = summary.get(key)
+        return f"{value:.{digits}f}" if isinstance(value, (int, float)) else "-"
+
+    verdict = "CONVERGED" if summary.get("converged") else "MISSED"
+    lines = [
+        f"{verdict}: the tip ends {figure('r1_final_mm')} mm from the plane (goal: within 1 mm)",
+        f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
+        f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms",
+        f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
+        f"{figure('depth_error_p95_mm')} mm (95th percentile)",
+        f"  speed             {figure('steps_per_s', 1)} steps/s; {figure('wall_s', 1)} s in all",
+        f"  report            {bag / REPORT}",
+    ]
+    if not summary.get("reached_depth"):
+        reason = summary.get("reason") or "no reason given"
+        lines.insert(1, f"  ended early       {reason}")
+    if summary.get("watchdog_trips"):
+        trips = summary["watchdog_trips"]
+        lines.append(f"  watchdogs         tripped {trips} times: this run may not repeat exactly")
+    return "\n".join(lines)
 
 
 def _make_folder(options: SimulateOptions) -> Path:

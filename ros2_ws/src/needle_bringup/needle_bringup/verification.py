@@ -90,6 +90,12 @@ class Run:
         return path.read_text("utf-8", errors="replace") if path.is_file() else ""
 
     @property
+    def left_in_memory(self) -> list[str]:
+        """Shared-memory ports that the nodes left behind."""
+        domain = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
+        return shared_memory_of(int(domain[1])) if domain else []
+
+    @property
     def last_line(self) -> str:
         """Last line of the output."""
         return ["", *self.output.strip().splitlines()][-1]
@@ -142,6 +148,10 @@ class StartedRun:
             time.sleep(0.02)
         raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
 
+    def running(self) -> list[tuple[int, str]]:
+        """Return (pid, command) of every process of this run."""
+        return processes_with(MARK, self._mark)
+
     def wait(self, timeout: float = 300.0) -> Run:
         """Wait for the end; a run that does not end is killed and has code -9."""
         try:
@@ -150,7 +160,7 @@ class StartedRun:
             self.process.kill()
             code = self.process.wait()
         wall = time.monotonic() - self._begin
-        left_over = processes_with(MARK, self._mark)
+        left_over = self.running()
         for pid, _ in left_over:
             os.kill(pid, signal.SIGKILL)
         names = [f"{pid} {name}" for pid, name in left_over]
@@ -162,25 +172,24 @@ class Workbench:
 
     Parameters
     ----------
-    checkout : Path
-        The project's folder.
+    command : sequence of str
+        What runs `simulate`.
     folder : Path
         Takes the bags.
     """
 
-    def __init__(self, checkout: Path, folder: Path) -> None:
-        self.checkout = checkout
+    def __init__(self, command: Sequence[str], folder: Path) -> None:
+        self._command = list(command)
         self.folder = folder
         self._runs: dict[str, Run] = {}
 
     def start(self, name: str, *arguments: str) -> StartedRun:
-        """Start `scripts/simulate` with these arguments and a bag of this name."""
+        """Start `simulate` with these arguments and a bag of this name."""
         bag = self.folder / name
-        command = [str(self.checkout / "scripts" / "simulate"), *arguments, "--bag", str(bag)]
-        return StartedRun(command, bag)
+        return StartedRun([*self._command, *arguments, "--bag", str(bag)], bag)
 
     def run(self, name: str, *arguments: str) -> Run:
-        """Run `scripts/simulate`; a name that has run before gives that run again."""
+        """Run `simulate`; a name that has run before gives that run again."""
         if name not in self._runs:
             self._runs[name] = self.start(name, *arguments).wait()
         return self._runs[name]

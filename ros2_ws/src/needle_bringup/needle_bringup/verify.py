@@ -64,7 +64,7 @@ def _verify(arguments: Sequence[str]) -> int:
     begin = time.monotonic()
     findings: list[tuple[str, Finding]] = []
     with _folder(given.keep) as folder:
-        bench = Workbench(_checkout(), folder)
+        bench = Workbench([str(_checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
             for finding in check(bench):
                 findings.append((step, finding))

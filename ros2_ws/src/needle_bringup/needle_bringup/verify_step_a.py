@@ -18,7 +18,6 @@ from needle_bringup.verification import (
     Workbench,
     diagnostics,
     payloads,
-    shared_memory_of,
     unreadable,
 )
 
@@ -138,8 +137,7 @@ def interrupt(bench: Workbench) -> Iterator[Finding]:
         run = started.wait(60.0)
         why = unreadable(run.bag) if run.bag.exists() else ""
         bag = f"bag unreadable ({why})" if why else "bag reads" if run.bag.exists() else "no bag"
-        domain = re.search(r"ROS_DOMAIN_ID (\d+)", run.output)
-        memory = shared_memory_of(int(domain[1])) if domain else []
+        memory = run.left_in_memory
         seen = f"exit code {run.code}, {len(run.left_over)} processes left, {bag}"
         seen += f", left in shared memory: {', '.join(memory)}" if memory else ""
         yield Finding(
