@@ -75,8 +75,8 @@ class PlaneControllerNode(Node):
         super().__init__(
             "plane_controller", context=context, parameter_overrides=parameter_overrides
         )
-        self._parameters = NodeParameters(self, PlaneControllerParameters, self._on_parameters)
-        values = self._parameters.values
+        self._settings = NodeParameters(self, PlaneControllerParameters, self._on_parameters)
+        values = self._settings.values
         self._target_offset = values.target_offset
         control = PlaneControl(values.control(), offset_plane(values.target_offset))
         self._steering = Steering(values.steering(), control)
@@ -141,7 +141,7 @@ class PlaneControllerNode(Node):
 
     def _on_plane(self, message: PoseStamped) -> None:
         try:
-            plane = conversions.to_plane(message, self._parameters.values.depth)
+            plane = conversions.to_plane(message, self._settings.values.depth)
         except UserError as error:
             self._plane_complaint = f"{error}; the last plane stays"
             self._do([Log("warning", self._plane_complaint)])
@@ -194,7 +194,7 @@ class PlaneControllerNode(Node):
             self.get_logger().info(log.text)
 
     def _report(self) -> None:
-        diagnostic = conversions.to_diagnostic(self._steering, self._parameters.values.preset)
+        diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
         if diagnostic == self._published:
             return
         self._published = diagnostic
