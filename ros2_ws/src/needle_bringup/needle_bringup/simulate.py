@@ -175,11 +175,12 @@ def _run_nodes(
     """Run the graph until the operator ends; whether the needle reached its depth."""
     logs = bag / LOGS
     logs.mkdir()
+    progress = os.dup(sys.stderr.fileno())
     environment = {
         **os.environ,
         "ROS_DOMAIN_ID": str(domain),
         # Nodes write into their log files; only the operator's progress goes to the terminal.
-        PROGRESS_FD: str(sys.stderr.fileno()),
+        PROGRESS_FD: str(progress),
         "PYTHONUNBUFFERED": "1",
     }
     nodes: dict[str, NodeProcess] = {}
@@ -193,7 +194,7 @@ def _run_nodes(
                 [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
                 environment=environment,
                 log=logs / f"{name}.log",
-                pass_fds=[sys.stderr.fileno()] if name == "operator" else [],
+                pass_fds=[progress] if name == "operator" else [],
             )
         operator = nodes["operator"]
         while operator.exit_code is None and failure is None:
@@ -207,6 +208,7 @@ def _run_nodes(
             raise NodeFailedError(failure)
         return operator.exit_code == EXIT_DONE
     finally:
+        os.close(progress)
         _stop_nodes(nodes)
 
 
@@ -245,8 +247,9 @@ def _report(
 
     with interruption.at_once():
         run = read_run(bag)
-        write_report(run, bag)
-        summary = summarize(run, wall_s=time.time() - started_at)
+        summary = summarize(run)
+        write_report(run, summary)
+        summary["wall_s"] = time.time() - started_at
         for path in (bag / SUMMARY, options.json):
             if path is not None:
                 write_json(path, summary)
