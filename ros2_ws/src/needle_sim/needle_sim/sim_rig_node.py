@@ -64,6 +64,7 @@ START_NS = NANOSECONDS
 _CLOCK_REPEAT = 0.1
 _MATCH_CHECK = 0.02
 _IDLE = 0.01
+_TURNS_PER_LOOK = 5
 _CENTRELINE_SPACING = 0.001
 _RECORDER = "recorder"
 
@@ -180,6 +181,15 @@ class SimRigNode(Node):
             self._idle(now)
             return _IDLE
         return 0.0
+
+    def turns(self) -> float:
+        """Do a few turns in a row, for a look at the callbacks costs as much as a tick."""
+        wait = 0.0
+        for _ in range(_TURNS_PER_LOOK):
+            wait = self.turn()
+            if wait > 0.0:
+                break
+        return wait
 
     def close(self) -> None:
         """Stop the simulated axes and say so."""
@@ -379,7 +389,7 @@ def main() -> int:
         executor.add_node(node)
         try:
             while not ended:
-                executor.spin_once(timeout_sec=node.turn())
+                executor.spin_once(timeout_sec=node.turns())
             node.close()
         finally:
             executor.shutdown()

@@ -118,7 +118,7 @@ class Rig:
         deadline = time.monotonic() + LIMIT
         while not condition():
             assert time.monotonic() < deadline, f"timed out: {what}; {self.partner.status}"
-            self._executor.spin_once(timeout_sec=min(self.sim.turn(), 0.01))
+            self._executor.spin_once(timeout_sec=min(self.sim.turns(), 0.01))
 
     def call(self, name: str, data: bool | None = None) -> Any:
         future = self.partner.call(name, data)
