@@ -22,7 +22,9 @@ setup(
     maintainer_email="maintainers@needle-steering.invalid",
     description="Stereo images to the needle's tip, through the phantom's refracting surface.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [
+    entry_points={
+        "console_scripts": [
             "stereo_tracker = needle_tracker.stereo_tracker_node:main",
-        ]},
+        ]
+    },
 )
