@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from needle_bringup.bag_reader import Run, Series
 from needle_bringup.run_summary import (
@@ -27,19 +28,22 @@ MEASURED = "#d1701b"
 ESTIMATE = "#1668b0"
 GOAL_BAND = "#2e9d55"
 MM = 1e3
+# Narrow, so that the text can still be read on a phone [inch].
+WIDTH = 6.6
 _STYLE: dict[Any, Any] = {
-    "font.size": 10,
+    "font.size": 9.5,
+    "axes.formatter.useoffset": False,
     "axes.grid": True,
     "grid.color": "#e4e6ea",
     "grid.linewidth": 0.8,
     "axes.edgecolor": "#9aa0a8",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.titlesize": 10.5,
+    "axes.titlesize": 10,
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "legend.frameon": False,
-    "legend.fontsize": 9,
+    "legend.fontsize": 8.5,
 }
 _MEASURED_DOTS: dict[str, Any] = {
     "marker": "o",
@@ -60,7 +64,7 @@ def save(figure: Figure, target: Path | BinaryIO) -> None:
 def states_figure(run: Run) -> Figure:
     """Return [KC09] figure 3's four rows: r1, r2, r3 and the accumulated rotation."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(8.0, 9.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 8.8), layout="constrained")
         r1, r2, r3, rotation = figure.subplots(4, 1, sharex=True)
         _goal_band(r1)
         _draw_measured(r1, run)
@@ -106,7 +110,7 @@ def states_figure(run: Run) -> Figure:
 def path_figure(run: Run) -> Figure:
     """Return the needle's path: from the side against the plane, from above, and in space."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(8.0, 7.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 7.0), layout="constrained")
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
         side = figure.add_subplot(grid[0, :])
         above = figure.add_subplot(grid[1, 0])
@@ -135,7 +139,7 @@ def path_figure(run: Run) -> Figure:
 def error_figure(run: Run) -> Figure:
     """Return the measurement's and the estimate's error against the truth."""
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(8.0, 6.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 5.6), layout="constrained")
         tip, difference = figure.subplots(2, 1, sharex=True)
         error = tip_error(run) * MM
         here, _ = run.tips.at(run.truth.stamps)
@@ -187,7 +191,10 @@ def _draw_space(axes: Any, path: Floats, plane: float) -> None:
     axes.plot(path[:, 2], path[:, 1], path[:, 0], color=TRUTH, lw=1.9)
     axes.plot(path[:, 2], path[:, 1], np.full(len(path), plane), color="#9aa0a8", lw=0.9)
     axes.set(xlabel="z [mm]", ylabel="y [mm]", zlabel="x [mm]")
-    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.92)
+    for axis in (axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(3))
+    axes.tick_params(labelsize=8)
+    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.9)
     axes.view_init(elev=22, azim=-62)
 
 

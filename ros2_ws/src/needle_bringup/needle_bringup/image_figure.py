@@ -34,7 +34,7 @@ def images_figure(run: Run) -> Figure | None:
     cameras = _cameras(run)
     with mpl.rc_context({"font.size": 9}):
         columns = sorted({index for index, _ in pictures})
-        figure = Figure(figsize=(8.0, 5.8), layout="constrained")
+        figure = Figure(figsize=(6.6, 4.9), layout="constrained")
         grid = figure.subplots(len(SIDES), len(columns), squeeze=False)
         insertion = run.insertion_at(chosen) * 1e3
         for column, index in enumerate(columns):

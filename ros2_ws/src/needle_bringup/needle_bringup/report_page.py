@@ -31,7 +31,7 @@ header small { opacity: .88; }
 h2 { font-size: 1.2rem; margin: 1.8rem 0 .3rem; }
 figure { margin: 0; break-inside: avoid; }
 figcaption, .note { color: var(--soft); font-size: .9rem; margin: 0 0 .4rem; }
-img { display: block; width: 100%; height: auto; }
+img { display: block; width: 100%; max-width: 50rem; height: auto; margin: 0 auto; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; width: 100%; font-size: .88rem; }
 td, th { text-align: left; vertical-align: top; padding: .22rem .6rem .22rem 0;
