@@ -175,6 +175,20 @@ def test_a_black_image_is_named(
         assert measured.reason == "right image is black"
 
 
+def test_nonsense_images_give_no_tip_and_no_error(tracker: StereoTracker) -> None:
+    rng = np.random.default_rng(9)
+    for _ in range(8):
+        pair = []
+        for _ in range(2):
+            image = rng.normal(rng.uniform(40, 200), rng.choice([0.0, 8.0, 40.0]), (768, 1024))
+            for _ in range(4):
+                u, v = rng.integers(0, 900), rng.integers(0, 700)
+                width, height = rng.integers(2, 300, 2)
+                image[v : v + height, u : u + width] = rng.uniform(0, 255)
+            pair.append(np.clip(image, 0, 255).astype(np.uint8))
+        assert tracker.process(pair[0], pair[1], float(rng.uniform(0.01, 0.2))).tip is None
+
+
 def test_another_size_is_a_bad_call(tracker: StereoTracker) -> None:
     small = np.zeros((480, 640), np.uint8)
     with pytest.raises(ValueError, match=r"left image is uint8\(480, 640\)"):
