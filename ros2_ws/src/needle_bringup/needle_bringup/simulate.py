@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import importlib
 import os
 import shutil
 import signal
@@ -11,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 
 from needle_bringup.installed import find_executable, find_shared
 from needle_bringup.node_process import NodeProcess, stop, wait_for
@@ -51,6 +52,8 @@ METADATA = "metadata.yaml"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 POLL = 0.05
+# When the nodes have started, one core has time for this process [s].
+QUIET_AFTER = 4.0
 # rclpy's own log files would double those in LOGS.
 ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
 # The recorder writes out what it still holds: a slow disk may take its time.
@@ -182,6 +185,9 @@ def _run_nodes(
         # Nodes write into their log files; only the operator's progress goes to the terminal.
         PROGRESS_FD: str(progress),
         "PYTHONUNBUFFERED": "1",
+        # Small matrices: threads only get in each other's way, and in the way of the other nodes.
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
     }
     nodes: dict[str, NodeProcess] = {}
     print(f"recording into {bag} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
@@ -197,8 +203,11 @@ def _run_nodes(
                 pass_fds=[progress] if name == "operator" else [],
             )
         operator = nodes["operator"]
+        begin = time.monotonic()
         while operator.exit_code is None and failure is None:
             interruption.check()
+            if time.monotonic() - begin > QUIET_AFTER:
+                _import_report()
             failure = _first_dead(nodes)
             wait_for([operator], POLL)
         failure = failure or _first_dead(nodes)
@@ -240,21 +249,23 @@ def _report(
     done: bool,
 ) -> int:
     """Make summary and report from the bag; the exit code."""
-    # They take a second to import: not for a command line that is refused.
-    from needle_bringup.bag_reader import read_run  # noqa: PLC0415
-    from needle_bringup.report import write_report  # noqa: PLC0415
-    from needle_bringup.run_summary import summarize  # noqa: PLC0415
-
     with interruption.at_once():
-        run = read_run(bag)
-        summary = summarize(run)
-        write_report(run, summary)
+        report, bag_reader, run_summary = _import_report()
+        run = bag_reader.read_run(bag)
+        summary = run_summary.summarize(run)
+        report.write_report(run, summary)
         summary["wall_s"] = time.time() - started_at
         for path in (bag / SUMMARY, options.json):
             if path is not None:
                 write_json(path, summary)
     print(describe(summary, bag))
     return EXIT_DONE if summary["converged"] else EXIT_MISSED
+
+
+def _import_report() -> tuple[ModuleType, ...]:
+    """Import what makes the report: a second of work, best done while there is time to spare."""
+    names = ("report", "bag_reader", "run_summary")
+    return tuple(importlib.import_module(f"needle_bringup.{name}") for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
