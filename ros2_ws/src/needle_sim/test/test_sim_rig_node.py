@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,6 +12,15 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PointStamped, PoseStamped
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import JointState, Joy
+from std_msgs.msg import Bool, Header
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
 from needle_common.base_node import STEADY_CLOCK
 from needle_common.conversions import (
     HOLD,
@@ -21,15 +31,8 @@ from needle_common.conversions import (
     to_stamp,
     values_of,
 )
+from needle_common.errors import UserError
 from needle_sim.sim_rig_node import SimRigNode
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState, Joy
-from std_msgs.msg import Header
-from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 DOMAIN = 61
 LIMIT = 20.0
@@ -47,13 +50,17 @@ class Partner(Node):
         self.status: dict[str, str] = {}
         self.pressed = False
         self.silent = False
+        self.scale = 1.0
         self.rotation_per_step = 0.1
         self._commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
         self._hold = self.create_publisher(Joy, "device/hold", HOLD)
         self._status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
+        self._estop = self.create_publisher(Bool, "device/estop", RELIABLE)
         self.create_subscription(PointStamped, "needle/tip", self.tips.append, RELIABLE)
         self.create_subscription(JointState, "joint_states", self.joints.append, JOINT_STATES)
-        self.create_subscription(PoseStamped, "sim/tip_pose", self.truths.append, RELIABLE)
+        self._truth = self.create_subscription(
+            PoseStamped, "sim/tip_pose", self.truths.append, RELIABLE
+        )
         self.create_subscription(Header, "device/result", self.results.append, RELIABLE)
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
         self._device_services: dict[str, Any] = {
@@ -73,13 +80,19 @@ class Partner(Node):
     def ready(self) -> bool:
         return all(client.service_is_ready() for client in self._device_services.values())
 
+    def hears_truth(self) -> bool:
+        return bool(self._truth.get_publisher_count() > 0)
+
     def send_hold(self) -> None:
         if self.silent:
             return
-        message = Joy(axes=[1.0], buttons=[int(self.pressed)])
+        message = Joy(axes=[self.scale], buttons=[int(self.pressed)])
         message.header.frame_id = "partner"
         message.header.stamp = to_stamp(time.time_ns())
         self._hold.publish(message)
+
+    def estop(self, pressed: bool) -> None:
+        self._estop.publish(Bool(data=pressed))
 
     def say(self, state: str, awaiting: str, tip_after_ns: int) -> None:
         values = {"state": state, "awaiting": awaiting, "tip_after_ns": str(tip_after_ns)}
@@ -128,6 +141,7 @@ class Rig:
     def prepare(self) -> None:
         partner = self.partner
         self.until(partner.ready, "services")
+        self.until(partner.hears_truth, "truth")
         partner.say("IDLE", "nothing", 0)
 
         def started() -> bool:
@@ -143,14 +157,17 @@ class Rig:
         partner.pressed = True
         self.until(lambda: partner.status["hold_owner"] == "partner", "hold")
         partner.say("STEERING", "tip", 0)
-        self.until(lambda: len(partner.tips) == 1, "first tip")
+        self.until(lambda: len(partner.tips) > 0, "first tip")
 
     def step(self, length: float = 0.001) -> Header:
         partner = self.partner
         done = len(partner.results)
         # Topics have no order among each other: wait for the joints at the tip's exposure.
         stamp = partner.tips[-1].header.stamp
-        self.until(lambda: partner.joints[-1].header.stamp == stamp, "joints at the tip's stamp")
+        self.until(
+            lambda: bool(partner.joints) and partner.joints[-1].header.stamp == stamp,
+            "joints at the tip's stamp",
+        )
         last = partner.joints[-1]
         partner.command(
             last.position[0] + length,
@@ -173,8 +190,10 @@ def running(**parameters: Any) -> Iterator[Rig]:
     rclpy.init(context=context, domain_id=DOMAIN)
     try:
         rig = Rig(context, **parameters)
-        yield rig
-        rig.close()
+        try:
+            yield rig
+        finally:
+            rig.close()
     finally:
         context.try_shutdown()
 
@@ -202,9 +221,178 @@ def test_five_steps_repeat_bit_for_bit_with_one_seed_and_differ_with_another() -
     assert joints[-1].position == pytest.approx([0.005, 0.5])
     stamps = [to_nanoseconds(joint.header.stamp) for joint in joints]
     # One at the start of time, 25 in each step, one at each of six exposures: none was lost.
-    assert [b - a for a, b in zip(stamps, stamps[1:], strict=False)] == [20_000_000] * 131
+    assert [b - a for a, b in itertools.pairwise(stamps)] == [20_000_000] * 131
     for tip, truth in zip(tips, truths, strict=True):
         assert tip.header == truth.header
         assert tip.header.frame_id == "rig"
         assert abs(tip.point.x - truth.pose.position.x) <= 1e-3
     assert truths[-1].pose.position.z == pytest.approx(0.005, abs=1e-5)
+
+
+def test_services_refuse_while_partners_are_missing_and_say_which() -> None:
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    sim = SimRigNode(
+        context=context,
+        parameter_overrides=[
+            Parameter("level", value="tip"),
+            Parameter("wait_for_recorder", value=True),
+        ],
+    )
+    asker = Node("asker", context=context)
+    try:
+        executor = SingleThreadedExecutor(context=context)
+        executor.add_node(sim)
+        executor.add_node(asker)
+        client = asker.create_client(SetBool, "device/enable")
+        deadline = time.monotonic() + LIMIT
+        while not client.service_is_ready():
+            assert time.monotonic() < deadline
+            executor.spin_once(timeout_sec=sim.turns())
+
+        def enable(on: bool) -> Any:
+            future = client.call_async(SetBool.Request(data=on))
+            while not future.done():
+                assert time.monotonic() < deadline
+                executor.spin_once(timeout_sec=sim.turns())
+            return future.result()
+
+        answer = enable(True)
+        assert not answer.success
+        assert answer.message.startswith("waiting for ")
+        assert "publisher of /device/hold" in answer.message
+        assert "subscriber of /needle/tip" in answer.message
+        # Whoever wants less motion is never kept waiting.
+        assert enable(False).success
+        executor.shutdown()
+    finally:
+        asker.destroy_node()
+        sim.destroy_node()
+        context.try_shutdown()
+
+
+def test_time_starts_only_with_the_recorder_where_one_is_wanted() -> None:
+    with running(wait_for_recorder=True) as rig:
+        rig.until(rig.partner.ready, "services")
+        rig.partner.say("IDLE", "nothing", 0)
+
+        def refusal() -> str:
+            return str(rig.call("confirm_needle_out", True).message)
+
+        rig.until(lambda: "recorder of" in refusal(), "only the recorder is missing")
+        assert "recorder of /sim/tip_pose" in refusal()
+        assert "recorder of /joint_states" in refusal()
+        assert rig.partner.joints == []
+
+
+def test_releasing_the_hold_aborts_the_step_and_the_next_tip_tells_where() -> None:
+    with running() as rig:
+        rig.prepare()
+        partner = rig.partner
+        # The step would never end: lock step stands still at speed 0.
+        partner.scale = 0.0
+        partner.send_hold()
+        rig.until(lambda: partner.status["speed_scale"] == "0", "standing still")
+        partner.command(0.001, 0.1, to_nanoseconds(partner.tips[-1].header.stamp))
+        rig.until(lambda: partner.status["state"] == "MOVING", "step under way")
+        partner.pressed = False
+        rig.until(lambda: len(partner.results) == 1, "abort")
+        assert partner.results[0].frame_id == "aborted: hold released"
+        assert partner.results[0].stamp == partner.tips[0].header.stamp
+        rig.until(lambda: len(partner.tips) == 2, "exposure after the abort")
+        rig.until(lambda: partner.status["hold_owner"] == "", "no owner")
+
+
+def test_a_lapsed_hold_pauses_and_is_counted() -> None:
+    with running() as rig:
+        rig.prepare()
+        partner = rig.partner
+        partner.silent = True
+        rig.until(lambda: partner.status["reason"].endswith("paused"), "lapse")
+        partner.command(0.001, 0.1, to_nanoseconds(partner.tips[-1].header.stamp))
+        rig.until(lambda: partner.status["state"] == "MOVING", "step accepted")
+        joints = len(partner.joints)
+        partner.silent = False
+        rig.until(lambda: len(partner.results) == 1, "step done")
+        assert partner.results[0].frame_id == "succeeded"
+        rig.until(lambda: len(partner.joints) >= joints + 25, "joints of the step")
+
+
+def test_estop_stops_and_takes_reset_and_enable() -> None:
+    with running() as rig:
+        rig.prepare()
+        partner = rig.partner
+        partner.estop(True)
+        rig.until(lambda: partner.status["state"] == "ESTOPPED", "emergency stop")
+        assert not rig.call("reset").success
+        partner.estop(False)
+        partner.pressed = False
+
+        def reset() -> bool:
+            return bool(rig.call("reset").success)
+
+        rig.until(reset, "reset")
+        rig.until(lambda: partner.status["state"] == "DISABLED", "disabled")
+        assert rig.call("enable", True).success
+
+
+def test_a_second_publisher_of_commands_is_refused() -> None:
+    with running() as rig:
+        rig.prepare()
+        partner = rig.partner
+        other = partner.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
+        rig.until(lambda: other.get_subscription_count() == 1, "second publisher")
+        assert "2 nodes publish commands" in rig.step().frame_id
+        rig.until(lambda: partner.status["commands_refused"] == "1", "count")
+
+
+def test_retraction_draws_the_needle_to_the_entry_point() -> None:
+    with running() as rig:
+        rig.prepare()
+        partner = rig.partner
+        for number in range(2):
+            assert rig.step().frame_id == "succeeded"
+            rig.until(lambda n=number: len(partner.tips) == n + 2, "tip after the step")
+        assert rig.call("retract").success
+        rig.until(lambda: partner.joints[-1].position[0] == 0.0, "retracted")
+        assert partner.joints[-1].position[1] == pytest.approx(0.2)
+        rig.until(lambda: partner.status["state"] == "HOLDING", "holding")
+
+
+def test_real_time_exposes_by_rate_and_a_lapse_aborts() -> None:
+    with running(real_time_factor=5.0, camera_rate=10.0) as rig:
+        rig.prepare()
+        partner = rig.partner
+        rig.until(lambda: len(partner.tips) >= 5, "tips")
+        stamps = [to_nanoseconds(tip.header.stamp) for tip in partner.tips]
+        assert {b - a for a, b in itertools.pairwise(stamps)} == {100_000_000}
+        partner.scale = 0.0
+        partner.send_hold()
+        rig.until(lambda: partner.status["speed_scale"] == "0", "standing still")
+        partner.command(0.001, 0.0, to_nanoseconds(partner.tips[-1].header.stamp))
+        rig.until(lambda: partner.status["state"] == "MOVING", "step under way")
+        partner.silent = True
+        rig.until(lambda: len(partner.results) == 1, "abort")
+        assert partner.results[0].frame_id.startswith("aborted: no hold message for")
+        rig.until(lambda: int(partner.status["watchdog_trips"]) >= 1, "count")
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"level": "drive"}, "drive is not available yet"),
+        ({"level": "x"}, "level"),
+        ({"curvature": -1.0}, "curvature"),
+        ({"max_speed": 0.006}, "max_speed"),
+        ({"speed": 1.0}, "unknown parameter 'speed'"),
+        ({"level": "camera", "calibration_file": "/nowhere.yaml"}, "/nowhere.yaml"),
+    ],
+)
+def test_bad_parameters_are_refused_in_one_line(parameters: dict[str, Any], message: str) -> None:
+    context = Context()
+    rclpy.init(context=context, domain_id=DOMAIN)
+    try:
+        with pytest.raises(UserError, match=message):
+            Rig(context, **parameters)
+    finally:
+        context.try_shutdown()
