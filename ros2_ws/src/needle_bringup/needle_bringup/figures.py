@@ -194,7 +194,7 @@ def _draw_space(axes: Any, path: Floats, plane: float) -> None:
     for axis in (axes.yaxis, axes.zaxis):
         axis.set_major_locator(MaxNLocator(3))
     axes.tick_params(labelsize=8)
-    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.9)
+    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.82)
     axes.view_init(elev=22, azim=-62)
 
 

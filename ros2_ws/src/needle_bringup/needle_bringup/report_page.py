@@ -36,7 +36,8 @@ img { display: block; width: 100%; max-width: 50rem; height: auto; margin: 0 aut
 table { border-collapse: collapse; width: 100%; font-size: .88rem; }
 td, th { text-align: left; vertical-align: top; padding: .22rem .6rem .22rem 0;
   border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }
-th { color: var(--soft); font-weight: 500; white-space: nowrap; }
+th { color: var(--soft); font-weight: 500; white-space: nowrap; width: 15rem; }
+.events th { width: auto; }
 details { margin: .35rem 0; } summary { cursor: pointer; font-weight: 600; }
 pre { overflow-x: auto; font-size: .8rem; background: #f5f6f8; padding: .7rem;
   border-radius: .4rem; white-space: pre-wrap; }
@@ -182,7 +183,7 @@ def _health(run: Run) -> str:
     )
     return (
         "<h2>Warnings and faults</h2><p class=note>Seconds of wall time after the first step's "
-        f"command.</p><div class=scroll><table>{lines}</table></div>"
+        f"command.</p><div class=scroll><table class=events>{lines}</table></div>"
     )
 
 

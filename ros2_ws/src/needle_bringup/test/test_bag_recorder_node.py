@@ -1,0 +1,233 @@
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import rclpy
+import yaml
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+from sensor_msgs.msg import Joy
+from std_msgs.msg import Int32, String
+
+from needle_bringup.ros_domain import own_domain
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+PATIENCE = 20.0
+RECORDER = (sys.executable, "-m", "needle_bringup.recorder_node")
+
+
+class Source:
+    """A node in this process that publishes into the domain."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.node = Node("source", context=self.context)
+        self.node.declare_parameter("gain", 1.5)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+
+    def wait(self, condition: Callable[[], object], what: str) -> None:
+        end = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < end, f"waited in vain for {what}"
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def publisher(self, kind: type, topic: str, qos: QoSProfile | int = 1000) -> Any:
+        return self.node.create_publisher(kind, topic, qos)
+
+    def wait_matched(self, *publishers: Any) -> None:
+        self.wait(
+            lambda: all(p.get_subscription_count() for p in publishers), "the recorder to subscribe"
+        )
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    with own_domain() as number:
+        yield number
+
+
+@pytest.fixture
+def source(domain: int) -> Iterator[Source]:
+    one = Source(domain)
+    yield one
+    one.close()
+
+
+def start(domain: int, *parameters: str) -> subprocess.Popen[str]:
+    arguments = ["--ros-args"]
+    for parameter in parameters:
+        arguments += ["-p", parameter]
+    return subprocess.Popen(
+        [*RECORDER, *arguments],
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> tuple[int, str, str]:
+    process.send_signal(number)
+    try:
+        printed, errors = process.communicate(timeout=PATIENCE)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.communicate()
+        raise
+    return process.returncode, printed, errors
+
+
+def numbers(bag: Path, topic: str) -> list[int]:
+    with AnyReader([bag]) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        return [
+            int(reader.deserialize(data, c.msgtype).data)  # type: ignore[attr-defined]
+            for c, _, data in reader.messages(connections=connections)
+        ]
+
+
+def test_nothing_is_lost(domain: int, source: Source, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    calibration = tmp_path / "calibration.yaml"
+    calibration.write_text("phantom: {}\n")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    hold = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    state = source.publisher(String, "state", latched)
+    state.publish(String(data="before the recorder came"))
+    numbered, joy = source.publisher(Int32, "numbered"), source.publisher(Joy, "hold", hold)
+    process = start(
+        domain, f"bag:={bag}", f"calibration_file:={calibration}", "run_info:='seed: 4'"
+    )
+    source.wait_matched(state, numbered, joy)
+    for number in range(2000):
+        numbered.publish(Int32(data=number))
+    joy.publish(Joy(buttons=[1]))
+    late = source.publisher(Int32, "rig/late")
+    source.wait_matched(late)
+    for number in range(50):
+        late.publish(Int32(data=number))
+    # The recorder's questions about parameters need this node to spin until they are answered.
+    data = bag / "bag_0.mcap"
+    source.wait(lambda: b"gain: 1.5" in data.read_bytes(), "the parameters to be recorded")
+    code, printed, errors = end(process)
+    assert code == 0, errors
+    assert f"into {bag}" in printed
+    assert numbers(bag, "/numbered") == list(range(2000))
+    assert numbers(bag, "/rig/late") == list(range(50))
+    with Reader(bag) as reader:
+        topics = {c.topic: c for c in reader.connections}
+        counts = {name: c.msgcount for name, c in topics.items()}
+        assert {"/rosout", "/parameter_events", "/diagnostics"} <= set(counts)
+        assert (counts["/state"], counts["/hold"]) == (1, 1)
+        for connection in topics.values():
+            assert connection.digest == STORE.hash_rihs01(connection.msgtype)
+        (offered,) = topics["/state"].ext.offered_qos_profiles  # type: ignore[union-attr]
+        assert offered.durability is QosDurability.TRANSIENT_LOCAL
+        (offered,) = topics["/hold"].ext.offered_qos_profiles  # type: ignore[union-attr]
+        assert offered.reliability is QosReliability.BEST_EFFORT
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+    custom = metadata["rosbag2_bagfile_information"]["custom_data"]
+    assert custom["calibration"] == "phantom: {}\n"
+    assert custom["run_info"] == "seed: 4"
+    assert yaml.safe_load(custom["parameters"])["/source"]["ros__parameters"]["gain"] == 1.5
+
+
+def test_topics_with_subscribers_only_are_recorded_from_the_first_message(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    """A publisher that says one thing and ends would be missed if the recorder came after it."""
+    bag = tmp_path / "bag"
+    source.node.create_subscription(Int32, "estop", lambda _: None, 10)
+    process = start(domain, f"bag:={bag}")
+    graph = source.node
+    source.wait(lambda: graph.count_subscribers("/estop") == 2, "the recorder to subscribe")
+    publisher = source.publisher(Int32, "estop")
+    source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
+    publisher.publish(Int32(data=1))
+    source.node.destroy_publisher(publisher)
+    source.wait(lambda: not graph.count_publishers("/estop"), "the publisher to go")
+    assert end(process, signal.SIGINT)[0] == 0
+    assert numbers(bag, "/estop") == [1]
+
+
+def test_a_latched_publisher_is_served_although_the_topic_was_volatile_before(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    source.node.create_subscription(Int32, "plane", lambda _: None, 10)
+    process = start(domain, f"bag:={bag}")
+    graph = source.node
+    source.wait(lambda: graph.count_subscribers("/plane") == 2, "the recorder to subscribe")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = source.publisher(Int32, "plane", latched)
+    publisher.publish(Int32(data=7))
+    durable = DurabilityPolicy.TRANSIENT_LOCAL
+    source.wait(
+        lambda: (
+            durable
+            in [
+                info.qos_profile.durability
+                for info in graph.get_subscriptions_info_by_topic("/plane")
+                if info.node_name == "recorder"
+            ]
+        ),
+        "the recorder to ask for the latched message",
+    )
+    source.wait_matched(publisher)
+    publisher.publish(Int32(data=8))
+    assert end(process)[0] == 0
+    recorded = numbers(bag, "/plane")
+    assert recorded in ([7, 8], [8])
+    assert len(set(recorded)) == len(recorded)
+
+
+def test_a_signal_during_start_up_leaves_a_whole_bag_or_none(domain: int, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    process = start(domain, f"bag:={bag}")
+    end_of_patience = time.monotonic() + PATIENCE
+    while not bag.exists():
+        assert time.monotonic() < end_of_patience
+        time.sleep(0.001)
+    assert end(process)[0] == 0
+    with Reader(bag) as reader:
+        assert reader.ros_distro == "jazzy"
+
+
+@pytest.mark.parametrize(
+    ("parameter", "words"),
+    [
+        ("bag:={here}", "holds a bag already"),
+        ("bagg:=x", "did you mean 'bag'"),
+        ("calibration_file:={here}/none.yaml", "cannot read"),
+    ],
+)
+def test_bad_parameters_are_one_line_and_exit_2(
+    domain: int, tmp_path: Path, parameter: str, words: str
+) -> None:
+    (tmp_path / "metadata.yaml").write_text("{}")
+    process = start(domain, parameter.format(here=tmp_path))
+    _, errors = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 2
+    assert words in errors
+    assert errors.count("\n") == 1
