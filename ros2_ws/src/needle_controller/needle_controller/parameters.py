@@ -21,13 +21,13 @@ class PlaneControllerParameters:
     """
 
     preset: str = parameter(
-        "paper",
+        ControlSettings.preset,
         unit="-",
         description="paper = observer and law of [KC09], open_loop = no rotation.",
         choices=PRESETS,
     )
     curvature: float = parameter(
-        1.0 / 0.122,
+        ControlSettings.curvature,
         unit="1/m",
         description="Curvature of the needle's path in the tissue.",
         lower=0.1,
@@ -48,7 +48,7 @@ class PlaneControllerParameters:
         upper=1.0,
     )
     step_length: float = parameter(
-        0.001,
+        ControlSettings.step_length,
         unit="m",
         description="Insertion of one step; the last one ends at the depth.",
         lower=1e-4,
@@ -62,7 +62,7 @@ class PlaneControllerParameters:
         upper=0.05,
     )
     max_rotation_per_length: float = parameter(
-        math.radians(30.0) / 0.001,
+        ControlSettings.max_rotation_per_length,
         unit="rad/m",
         description="Most the base is turned per inserted length.",
         lower=0.0,
@@ -97,60 +97,60 @@ class PlaneControllerParameters:
         upper=0.01,
     )
     state_weights: tuple[float, ...] = parameter(
-        (1.0e6, 950.0, 5.3e-6),
+        ControlSettings.state_weights,
         unit="1/m^2, -, m^2",
         description="Cost of s1^2, s2^2, s3^2 per inserted length.",
         lower=0.0,
     )
     input_weight: float = parameter(
-        3.06e-9,
+        ControlSettings.input_weight,
         unit="m^4",
         description="Cost of v^2 per inserted length.",
         lower=0.0,
     )
     process_noise: tuple[float, ...] = parameter(
-        (2.07e-7, 0.0343, 109.0),
+        ControlSettings.process_noise,
         unit="m, 1/m, 1/m^3",
         description="Variance per metre of white noise on the derivatives of s, for the observer.",
         lower=0.0,
     )
     measurement_std: float = parameter(
-        0.001 / math.sqrt(3.0),
+        ControlSettings.measurement_std,
         unit="m",
         description="Standard deviation of one measured tip coordinate.",
         lower=1e-7,
         upper=0.1,
     )
     saturation_margin: float = parameter(
-        0.12,
+        ControlSettings.saturation_margin,
         unit="-",
         description="The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
         lower=1e-6,
         upper=0.9,
     )
     demand_margin: float = parameter(
-        0.44,
+        ControlSettings.demand_margin,
         unit="-",
         description="The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
         lower=1e-6,
         upper=0.9,
     )
     initial_yaw_std: float = parameter(
-        math.radians(10.0),
+        ControlSettings.initial_yaw_std,
         unit="rad",
         description="How well the yaw at the entry is known (covariance only).",
         lower=0.0,
         upper=math.pi,
     )
     initial_pitch_std: float = parameter(
-        math.radians(10.0),
+        ControlSettings.initial_pitch_std,
         unit="rad",
         description="How well the pitch at the entry is known (covariance only).",
         lower=0.0,
         upper=math.pi,
     )
     initial_roll_std: float = parameter(
-        math.radians(30.0),
+        ControlSettings.initial_roll_std,
         unit="rad",
         description="How well the roll at the entry is known (covariance only).",
         lower=0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -21,21 +22,24 @@ LARGEST_START_ROLL = np.deg2rad(80.0)
 
 @dataclasses.dataclass(frozen=True)
 class ControlSettings:
-    """What estimator and law are made of; the node's parameters of the same names describe them."""
+    """What estimator and law are made of; the node's parameters describe them and their units.
 
-    preset: str
-    curvature: float
-    step_length: float
-    max_rotation_per_length: float
-    state_weights: tuple[float, ...]
-    input_weight: float
-    process_noise: tuple[float, ...]
-    measurement_std: float
-    saturation_margin: float
-    demand_margin: float
-    initial_yaw_std: float
-    initial_pitch_std: float
-    initial_roll_std: float
+    The values here are the defaults, of the node and of studies alike.
+    """
+
+    preset: str = "paper"
+    curvature: float = 1.0 / 0.122
+    step_length: float = 0.001
+    max_rotation_per_length: float = math.radians(30.0) / 0.001
+    state_weights: tuple[float, ...] = (1.0e6, 950.0, 5.3e-6)
+    input_weight: float = 3.06e-9
+    process_noise: tuple[float, ...] = (2.07e-7, 0.0343, 109.0)
+    measurement_std: float = 0.001 / math.sqrt(3.0)
+    saturation_margin: float = 0.12
+    demand_margin: float = 0.44
+    initial_yaw_std: float = math.radians(10.0)
+    initial_pitch_std: float = math.radians(10.0)
+    initial_roll_std: float = math.radians(30.0)
 
     def gains(self) -> Gains:
         """Return the gains the weights give; raises UserError as `gains.design_gains` does."""

@@ -1,0 +1,53 @@
+"""Functions compiled by numba at their first call and kept on disk, with their types intact."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar, cast
+
+import numba
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def compiled(function: Function) -> Function:
+    """Compile a function for arrays and floats; a decorator.
+
+    What was compiled is kept in the user's cache, in a folder named after all of this package's
+    sources: numba itself looks at the file of the compiled function only, and would go on using old
+    code of what that function calls in another file.
+    """
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = _CACHE
+    try:
+        result = numba.njit(cache=bool(_CACHE), error_model="numpy")(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    return cast(Function, result)
+
+
+def _cache_directory() -> str:
+    """Return a writable folder for this state of the sources, or "" where there is none."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(Path(__file__).parent.glob("*.py")):
+        digest.update(path.read_bytes())
+    places = [os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")]
+    if home := os.environ.get("HOME", ""):
+        places.append(f"{home}/.cache")
+    places.append(f"{tempfile.gettempdir()}/cache-{os.getuid()}")
+    for place in filter(None, places):
+        directory = Path(place) / "needle_controller" / digest.hexdigest()[:16]
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(directory, os.W_OK):
+            return str(directory)
+    return ""
+
+
+_CACHE = _cache_directory()
