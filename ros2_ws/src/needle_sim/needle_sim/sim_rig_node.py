@@ -185,7 +185,8 @@ class SimRigNode(Node):
     def turns(self) -> float:
         """Do a few turns in a row, for a look at the callbacks costs as much as a tick."""
         wait = 0.0
-        for _ in range(_TURNS_PER_LOOK):
+        # Behind real time, more ticks in a row would keep the hold's messages waiting.
+        for _ in range(_TURNS_PER_LOOK if self._pace is None else 1):
             wait = self.turn()
             if wait > 0.0:
                 break

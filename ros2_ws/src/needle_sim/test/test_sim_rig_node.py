@@ -133,6 +133,9 @@ class Rig:
             assert time.monotonic() < deadline, f"timed out: {what}; {self.partner.status}"
             self._executor.spin_once(timeout_sec=min(self.sim.turns(), 0.01))
 
+    def until_tips(self, count: int) -> None:
+        self.until(lambda: len(self.partner.tips) == count, f"{count} tips")
+
     def call(self, name: str, data: bool | None = None) -> Any:
         future = self.partner.call(name, data)
         self.until(future.done, name)
@@ -204,7 +207,7 @@ def five_steps(seed: int) -> tuple[list[Any], list[Any], list[Any]]:
         partner = rig.partner
         for number in range(5):
             assert rig.step().frame_id == "succeeded"
-            rig.until(lambda n=number: len(partner.tips) == n + 2, "tip after the step")
+            rig.until_tips(number + 2)
         rig.until(lambda: len(partner.truths) == 6, "truth")
         stamp = partner.tips[-1].header.stamp
         rig.until(lambda: partner.joints[-1].header.stamp == stamp, "joints")
@@ -352,7 +355,7 @@ def test_retraction_draws_the_needle_to_the_entry_point() -> None:
         partner = rig.partner
         for number in range(2):
             assert rig.step().frame_id == "succeeded"
-            rig.until(lambda n=number: len(partner.tips) == n + 2, "tip after the step")
+            rig.until_tips(number + 2)
         assert rig.call("retract").success
         rig.until(lambda: partner.joints[-1].position[0] == 0.0, "retracted")
         assert partner.joints[-1].position[1] == pytest.approx(0.2)
@@ -360,7 +363,7 @@ def test_retraction_draws_the_needle_to_the_entry_point() -> None:
 
 
 def test_real_time_exposes_by_rate_and_a_lapse_aborts() -> None:
-    with running(real_time_factor=5.0, camera_rate=10.0) as rig:
+    with running(real_time_factor=1.0, camera_rate=10.0) as rig:
         rig.prepare()
         partner = rig.partner
         rig.until(lambda: len(partner.tips) >= 5, "tips")
