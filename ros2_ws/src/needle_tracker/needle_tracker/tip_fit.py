@@ -87,9 +87,7 @@ def fit_tip(image: Image, path: Path, settings: DetectionSettings) -> ImageTip |
         moved = end + tip_along * direction + fit.offset * normal
         turned = direction + fit.slope * normal
         turned = turned / np.linalg.norm(turned)
-        settled = bool(
-            np.abs(moved - end).max() < 0.02 and abs(fit.slope) < 2e-3  # below any noise
-        )
+        settled = bool(np.abs(moved - end).max() < 0.1 and abs(fit.slope) < 5e-3)
         behind = min(float(_BEHIND_PX), behind + tip_along)
         end, direction = moved, turned
         if behind < _LEAST_LINE_PX + 4.0:
