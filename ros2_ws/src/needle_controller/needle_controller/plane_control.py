@@ -31,12 +31,12 @@ class ControlSettings:
     curvature: float = 1.0 / 0.122
     step_length: float = 0.001
     max_rotation_per_length: float = math.radians(30.0) / 0.001
-    state_weights: tuple[float, ...] = (1.0e6, 950.0, 5.3e-6)
-    input_weight: float = 3.06e-9
-    process_noise: tuple[float, ...] = (2.07e-7, 0.0343, 109.0)
+    state_weights: tuple[float, ...] = (1.0e6, 280.0, 0.0)
+    input_weight: float = 2.9e-10
+    process_noise: tuple[float, ...] = (5.0e-7, 0.13, 24.0)
     measurement_std: float = 0.001 / math.sqrt(3.0)
-    saturation_margin: float = 0.12
-    demand_margin: float = 0.44
+    saturation_margin: float = 0.11
+    demand_margin: float = 0.26
     initial_yaw_std: float = math.radians(10.0)
     initial_pitch_std: float = math.radians(10.0)
     initial_roll_std: float = math.radians(30.0)

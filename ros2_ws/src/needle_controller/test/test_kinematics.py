@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from numpy.random import default_rng
@@ -138,7 +140,7 @@ def test_linearized_system_along_a_trajectory_of_the_reduced_one() -> None:
     """ds/dl = A s + B v of (8) holds along (5), whatever u does."""
 
     def rate_at(length: float) -> float:
-        return 20.0 * np.sin(60.0 * length) - 5.0
+        return 20.0 * math.sin(60.0 * length) - 5.0
 
     solution = solve_ivp(
         lambda length, r: reduced_rates(r, rate_at(length), CURVATURE),

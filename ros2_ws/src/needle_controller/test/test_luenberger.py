@@ -93,14 +93,14 @@ def test_converges_without_noise_to_the_whole_reduced_state() -> None:
     plant, one, steer = NeedlePlant(poses(start), curvature=CURVATURE), observer(), law()
     one.reset(plant.T_rig_tip[:3, 3], [0.0, 0.0])
     errors = []
-    for _ in range(200):
+    for _ in range(500):
         rate = float(steer(one.estimate()).rotation_rate)
         plant.advance(STEP, rate * STEP)
         one.advance(STEP, rate * STEP)
         one.correct(plant.T_rig_tip[:3, 3])
         errors.append(np.abs(one.estimate().reduced - true_reduced(plant)))
     assert errors[0][2] > 0.2
-    assert_within(errors[-1], 0.0, [1e-7, 1e-5, 1e-3])
+    assert_within(errors[-1], 0.0, [1e-6, 1e-4, 1e-3])
 
 
 def test_steps_of_any_length_estimate_alike() -> None:
@@ -116,8 +116,8 @@ def test_steps_of_any_length_estimate_alike() -> None:
             one.advance(STEP / divide, d_rotation)
             one.correct(plant.T_rig_tip[:3, 3])
         ends.append(one.estimate().reduced - true_reduced(plant))
-    assert_within(ends[0], ends[2], [2e-6, 1e-3, 5e-2])
-    assert_within(ends[1], ends[2], [1e-6, 5e-4, 2.5e-2])
+    assert_within(ends[0], ends[2], [5e-6, 1e-3, 1e-2])
+    assert_within(ends[1], ends[2], [2.5e-6, 5e-4, 5e-3])
 
 
 @pytest.mark.parametrize("x", [-0.003, 0.003])

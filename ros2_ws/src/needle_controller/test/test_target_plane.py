@@ -32,8 +32,8 @@ def test_a_general_pose_is_a_rigid_transform() -> None:
     np.testing.assert_allclose(plane.T_plane_rig @ plane.T_rig_plane, np.eye(4), atol=1e-12)
     points = np.arange(12.0).reshape(2, 2, 3)
     np.testing.assert_allclose(
-        plane.from_rig(points),
-        rotation.inv().apply((points - origin).reshape(-1, 3)).reshape(2, 2, 3),
+        plane.from_rig(points).reshape(-1, 3),
+        rotation.inv().apply((points - origin).reshape(-1, 3)),
     )
     # The distance of the entry from the plane does not depend on where in the plane its origin is.
     moved = plane_from_pose(
