@@ -149,11 +149,12 @@ class Run:
         if not len(self.joints):
             return np.full(len(stamps), np.nan)
         start = self.joints.stamps[0]
-        return np.interp(
+        insertion: Floats = np.interp(
             (stamps - start).astype(np.float64),
             (self.joints.stamps - start).astype(np.float64),
             self.joints.values[:, 0],
         )
+        return insertion
 
     def last_status(self, key: str, default: str = "") -> str:
         """Return the last value of a key of the controller's status."""

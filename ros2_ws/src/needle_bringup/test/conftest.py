@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +36,9 @@ def header(nanoseconds: int, frame: str = "rig") -> Any:
     return message("std_msgs/msg/Header", stamp=stamp(nanoseconds), frame_id=frame)
 
 
-def vector(x: float, y: float, z: float, kind: str = "Vector3") -> Any:
-    return message(f"geometry_msgs/msg/{kind}", x=float(x), y=float(y), z=float(z))
+def vector(values: Sequence[float] | np.ndarray, kind: str = "Vector3") -> Any:
+    x, y, z = (float(value) for value in values)
+    return message(f"geometry_msgs/msg/{kind}", x=x, y=y, z=z)
 
 
 def pose(position: np.ndarray, beta: float) -> Any:
@@ -49,11 +50,11 @@ def pose(position: np.ndarray, beta: float) -> Any:
         w=float(np.cos(beta / 2)),
     )
     return message(
-        "geometry_msgs/msg/Pose", position=vector(*position, "Point"), orientation=orientation
+        "geometry_msgs/msg/Pose", position=vector(position, "Point"), orientation=orientation
     )
 
 
-def status(values: dict[str, object]) -> Any:
+def status(values: Mapping[str, object]) -> Any:
     pairs = [
         message("diagnostic_msgs/msg/KeyValue", key=k, value=str(v)) for k, v in values.items()
     ]
@@ -147,19 +148,19 @@ def write_run(
         point = message(
             "geometry_msgs/msg/PointStamped",
             header=header(time),
-            point=vector(*(tip + TIP_ERROR), "Point"),
+            point=vector(tip + TIP_ERROR, "Point"),
         )
         out.put("needle/tip", "geometry_msgs/msg/PointStamped", point)
         reduced = message(
             "geometry_msgs/msg/Vector3Stamped",
             header=header(time, "target_plane"),
-            vector=vector(r1 + 1e-4, slope + 0.01, 0.02),
+            vector=vector([r1 + 1e-4, slope + 0.01, 0.02]),
         )
         out.put("needle/reduced_state", "geometry_msgs/msg/Vector3Stamped", reduced)
         control = message(
             "geometry_msgs/msg/Vector3Stamped",
             header=header(time),
-            vector=vector(2e-3, 100.0, 0.1 * number),
+            vector=vector([2e-3, 100.0, 0.1 * number]),
         )
         out.put("needle/control_input", "geometry_msgs/msg/Vector3Stamped", control)
         out.put(
