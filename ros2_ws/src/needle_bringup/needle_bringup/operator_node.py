@@ -103,8 +103,10 @@ class OperatorNode(Node):
         deadline = time.monotonic() + DISABLE_TIMEOUT
         while disabled is not None and not disabled.done() and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
-        self.get_logger().info(outcome.reason)
-        self._progress.close(f"operator: {outcome.reason}")
+        line = f"operator: {outcome.reason}"
+        self._progress.close(line)
+        if self._progress.stream is not sys.stderr:
+            print(line, file=sys.stderr)
         if outcome.interrupted:
             return EXIT_INTERRUPTED
         if not outcome.prepared:

@@ -32,6 +32,8 @@ DISABLE = ServiceCall("device/enable", False)
 # A rig that has not found all its partners yet refuses with this beginning: ask again.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
+# Any other refusal may rest on news that are still under way (joints, the answer before this one).
+REFUSAL_PATIENCE = 2.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,6 +82,7 @@ class OperatorSequence:
         self._pending = False
         self._retry_at = now
         self._refusal = ""
+        self._refused_since: float | None = None
         self._homed = False
         self._steered = False
         self._progress: tuple[str, ...] = ()
@@ -127,12 +130,17 @@ class OperatorSequence:
         if success:
             self._prepared += 1
             self._refusal = ""
+            self._refused_since = None
             self._deadline = now + self._wait_timeout
             self._progress_at = now
-        elif message.startswith(NOT_YET):
-            self._refusal = message
-            self._retry_at = now + RETRY_AFTER
-        else:
+            return
+        self._refusal = message
+        self._retry_at = now + RETRY_AFTER
+        if message.startswith(NOT_YET):
+            self._refused_since = None
+        elif self._refused_since is None:
+            self._refused_since = now
+        elif now >= self._refused_since + REFUSAL_PATIENCE:
             self._end(f"{call.service} was refused: {message}")
 
     def see_device(self, values: Mapping[str, str]) -> None:

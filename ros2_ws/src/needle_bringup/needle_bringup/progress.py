@@ -16,11 +16,11 @@ class Progress:
     Parameters
     ----------
     stream : TextIO
-        Where to show it, usually stderr.
+        Where to show it, usually stderr; kept as the attribute `stream`.
     """
 
     def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+        self.stream = stream
         self._terminal = stream.isatty()
         self._bar: tqdm[None] | None = None
         self._shown_quarter = 0
@@ -35,14 +35,14 @@ class Progress:
         quarter = int(4.0 * insertion / depth + 1e-6)
         if quarter > self._shown_quarter:
             self._shown_quarter = quarter
-            print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self._stream, flush=True)
+            print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self.stream, flush=True)
 
     def close(self, line: str) -> None:
         """Take the bar away and leave one line."""
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-        print(line, file=self._stream, flush=True)
+        print(line, file=self.stream, flush=True)
 
     def _show_bar(self, insertion: float, depth: float) -> None:
         if self._bar is None:
@@ -50,7 +50,7 @@ class Progress:
             self._bar = tqdm(
                 total=round(depth * 1e3, 1),
                 unit="mm",
-                file=self._stream,
+                file=self.stream,
                 leave=False,
                 bar_format="inserted {bar} {n:.0f}/{total:.0f} mm, {elapsed}, {remaining} left",
             )

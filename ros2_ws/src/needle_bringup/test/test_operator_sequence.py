@@ -56,11 +56,16 @@ def test_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses
     assert sequence.next_call(1.0) == PREPARATION[0]
     sequence.take_answer(False, "waiting for a subscriber of joint_states", 1.0)
     assert sequence.next_call(1.05) is None
-    assert sequence.next_call(1.2) == PREPARATION[0]
-    sequence.take_answer(False, "the needle is in", 1.2)
+    assert sequence.next_call(20.0) == PREPARATION[0]
+    sequence.take_answer(False, "waiting for a subscriber of joint_states", 20.0)
+    assert sequence.next_call(20.2) == PREPARATION[0]
+    sequence.take_answer(False, "the needle is in", 20.2)
+    assert outcome(sequence) is None, "what it rests on may have changed meanwhile"
+    assert sequence.next_call(22.2) == PREPARATION[0]
+    sequence.take_answer(False, "the needle is in", 22.2)
     assert sequence.outcome is not None
     assert "the needle is in" in sequence.outcome.reason
-    assert sequence.next_call(2.0) is None
+    assert sequence.next_call(23.0) is None
 
 
 def test_a_service_that_never_answers_is_named() -> None:
