@@ -213,6 +213,9 @@ class SimRigNode(Node):
         self._device.report()
         if now - self._clock_told_at >= _CLOCK_REPEAT:
             self._tell_time(now)
+            if self._started and not self._exposures:
+                # A partner that others had matched before this node did has missed the first.
+                self._device.publish_joint_states(self._time_ns)
 
     def _tick(self, now: float) -> None:
         self._set_time(self._time_ns + TICK_NS)
@@ -255,6 +258,22 @@ class SimRigNode(Node):
             self._tip.publish(to_tip(tip, stamp))
         if self._lock_step is not None:
             self._lock_step.exposed(self._time_ns, now)
+        self._tell_health()
+
+    def _tell_health(self) -> None:
+        lost = 0 if self._pace is None else self._pace.lost_ticks
+        values = {
+            "exposures": str(self._exposures),
+            "lost_ticks": str(lost),
+            "simulated_s": f"{(self._time_ns - START_NS) / NANOSECONDS:.2f}",
+        }
+        level, message = Level.OK, "running"
+        if self._ended:
+            level, message = Level.ERROR, self._ended
+        elif lost:
+            factor = self._settings.real_time_factor
+            level, message = Level.WARN, f"too slow for real_time_factor {factor:g}"
+        self._diagnostics.set("simulation", Diagnostic(level, message, values))
 
     def _end_outside_phantom(self) -> None:
         if not self._is_camera or self._ended:
@@ -266,6 +285,7 @@ class SimRigNode(Node):
                 f"{math.copysign(self._surface_height, height) * 1e3:.2f} mm"
             )
             self._supervisor.fail(self._ended)
+            self._tell_health()
 
     # ---- start --------------------------------------------------------------------------------
 
@@ -282,7 +302,7 @@ class SimRigNode(Node):
         self._started = True
         self._tell_time(now)
         self._device.publish_joint_states(self._time_ns)
-        self._diagnostics.set("simulation", Diagnostic(Level.OK, "running"))
+        self._tell_health()
         self.get_logger().info("all partners are there: time starts")
 
     def _missing_partners(self) -> list[str]:
