@@ -1,0 +1,432 @@
+"""scripts/setup: what it says when something is missing, and what it leaves undone when it can.
+
+The shell part runs for real, with stubs on the PATH; of the rest only pip, venv and colcon are
+replaced, so that no test downloads anything.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import setup_workspace
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+TOOLS = ("bash", "dirname", "readlink", "uname", "sed", "grep", "cat", "env")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Return a checkout in a path with a space, without packages."""
+    root = tmp_path / "with a space"
+    shutil.copytree(SCRIPTS, root / "scripts", ignore=shutil.ignore_patterns("__pycache__"))
+    for name in ("requirements.lock", "requirements-ros.lock"):
+        (root / name).write_text("setuptools==1 \\\n    --hash=sha256:0\n")
+    package = root / "ros2_ws" / "src" / "needle_one"
+    (package / "config").mkdir(parents=True)
+    for name in ("package.xml", "setup.py", "setup.cfg"):
+        (package / name).write_text("")
+    return root
+
+
+@pytest.fixture
+def stubs(tmp_path: Path) -> Path:
+    """Return a folder for the PATH that holds what scripts/setup needs, but no Python."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    for tool in TOOLS:
+        (folder / tool).symlink_to(shutil.which(tool) or "/nonexistent")
+    return folder
+
+
+def add(folder: Path, name: str, text: str) -> Path:
+    path = folder / name
+    path.unlink(missing_ok=True)
+    path.write_text(f"#!{shutil.which('bash')}\n{text}\n")
+    path.chmod(0o755)
+    return path
+
+
+def setup(root: Path, path: Path | str, **variables: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [root / "scripts" / "setup"],
+        check=False,
+        env={"PATH": str(path), "HOME": "/nonexistent", **variables},
+        cwd="/",
+        text=True,
+        capture_output=True,
+    )
+
+
+def only_line(result: subprocess.CompletedProcess[str]) -> str:
+    assert result.returncode == 2
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("setup: ")
+    return lines[0]
+
+
+def test_another_machine(checkout: Path, stubs: Path) -> None:
+    add(stubs, "uname", '[ "$1" = -s ] && echo Linux || echo aarch64')
+    assert "needs Linux on x86-64" in only_line(setup(checkout, stubs))
+
+
+def test_no_python(checkout: Path, stubs: Path) -> None:
+    assert "no Python 3.10-3.13 on the PATH" in only_line(setup(checkout, stubs))
+
+
+def test_a_shim_of_an_inactive_version_is_no_python(checkout: Path, stubs: Path) -> None:
+    add(stubs, "python3", 'echo "pyenv: python3: command not found" >&2; exit 127')
+    add(stubs, "python3.12", "exit 10")
+    assert "no Python 3.10-3.13 on the PATH" in only_line(setup(checkout, stubs))
+
+
+def test_a_python_without_venv(checkout: Path, stubs: Path) -> None:
+    add(stubs, "python3", "exit 11")
+    assert "install python3-venv" in only_line(setup(checkout, stubs))
+
+
+def test_the_first_python_that_fits_is_taken(checkout: Path, stubs: Path) -> None:
+    add(stubs, "python3", "exit 11")
+    add(stubs, "python3.11", '[ "$1" = -c ] || echo "$@"')
+    result = setup(checkout, stubs)
+    assert result.stdout == f"-I -B {checkout}/scripts/lib/setup_workspace.py --mode wheels\n"
+
+
+def test_a_python_that_was_asked_for_is_not_replaced(checkout: Path, stubs: Path) -> None:
+    add(stubs, "python3", "exit 0")
+    line = only_line(setup(checkout, stubs, NEEDLE_PYTHON="/nonexistent/python"))
+    assert "NEEDLE_PYTHON=/nonexistent/python is not a Python" in line
+
+
+def test_another_ros(checkout: Path, stubs: Path) -> None:
+    add(stubs, "ros2", "exit 0")
+    assert "ROS 2 humble is sourced" in only_line(setup(checkout, stubs, ROS_DISTRO="humble"))
+
+
+def test_ros_that_the_python_cannot_import(checkout: Path, stubs: Path) -> None:
+    add(stubs, "ros2", "exit 0")
+    add(stubs, "python3", "exit 12")
+    line = only_line(setup(checkout, stubs, ROS_DISTRO="jazzy"))
+    assert "python3 cannot import rclpy" in line
+
+
+def test_ros_is_used_where_it_is_sourced_and_nothing_of_it_is_dropped(
+    checkout: Path, stubs: Path
+) -> None:
+    add(stubs, "ros2", "exit 0")
+    add(stubs, "python3", '[ "$1" = -c ] || echo "$@ $LD_LIBRARY_PATH"')
+    result = setup(checkout, stubs, ROS_DISTRO="jazzy", LD_LIBRARY_PATH="/opt/ros/jazzy/lib")
+    assert result.stdout.endswith("--mode ros /opt/ros/jazzy/lib\n")
+
+
+def test_the_stand_in_is_not_taken_for_ros(checkout: Path, stubs: Path) -> None:
+    add(stubs, "ros2", "exec python ros2_standin.py")
+    add(stubs, "python3", '[ "$1" = -c ] || echo "$@ ${LD_LIBRARY_PATH-}"')
+    result = setup(checkout, stubs, ROS_DISTRO="jazzy", LD_LIBRARY_PATH="/leaked")
+    assert result.stdout.endswith("--mode wheels \n")
+
+
+def test_an_unknown_argument(checkout: Path, stubs: Path) -> None:
+    result = subprocess.run(
+        [checkout / "scripts" / "setup", "--frce"],
+        check=False,
+        env={"PATH": str(stubs)},
+        text=True,
+        capture_output=True,
+    )
+    assert "unknown argument '--frce'" in only_line(result)
+
+
+def test_an_index_that_cannot_be_reached(checkout: Path) -> None:
+    result = setup(
+        checkout,
+        os.environ["PATH"],
+        NEEDLE_PYTHON=sys.executable,
+        PIP_CONFIG_FILE=os.devnull,
+        PIP_INDEX_URL="http://127.0.0.1:9/",
+        PIP_RETRIES="1",
+        PIP_NO_CACHE_DIR="1",
+    )
+    assert result.returncode == 2
+    last = result.stderr.splitlines()[-1]
+    assert "no network: the package index cannot be reached" in last
+    assert str(checkout / "ros2_ws" / "log" / "setup.log") in last
+
+
+Workspace = types.ModuleType
+
+
+class Commands:
+    """Stands in for pip, venv and colcon; remembers what was run."""
+
+    def __init__(self, module: Workspace) -> None:
+        self._module = module
+        self.names: list[str] = []
+        self.fail: dict[str, BaseException] = {}
+        self.output = ""
+
+    def __call__(self, command: list[Any], **_options: object) -> None:
+        words = [str(word) for word in command]
+        if "venv" in words or "pip" in words:
+            name = "venv" if "venv" in words else "pip"
+        else:
+            name = "colcon" if "colcon_core" in words[2] else "import"
+        self.names.append(name)
+        if name in self.fail:
+            self._module.LOG.write_text(self.output)
+            raise self.fail[name]
+        if name == "venv":
+            (self._module.VENV / "bin").mkdir(parents=True)
+            self._module.VENV_PYTHON.touch()
+        if name == "colcon":
+            for folder in ("build", "install"):
+                (self._module.WORKSPACE / folder / "needle_one").mkdir(parents=True, exist_ok=True)
+
+
+@pytest.fixture
+def workspace(checkout: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
+    """Return the module, at work in the checkout of this test."""
+    module: Workspace = setup_workspace
+    root = module.ROOT
+    for name, value in vars(module).copy().items():
+        if isinstance(value, Path) and value.is_relative_to(root):
+            monkeypatch.setattr(module, name, checkout / value.relative_to(root))
+    locks = {mode: checkout / path.name for mode, path in module.LOCKS.items()}
+    monkeypatch.setattr(module, "LOCKS", locks)
+    monkeypatch.setattr(sys, "argv", ["scripts/setup"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    return module
+
+
+@pytest.fixture
+def commands(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> Commands:
+    commands = Commands(workspace)
+    monkeypatch.setattr(workspace, "run", commands)
+    return commands
+
+
+FIRST = ["venv", "pip", "pip", "import", "colcon"]
+
+
+def test_a_second_set_up_does_nothing(workspace: Workspace, commands: Commands) -> None:
+    assert workspace.main() == 0
+    assert commands.names == FIRST
+    commands.names.clear()
+    assert workspace.main() == 0
+    assert commands.names == []
+
+
+def test_a_renewed_lock_is_installed_into_the_environment(
+    workspace: Workspace, commands: Commands
+) -> None:
+    workspace.main()
+    commands.names.clear()
+    workspace.LOCKS["wheels"].write_text("setuptools==2 \\\n    --hash=sha256:0\n")
+    assert workspace.main() == 0
+    assert commands.names == ["pip", "pip", "import", "colcon"]
+
+
+@pytest.mark.parametrize("path", ["setup.py", "config/new.yaml", "launch/rig.launch.py"])
+def test_a_new_executable_or_file_is_only_built(
+    workspace: Workspace, commands: Commands, path: str
+) -> None:
+    workspace.main()
+    commands.names.clear()
+    file = workspace.WORKSPACE / "src" / "needle_one" / path
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("new")
+    assert workspace.main() == 0
+    assert commands.names == ["colcon"]
+
+
+def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands) -> None:
+    package = workspace.WORKSPACE / "src" / "needle_one"
+    (package / "config" / "rig.yaml").write_text("a: 1")
+    workspace.main()
+    commands.names.clear()
+    (package / "config" / "rig.yaml").write_text("a: 2")
+    (package / "needle_one").mkdir()
+    (package / "needle_one" / "plant.py").write_text("")
+    assert workspace.main() == 0
+    assert commands.names == []
+
+
+@pytest.mark.parametrize(
+    ("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", ["colcon"])]
+)
+def test_the_next_set_up_repairs_an_interrupted_one(
+    workspace: Workspace, commands: Commands, stage: str, again: list[str]
+) -> None:
+    commands.fail[stage] = KeyboardInterrupt()
+    assert workspace.main() == 130
+    commands.fail.clear()
+    commands.names.clear()
+    assert workspace.main() == 0
+    assert commands.names == again
+
+
+def test_a_moved_checkout_gets_a_new_environment(
+    workspace: Workspace, commands: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace.main()
+    commands.names.clear()
+    monkeypatch.setattr(workspace, "ROOT", Path("/elsewhere"))
+    monkeypatch.setattr(workspace, "check_space", lambda: None)
+    monkeypatch.setattr(workspace, "exclusive", lambda: contextlib.nullcontext(-1))
+    assert workspace.main() == 0
+    assert commands.names == FIRST
+
+
+@pytest.mark.parametrize(
+    ("output", "line"),
+    [
+        ("ERROR: [Errno 28] No space left on device", "disk full"),
+        (
+            "WARNING: Retrying (Retry(total=0))\nERROR: No matching distribution found for a",
+            "no network",
+        ),
+        ("ERROR: No matching distribution found for a==1", "the package index has no a==1"),
+        ("ERROR: THESE PACKAGES DO NOT MATCH THE HASHES FROM", "another file than the lock pins"),
+        ("strange", "could not install the packages; all output is in "),
+    ],
+)
+def test_a_failed_installation_says_why_in_one_line(
+    workspace: Workspace,
+    commands: Commands,
+    capsys: pytest.CaptureFixture[str],
+    output: str,
+    line: str,
+) -> None:
+    commands.fail["pip"] = workspace.CommandFailedError()
+    commands.output = f"$ pip install\n{output}\n"
+    assert workspace.main() == 2
+    assert line in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_too_little_space_is_said_before_anything_is_done(
+    workspace: Workspace,
+    commands: Commands,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    free = shutil.disk_usage("/")._replace(free=700_000_000)
+    monkeypatch.setattr(workspace.shutil, "disk_usage", lambda _path: free)
+    assert workspace.main() == 2
+    assert "has 0.7 GB free, needs 1.5 GB" in capsys.readouterr().err.splitlines()[-1]
+    assert commands.names == []
+
+
+@pytest.mark.parametrize(
+    ("error", "line"),
+    [
+        (OSError(28, "No space left on device", "/a/file"), "setup: disk full: /a/file"),
+        (
+            OSError(30, "Read-only file system", "/a"),
+            "setup: cannot write /a: Read-only file system",
+        ),
+    ],
+)
+def test_a_disk_that_takes_no_more(
+    workspace: Workspace,
+    commands: Commands,
+    capsys: pytest.CaptureFixture[str],
+    error: OSError,
+    line: str,
+) -> None:
+    commands.fail["venv"] = error
+    assert workspace.main() == 2
+    assert capsys.readouterr().err.splitlines()[-1] == line
+
+
+@pytest.mark.parametrize(
+    ("library", "found"), [(("glibc", "2.17"), "glibc 2.17"), (("", ""), "another C library")]
+)
+def test_an_old_c_library(
+    workspace: Workspace,
+    commands: Commands,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    library: tuple[str, str],
+    found: str,
+) -> None:
+    monkeypatch.setattr(workspace.platform, "libc_ver", lambda: library)
+    assert workspace.main() == 2
+    assert found in capsys.readouterr().err
+    assert commands.names == []
+
+
+def test_of_two_set_ups_at_a_time_the_second_waits_and_finds_all_done(
+    workspace: Workspace, commands: Commands, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    waiting, said = threading.Event(), workspace.say
+
+    def say(text: str) -> None:
+        said(text)
+        if "waiting" in text:
+            waiting.set()
+
+    monkeypatch.setattr(workspace, "say", say)
+    first = os.open(workspace.ROOT, os.O_RDONLY)
+    fcntl.flock(first, fcntl.LOCK_EX)
+    codes: list[int] = []
+    second = threading.Thread(target=lambda: codes.append(workspace.main()))
+    second.start()
+    assert waiting.wait(timeout=30)
+    assert commands.names == []
+    workspace.install("wheels", first)
+    workspace.build("wheels", first)
+    commands.names.clear()
+    os.close(first)
+    second.join(timeout=30)
+    assert codes == [0]
+    assert commands.names == []
+
+
+def test_an_interrupted_command_is_ended_with_all_that_it_started(workspace: Workspace) -> None:
+    workspace.LOG.parent.mkdir()
+    started: list[int] = []
+
+    def interrupt(line: str) -> None:
+        started.append(int(line))
+        raise KeyboardInterrupt
+
+    script = "sleep 600 & echo $!; wait"
+    with workspace.exclusive() as lock, pytest.raises(KeyboardInterrupt):
+        workspace.run(["sh", "-c", script], env=dict(os.environ), lock=lock, on_line=interrupt)
+    status = Path(f"/proc/{started[0]}/stat")
+    assert not status.exists() or status.read_text().split()[2] == "Z"
+
+
+def entry_point(name: str, interpreter: str) -> str:
+    return f"#!{interpreter}\nprint('{name}')\n"
+
+
+def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Workspace) -> None:
+    python = workspace.VENV_PYTHON
+    python.parent.mkdir(parents=True)
+    python.symlink_to(sys.executable)
+    folder = workspace.WORKSPACE / "install" / "needle_one" / "lib" / "needle_one"
+    egg = workspace.WORKSPACE / "build" / "needle_one" / "needle_one.egg-info"
+    folder.mkdir(parents=True)
+    egg.mkdir(parents=True)
+    (egg / "entry_points.txt").write_text("[console_scripts]\nkept = needle_one.kept:main\n")
+    for name in ("kept", "gone"):
+        (folder / name).write_text(entry_point(name, f'"{python}"'))
+        (folder / name).chmod(0o755)
+    workspace.tidy_executables("needle_one")
+    workspace.tidy_executables("needle_one")
+    assert [path.name for path in folder.iterdir()] == ["kept"]
+    assert subprocess.check_output([folder / "kept"], text=True) == "kept\n"
