@@ -194,16 +194,15 @@ class PlaneControllerNode(Node):
             self.get_logger().info(log.text)
 
     def _report(self) -> None:
-        diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
-        if diagnostic == self._published:
-            return
-        self._published = diagnostic
-        name = self.get_name()
-        self._status.publish(to_diagnostic_status(f"{name}: steering", name, diagnostic))
-        self._diagnostics.set("steering", diagnostic)
         joints = {"joint_states_refused": str(self._bad_joints)}
         self._diagnostics.set("joint_states", _health(self._joints_complaint, joints))
         self._diagnostics.set("target_plane", _health(self._plane_complaint, {}))
+        diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
+        self._diagnostics.set("steering", diagnostic)
+        if diagnostic != self._published:
+            self._published = diagnostic
+            name = self.get_name()
+            self._status.publish(to_diagnostic_status(f"{name}: steering", name, diagnostic))
 
 
 def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
