@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
+import math
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,12 +14,12 @@ from typing import Any
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PointStamped, PoseStamped
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState, Joy
+from sensor_msgs.msg import CameraInfo, Image, JointState, Joy
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -24,6 +27,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from needle_common.base_node import STEADY_CLOCK
 from needle_common.conversions import (
     HOLD,
+    IMAGES,
     JOINT_STATES,
     LATCHED,
     RELIABLE,
@@ -34,7 +38,7 @@ from needle_common.conversions import (
 from needle_common.errors import UserError
 from needle_sim.sim_rig_node import SimRigNode
 
-DOMAIN = 61
+DOMAINS = range(61, 70)
 LIMIT = 20.0
 
 
@@ -45,6 +49,7 @@ class Partner(Node):
         super().__init__("partner", context=context)
         self.tips: list[PointStamped] = []
         self.joints: list[JointState] = []
+        self.infos: list[CameraInfo] = []
         self.truths: list[PoseStamped] = []
         self.results: list[Header] = []
         self.status: dict[str, str] = {}
@@ -72,6 +77,31 @@ class Partner(Node):
             for name in names
         }
         self.create_timer(0.05, self.send_hold, clock=STEADY_CLOCK)
+
+    def track(self) -> None:
+        """Play the tracker too: answer every pair of images."""
+        self.pairs: list[dict[str, Image]] = []
+        self.found = True
+        answers = self.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
+        waiting: dict[str, Image] = {}
+
+        def take(side: str, image: Image) -> None:
+            waiting[side] = image
+            if len(waiting) < 2:
+                return
+            self.pairs.append(dict(waiting))
+            waiting.clear()
+            answer = PoseWithCovarianceStamped(header=image.header)
+            answer.pose.covariance[0] = 1e-8 if self.found else math.inf
+            answers.publish(answer)
+
+        for side in ("left", "right"):
+            self.create_subscription(
+                Image, f"stereo/{side}/image_raw", functools.partial(take, side), IMAGES
+            )
+            self.create_subscription(
+                CameraInfo, f"stereo/{side}/camera_info", self.infos.append, IMAGES
+            )
 
     def call(self, name: str, data: bool | None = None) -> Any:
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
@@ -118,11 +148,14 @@ class Rig:
 
     def __init__(self, context: Context, **parameters: Any) -> None:
         overrides = {"level": "tip", **parameters}
+        self.level = overrides["level"]
         self.sim = SimRigNode(
             context=context,
             parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
         )
         self.partner = Partner(context)
+        if overrides["level"] == "camera":
+            self.partner.track()
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.sim)
         self._executor.add_node(self.partner)
@@ -160,13 +193,15 @@ class Rig:
         partner.pressed = True
         self.until(lambda: partner.status["hold_owner"] == "partner", "hold")
         partner.say("STEERING", "tip", 0)
-        self.until(lambda: len(partner.tips) > 0, "first tip")
+        if self.level == "tip":
+            self.until(lambda: len(partner.tips) > 0, "first tip")
 
     def step(self, length: float = 0.001) -> Header:
         partner = self.partner
         done = len(partner.results)
         # Topics have no order among each other: wait for the joints at the tip's exposure.
-        stamp = partner.tips[-1].header.stamp
+        tips = partner.tips if self.level == "tip" else partner.truths
+        stamp = tips[-1].header.stamp
         self.until(
             lambda: bool(partner.joints) and partner.joints[-1].header.stamp == stamp,
             "joints at the tip's stamp",
@@ -188,17 +223,32 @@ class Rig:
 
 
 @contextmanager
+def own_context() -> Iterator[Context]:
+    """Give a context in a domain that nobody else has who takes the same lock."""
+    for domain in DOMAINS:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
+            try:
+                lock.bind(f"\0needle_ros_domain_{domain}")
+            except OSError:
+                continue
+            context = Context()
+            rclpy.init(context=context, domain_id=domain)
+            try:
+                yield context
+            finally:
+                context.try_shutdown()
+            return
+    raise AssertionError(f"no free domain in {DOMAINS}")
+
+
+@contextmanager
 def running(**parameters: Any) -> Iterator[Rig]:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    try:
+    with own_context() as context:
         rig = Rig(context, **parameters)
         try:
             yield rig
         finally:
             rig.close()
-    finally:
-        context.try_shutdown()
 
 
 def five_steps(seed: int) -> tuple[list[Any], list[Any], list[Any]]:
@@ -211,7 +261,9 @@ def five_steps(seed: int) -> tuple[list[Any], list[Any], list[Any]]:
         rig.until(lambda: len(partner.truths) == 6, "truth")
         stamp = partner.tips[-1].header.stamp
         rig.until(lambda: partner.joints[-1].header.stamp == stamp, "joints")
-        return partner.tips, partner.joints, partner.truths
+        # Until the first exposure the joints at the start of time are repeated for late joiners.
+        joints = [a for a, b in itertools.pairwise(partner.joints) if a != b]
+        return partner.tips, [*joints, partner.joints[-1]], partner.truths
 
 
 def test_five_steps_repeat_bit_for_bit_with_one_seed_and_differ_with_another() -> None:
@@ -233,45 +285,38 @@ def test_five_steps_repeat_bit_for_bit_with_one_seed_and_differ_with_another() -
 
 
 def test_services_refuse_while_partners_are_missing_and_say_which() -> None:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    sim = SimRigNode(
-        context=context,
-        parameter_overrides=[
-            Parameter("level", value="tip"),
-            Parameter("wait_for_recorder", value=True),
-        ],
-    )
-    asker = Node("asker", context=context)
-    try:
+    with own_context() as context:
+        sim = SimRigNode(context=context, parameter_overrides=[Parameter("level", value="tip")])
+        asker = Node("asker", context=context)
         executor = SingleThreadedExecutor(context=context)
         executor.add_node(sim)
         executor.add_node(asker)
         client = asker.create_client(SetBool, "device/enable")
         deadline = time.monotonic() + LIMIT
-        while not client.service_is_ready():
-            assert time.monotonic() < deadline
-            executor.spin_once(timeout_sec=sim.turns())
+
+        def until(condition: Callable[[], bool]) -> None:
+            while not condition():
+                assert time.monotonic() < deadline
+                executor.spin_once(timeout_sec=sim.turns())
 
         def enable(on: bool) -> Any:
             future = client.call_async(SetBool.Request(data=on))
-            while not future.done():
-                assert time.monotonic() < deadline
-                executor.spin_once(timeout_sec=sim.turns())
+            until(future.done)
             return future.result()
 
-        answer = enable(True)
-        assert not answer.success
-        assert answer.message.startswith("waiting for ")
-        assert "publisher of /device/hold" in answer.message
-        assert "subscriber of /needle/tip" in answer.message
-        # Whoever wants less motion is never kept waiting.
-        assert enable(False).success
-        executor.shutdown()
-    finally:
-        asker.destroy_node()
-        sim.destroy_node()
-        context.try_shutdown()
+        try:
+            until(client.service_is_ready)
+            answer = enable(True)
+            assert not answer.success
+            assert answer.message.startswith("waiting for ")
+            assert "publisher of /device/hold" in answer.message
+            assert "subscriber of /needle/tip" in answer.message
+            # Whoever wants less motion is never kept waiting.
+            assert enable(False).success
+        finally:
+            executor.shutdown()
+            asker.destroy_node()
+            sim.destroy_node()
 
 
 def test_time_starts_only_with_the_recorder_where_one_is_wanted() -> None:
@@ -380,6 +425,40 @@ def test_real_time_exposes_by_rate_and_a_lapse_aborts() -> None:
         rig.until(lambda: int(partner.status["watchdog_trips"]) >= 1, "count")
 
 
+def test_camera_exposes_pairs_again_when_lost_and_ends_where_the_tip_leaves_the_phantom() -> None:
+    # Almost straight up: out of the surface, 17.5 mm above, within ten steps.
+    with running(level="camera", initial_pitch=1.4, curvature=0.0) as rig:
+        rig.prepare()
+        partner = rig.partner
+        rig.until(lambda: len(partner.pairs) == 1, "first pair")
+        left, right = partner.pairs[0]["left"], partner.pairs[0]["right"]
+        assert left.header.stamp == right.header.stamp
+        assert left.header.frame_id == "left_camera_optical"
+        assert right.header.frame_id == "right_camera_optical"
+        assert (left.encoding, left.step, len(left.data)) == ("mono8", 1024, 1024 * 768)
+        assert bytes(left.data) != bytes(right.data)
+        rig.until(lambda: len(partner.infos) == 2, "camera infos")
+        assert all(info.header.stamp == left.header.stamp for info in partner.infos)
+
+        partner.found = False
+        partner.rotation_per_step = 0.0
+        assert rig.step(0.002).frame_id == "succeeded"
+        rig.until(lambda: len(partner.pairs) == 4, "exposures again while the tip is lost")
+        partner.found = True
+
+        outcome = "succeeded"
+        for _ in range(12):
+            pairs = len(partner.pairs)
+            outcome = rig.step(0.002).frame_id
+            if outcome != "succeeded":
+                break
+            rig.until(lambda n=pairs: len(partner.pairs) > n, "pair after the step")  # type: ignore[misc]
+        assert outcome.startswith("aborted: the tip left the phantom: x = 17.5")
+        rig.until(lambda: partner.status["state"] == "FAULT", "fault")
+        assert partner.status["fault"] in outcome
+        assert "the run has ended" in rig.call("reset").message
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
@@ -392,10 +471,5 @@ def test_real_time_exposes_by_rate_and_a_lapse_aborts() -> None:
     ],
 )
 def test_bad_parameters_are_refused_in_one_line(parameters: dict[str, Any], message: str) -> None:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    try:
-        with pytest.raises(UserError, match=message):
-            Rig(context, **parameters)
-    finally:
-        context.try_shutdown()
+    with own_context() as context, pytest.raises(UserError, match=message):
+        Rig(context, **parameters)
