@@ -24,5 +24,6 @@ setup(
     license="Apache-2.0",
     entry_points={"console_scripts": [
             "sim_rig = needle_sim.sim_rig_node:main",
+            "monte_carlo = needle_sim.monte_carlo:main",
         ]},
 )

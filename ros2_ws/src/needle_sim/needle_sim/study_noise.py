@@ -1,0 +1,38 @@
+"""Random numbers of a study, keyed by what they are for: no chunking or order changes them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from needle_sim.se3 import FloatArray
+
+START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE = range(6)
+"""What random numbers are for."""
+PER_NEEDLE = 4
+"""Numbers for each needle and draw: one block of the generator."""
+
+
+def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> FloatArray:
+    """Return four numbers, uniform in [0, 1), for each of some needles.
+
+    Philox counts through its sequence by a number that can be set: needle, step and purpose are
+    that number, and each needle has one block of four.
+
+    Parameters
+    ----------
+    seed : int
+        Of the study, >= 0.
+    purpose : int
+        One of `START` ... `CURVATURE`.
+    step : int
+        Number of the exposure, or of whatever the purpose counts.
+    first, count : int
+        The needles `first` ... `first + count - 1`.
+
+    Returns
+    -------
+    ndarray, shape (count, 4)
+        A row for each needle.
+    """
+    bits = np.random.Philox(key=seed, counter=[first, step, purpose, 0])
+    return np.random.Generator(bits).random((count, PER_NEEDLE))
