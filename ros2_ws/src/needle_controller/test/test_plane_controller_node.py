@@ -278,7 +278,7 @@ def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
 
 def test_parameters_change_as_valid_wholes_only(bench: Bench) -> None:
     def set_all(**values: Any) -> list[Any]:
-        return bench.node.set_parameters([Parameter(n, value=v) for n, v in values.items()])
+        return list(bench.node.set_parameters([Parameter(n, value=v) for n, v in values.items()]))
 
     node = bench.node
     before = node._settings.values
