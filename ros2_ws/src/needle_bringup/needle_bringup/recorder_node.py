@@ -49,11 +49,13 @@ Exit codes: 0 the bag is whole; 1 the disk refused data; 2 bad parameters.
 """
 
 GRAPH_PERIOD = 0.1
-DEPTH = 1000
+# All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
+DEPTH = 5000
 IMAGE_DEPTH = 20
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
+LAST_WORDS_LIMIT = 1.0
 WARN_WAITING = 20_000
 
 
@@ -360,9 +362,13 @@ def main(args: list[str] | None = None) -> int:
             while not stop.wanted and recorder.recording.error is None:
                 executor.spin_once(timeout_sec=0.1)
             recorder.report()
+            limit = time.monotonic() + LAST_WORDS_LIMIT
             end = time.monotonic() + LAST_WORDS
-            while time.monotonic() < end:
+            while time.monotonic() < min(end, limit):
+                before = recorder.recording.messages_received
                 executor.spin_once(timeout_sec=0.05)
+                if recorder.recording.messages_received > before:
+                    end = time.monotonic() + LAST_WORDS
             return recorder.finish()
         finally:
             recorder.recording.close()

@@ -13,6 +13,7 @@ import pytest
 import rclpy
 import yaml
 from rclpy.context import Context
+from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -115,13 +116,14 @@ def test_nothing_is_lost(domain: int, source: Source, tmp_path: Path) -> None:
     hold = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     state = source.publisher(String, "state", latched)
     state.publish(String(data="before the recorder came"))
-    numbered, joy = source.publisher(Int32, "numbered"), source.publisher(Joy, "hold", hold)
+    numbered, joy = source.publisher(Int32, "numbered", 2000), source.publisher(Joy, "hold", hold)
     process = start(
         domain, f"bag:={bag}", f"calibration_file:={calibration}", "run_info:='seed: 4'"
     )
     source.wait_matched(state, numbered, joy)
     for number in range(2000):
         numbered.publish(Int32(data=number))
+    assert numbered.wait_for_all_acked(Duration(seconds=PATIENCE))
     joy.publish(Joy(buttons=[1]))
     late = source.publisher(Int32, "rig/late")
     source.wait_matched(late)
