@@ -9,8 +9,9 @@ import numpy as np
 
 from needle_controller.arrays import Array
 from needle_controller.estimator import Estimate
-from needle_controller.feedback_linearization import reduced_from_linearized, virtual_input
-from needle_controller.saturation import saturate
+from needle_controller.feedback_linearization import virtual_input
+from needle_controller.kinematics import PITCH, ROLL
+from needle_controller.luenberger_steps import demand_states
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,17 +67,18 @@ class LinearizingLaw:
     def __call__(self, estimate: Estimate) -> Command:
         """Return the rotation rate to hold over the next step."""
         s, length, curvature = estimate.linearized, self.step_length, estimate.curvature
-        v = -(s @ self.feedback)
-        s2 = s[..., 1] + length * s[..., 2] + 0.5 * length**2 * v
-        s3 = s[..., 2] + length * v
-        wanted, _ = saturate(np.stack([s[..., 0], s2, s3], axis=-1), curvature, self.demand_margin)
-        wanted_roll = reduced_from_linearized(wanted, curvature)[..., 2]
-        pitch, roll = estimate.reduced[..., 1], estimate.reduced[..., 2]
+        v = np.asarray(-(s @ self.feedback))
+        sine, cosine = np.empty(v.size), np.empty(v.size)
+        curvatures = np.broadcast_to(curvature, v.shape).flatten()
+        held = length, self.demand_margin
+        demand_states(s.reshape(-1, 3), v.reshape(-1), curvatures, held, (sine, cosine))
+        wanted_roll = np.arctan2(sine, cosine).reshape(v.shape)
+        pitch, roll = estimate.coordinates[..., PITCH], estimate.coordinates[..., ROLL]
         # The roll's own drift, (5).
         drift = -curvature * np.cos(roll) * np.tan(pitch)
         limit = self.max_rotation_per_length
         rate = np.clip((wanted_roll - roll) / length - drift, -limit, limit)
-        return Command(np.asarray(v), np.asarray(rate))
+        return Command(v, np.asarray(rate))
 
 
 class OpenLoopLaw:

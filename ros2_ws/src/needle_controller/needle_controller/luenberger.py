@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -17,6 +18,7 @@ from needle_controller.feedback_linearization import (
 )
 from needle_controller.gains import sampled_observer_gain
 from needle_controller.kinematics import YAW, angles_from_rotation, rotation_from_angles
+from needle_controller.luenberger_steps import advance_states, correct_states
 from needle_controller.saturation import saturate
 
 
@@ -122,32 +124,15 @@ class LuenbergerObserver:
         length, turn = np.asarray(d_insertion, dtype=float), np.asarray(d_rotation, dtype=float)
         if not (np.all(np.isfinite(length)) and np.all(length >= 0.0)):
             raise ValueError(f"d_insertion = {length} m, wants finite and >= 0")
-        curvature = self._settings.curvature
-        before = reduced_from_linearized(self._s, curvature)
-        pitch, roll = before[..., 1], before[..., 2]
-        # The v that takes the roll where (5) with u takes it over this length, held over it: (7)
-        # for short steps, and finite also where the needle only turned. Past +-90 deg s cannot
-        # follow.
-        turned = roll + turn - curvature * np.cos(roll) * np.tan(pitch) * length
-        turned = np.clip(turned, -0.5 * np.pi, 0.5 * np.pi)
-        pitched = pitch + curvature * np.sin(roll) * length
-        vl = curvature * np.cos(pitched) * np.sin(turned) - self._s[..., 2]
-        s = self._s
-        l2 = 0.5 * length**2
-        self._take(
-            np.stack(
-                np.broadcast_arrays(
-                    s[..., 0] + length * s[..., 1] + l2 * s[..., 2] + vl * (length**2 / 6.0),
-                    s[..., 1] + length * s[..., 2] + vl * (0.5 * length),
-                    s[..., 2] + vl,
-                ),
-                axis=-1,
-            )
-        )
-        after = reduced_from_linearized(self._s, curvature)
-        # (4), trapezoidal.
-        slope = np.cos(roll) / np.cos(pitch) + np.cos(after[..., 2]) / np.cos(after[..., 1])
-        self._yaw = self._yaw + 0.5 * length * curvature * slope
+        settings = self._settings
+        shape = np.broadcast_shapes(self._s.shape[:-1], length.shape, turn.shape)
+        states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
+        yaw = np.broadcast_to(self._yaw, shape).flatten()
+        motion = np.broadcast_to(length, shape).flatten(), np.broadcast_to(turn, shape).flatten()
+        region = settings.curvature, settings.saturation_margin
+        advance_states(states, yaw, saturated, motion, region)
+        self._s, self._yaw = states.reshape(*shape, 3), yaw.reshape(shape)
+        self._saturated = saturated.reshape(shape)
         self._since_correction = self._since_correction + length
         self._inserted = self._inserted + length
         f = transition(length)
@@ -164,26 +149,33 @@ class LuenbergerObserver:
         tip `age` ago is taken as x - age s2 + age^2 / 2 s3.
         """
         tip, age = np.asarray(tip, dtype=float), np.asarray(age, dtype=float)
-        found = np.all(np.isfinite(tip), axis=-1)
-        expected = self._s[..., 0] - age * self._s[..., 1] + 0.5 * age**2 * self._s[..., 2]
-        innovation = np.where(found, tip[..., 0] - expected, 0.0)
-        gain = sampled_observer_gain(self._settings.observer_poles, self._since_correction)
-        self._take(self._s + gain * innovation[..., None])
-        self._tip = np.where(found[..., None], tip, self._tip)
+        settings = self._settings
+        found = np.isfinite(tip[..., 0]) & np.isfinite(tip[..., 1]) & np.isfinite(tip[..., 2])
+        all_found = bool(np.all(found))
+        gain = sampled_observer_gain(settings.observer_poles, self._since_correction)
+        shape = np.broadcast_shapes(self._s.shape[:-1], found.shape, age.shape, gain.shape[:-1])
+        states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
+        x = np.where(found, tip[..., 0], np.nan)
+        measured = np.broadcast_to(x, shape).flatten(), np.broadcast_to(age, shape).flatten()
+        gains = gain.reshape(1, 3) if gain.ndim == 1 else _rows(gain, shape)
+        region = settings.curvature, settings.saturation_margin
+        correct_states(states, saturated, measured, gains, region)
+        self._s, self._saturated = states.reshape(*shape, 3), saturated.reshape(shape)
+        self._tip = tip.copy() if all_found else np.where(found[..., None], tip, self._tip)
         noise = np.asarray(self._settings.measurement_std**2)
         if covariance is not None:
             self._tip_covariance = np.asarray(covariance, dtype=float)
             noise = self._tip_covariance[..., 0, 0]
         # Only what was found narrows the covariance; one shape for all needles while all were.
-        used = gain if np.all(found) else gain * found[..., None]
+        used = gain if all_found else gain * found[..., None]
         keep = np.eye(3) - used[..., :, None] * np.array([1.0, 0.0, 0.0])
         self._covariance = (
             keep @ self._covariance @ np.swapaxes(keep, -1, -2)
             + used[..., :, None] * used[..., None, :] * noise[..., None, None]
         )
-        self._since_correction = np.where(found, 0.0, self._since_correction)
-        if np.all(found):
-            self._since_correction = np.zeros(())
+        self._since_correction = (
+            np.zeros(()) if all_found else np.where(found, 0.0, self._since_correction)
+        )
 
     def estimate(self) -> Estimate:
         """Return what is known now; see `Estimator.estimate`."""
@@ -245,3 +237,8 @@ class LuenbergerObserver:
             self._settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
         )
         return covariance
+
+
+def _rows(vectors: Array, shape: tuple[int, ...]) -> Array:
+    """Return a copy of vectors, one row for each of `shape`, (N, 3)."""
+    return np.array(np.broadcast_to(vectors, (*shape, 3)).reshape(-1, 3))

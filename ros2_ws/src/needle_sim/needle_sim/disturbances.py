@@ -10,6 +10,7 @@ import dataclasses
 
 import numpy as np
 
+from needle_common.compiled import compiled
 from needle_sim import study_noise
 from needle_sim.se3 import FloatArray
 
@@ -76,11 +77,9 @@ def measured(
         The measured tips [m]; NaN where missing.
     """
     count = len(tips)
-    share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)[:, :3]
-    share -= 0.5
-    share *= 2.0 * disturbances.noise
-    share += tips
-    seen = share
+    share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
+    seen = np.empty((count, 3))
+    _add_noise(tips, share, disturbances.noise, seen)
     if exposure == 0:
         return seen
     if disturbances.outliers > 0.0:
@@ -138,6 +137,13 @@ class DelayLine:
             return np.full_like(tips, np.nan), 0.0
         late, then = self._under_way.popleft()
         return late, insertion - then
+
+
+@compiled
+def _add_noise(tips: FloatArray, share: FloatArray, amplitude: float, seen: FloatArray) -> None:
+    for i in range(tips.shape[0]):
+        for j in range(3):
+            seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
 
 
 def _outliers(seed: int, exposure: int, first: int, count: int) -> FloatArray:

@@ -144,9 +144,7 @@ def _parser() -> argparse.ArgumentParser:
         help="all 1000 N runs from this one start instead of a grid",
     )
     add("--json", metavar="FILE", help="write the figures as one flat JSON object")
-    add(
-        "--csv", metavar="FILE", help="one line for each run: its start and what became of it"
-    )
+    add("--csv", metavar="FILE", help="one line for each run: its start and what became of it")
     return parser
 
 
