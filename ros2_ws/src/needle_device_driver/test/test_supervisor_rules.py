@@ -441,6 +441,7 @@ def test_retraction_moves_insertion_only_slowly_and_with_the_hold(bench: Bench) 
     assert not bench.supervisor.retract(bench.now).success
     bench.hold()
     rotation = bench.rotation.position
+    bench.rotation.orders.clear()
     assert bench.supervisor.retract(bench.now).success
     start = bench.now, bench.insertion.position
     bench.cycle(10, holding=True)
@@ -454,6 +455,7 @@ def test_retraction_moves_insertion_only_slowly_and_with_the_hold(bench: Bench) 
     assert bench.supervisor.retract(bench.now).success
     bench.cycle(100, holding=True)
     assert bench.positions == (0.0, rotation)
+    assert "move" not in bench.rotation.orders
     assert in_state(bench, State.HOLDING)
     assert [r.outcome for r in bench.results] == ["succeeded"] * 3
 
