@@ -218,9 +218,18 @@ def shared_memory_of(domain: int) -> list[str]:
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
-    """Return the messages of some topics, as they were sent, byte for byte."""
+    """Return the messages of some topics, as they were sent, byte for byte.
+
+    Raises
+    ------
+    UserError
+        If there is no bag.
+    """
     found: dict[str, list[bytes]] = {topic: [] for topic in topics}
-    with next(bag.glob("*.mcap")).open("rb") as stream:
+    files = list(bag.glob("*.mcap"))
+    if not files:
+        raise UserError(f"{bag}: there is no bag")
+    with files[0].open("rb") as stream:
         reader = make_reader(stream)
         for _, channel, message in reader.iter_messages(topics=list(topics)):
             found[channel.topic].append(message.data)

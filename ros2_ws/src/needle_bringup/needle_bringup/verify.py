@@ -66,7 +66,7 @@ def _verify(arguments: Sequence[str]) -> int:
     with _folder(given.keep) as folder:
         bench = Workbench([str(_checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
-            for finding in check(bench):
+            for finding in _findings(check, bench):
                 findings.append((step, finding))
                 _show(step, finding)
     failed = sum(not finding.passed for _, finding in findings)
@@ -74,6 +74,15 @@ def _verify(arguments: Sequence[str]) -> int:
     if given.json:
         write_json(Path(given.json), _flat(findings, time.monotonic() - begin))
     return EXIT_MISSED if failed else EXIT_DONE
+
+
+def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:
+    """Run a check; one that cannot be made has missed."""
+    try:
+        yield from check(bench)
+    except UserError as error:
+        what = (check.__doc__ or "").splitlines()[0]
+        yield Finding(check.__name__, what, "can be checked", str(error), False)
 
 
 def _chosen(steps: Sequence[str], only: Sequence[str] | None) -> list[tuple[str, Check]]:

@@ -45,7 +45,7 @@ def camera(bench: Workbench) -> Iterator[Finding]:
         "camera_r1_final",
         "level camera: |r1| at 120 mm against the truth",
         "<= 1 mm",
-        f"{r1} mm",
+        f"{r1} mm" if r1 is not None else f"no result: {run.last_line}",
         isinstance(r1, float) and abs(r1) <= 1.0,
     )
     wall = run.wall
@@ -71,7 +71,7 @@ def open_loop(bench: Workbench) -> Iterator[Finding]:
         "open_loop_r1_final",
         "open loop: r1 at 120 mm",
         "14.6 +- 0.1 mm",
-        f"{r1} mm",
+        f"{r1} mm" if r1 is not None else f"no result: {run.last_line}",
         isinstance(r1, float) and abs(r1 - 14.6) <= 0.1,
     )
     yield _exit(run, "open_loop", "open loop", 1)
