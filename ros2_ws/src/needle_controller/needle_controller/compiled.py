@@ -17,8 +17,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled(function: Function) -> Function:
     """Compile a function for arrays and floats; a decorator.
 
-    What was compiled is kept in the user's cache, in a folder named after all of this package's
-    sources: numba itself looks at the file of the compiled function only, and would go on using old
+    What was compiled is kept in the user's cache, in a folder named after all files with compiled
+    functions: numba itself looks at the file of the called function only, and would go on using old
     code of what that function calls in another file.
     """
     before = numba.config.CACHE_DIR
@@ -34,7 +34,9 @@ def _cache_directory() -> str:
     """Return a writable folder for this state of the sources, or "" where there is none."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(path.read_bytes())
+        source = path.read_bytes()
+        if b"\n@compiled\n" in source or path == Path(__file__):
+            digest.update(source)
     places = [os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")]
     if home := os.environ.get("HOME", ""):
         places.append(f"{home}/.cache")

@@ -6,6 +6,8 @@ exp(error) R), then the curvature and the size of the torsion. In these axes the
 from the identity in a 3 x 3 block and three columns only, which `propagate` makes use of.
 """
 
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math

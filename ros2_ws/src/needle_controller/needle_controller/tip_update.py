@@ -8,6 +8,8 @@ learns nothing, one at its edge much: with uniform noise that halves the error o
 with the noise's variance.
 """
 
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -163,9 +165,8 @@ def gaussian_update(
         change[i] = gain[i, 0] * n0 + gain[i, 1] * n1 + gain[i, 2] * n2
     for i in range(ERROR - 1, -1, -1):
         for j in range(i, -1, -1):
-            # Rows 0..2 are read as the prior's: they are changed last.
-            value = p[i, j] - (gain[i, 0] * p[0, j] + gain[i, 1] * p[1, j] + gain[i, 2] * p[2, j])
-            p[i, j] = value
+            # In this order, what is read of row j is still the prior's.
+            p[i, j] -= gain[i, 0] * p[j, 0] + gain[i, 1] * p[j, 1] + gain[i, 2] * p[j, 2]
     for i in range(ERROR):
         for j in range(i):
             p[j, i] = p[i, j]
@@ -174,7 +175,7 @@ def gaussian_update(
         + 2.0 * (n0 * n1 * i01 + n0 * n2 * i02 + n1 * n2 * i12)
     ) / determinant  # fmt: skip
     _apply(position, rotation, change)
-    return -0.5 * (quadratic + math.log(determinant))
+    return float(-0.5 * (quadratic + math.log(determinant)))
 
 
 @compiled

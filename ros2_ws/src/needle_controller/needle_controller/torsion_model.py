@@ -2,9 +2,12 @@
 
 [KC09] neglects torsion and names friction along the shaft as the likely cause of its "sluggish
 response". Play D: the angle behind it stays until the base is D ahead, then follows at that
-distance. Lag L: the tip follows that angle over the inserted length, d(tip)/dl = (behind - tip) / L.
+distance. Lag L: the tip follows that angle over the inserted length, d(tip)/dl = (behind - tip) /
+L.
 """
 
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
