@@ -20,6 +20,8 @@ class Stroke:
     ----------
     row, column : ndarray of int, shape (N,)
         The pixels; one may be named twice, with all but the same values.
+    sample : ndarray of int, shape (N,)
+        Which point of the middle line answers for the pixel.
     across : ndarray, shape (N,)
         Distance from the middle line over the half width; 1 is the edge.
     coverage : ndarray, shape (N,)
@@ -28,12 +30,16 @@ class Stroke:
 
     row: np.ndarray[tuple[int], np.dtype[np.intp]]
     column: np.ndarray[tuple[int], np.dtype[np.intp]]
+    sample: np.ndarray[tuple[int], np.dtype[np.intp]]
     across: FloatArray
     coverage: FloatArray
 
 
 def stroke(
-    line: FloatArray, half_width: FloatArray, blur: float, image_size: tuple[int, int]
+    line: FloatArray,
+    half_width: FloatArray,
+    blur: float | FloatArray,
+    image_size: tuple[int, int],
 ) -> Stroke:
     """Return what a line of given width with square ends covers under a Gaussian blur.
 
@@ -46,7 +52,7 @@ def stroke(
         Middle line u, v, at distances of a few px [px].
     half_width : ndarray, shape (M,)
         Half the width along it [px].
-    blur : float
+    blur : float or ndarray, shape (M,)
         Standard deviation of the blur, the pixel's own area included [px].
     image_size : tuple of int
         Width and height of the image [px].
@@ -60,9 +66,10 @@ def stroke(
     tangent = np.gradient(line, np.concatenate([[0.0], np.cumsum(step)]), axis=0)
     tangent /= np.linalg.norm(tangent, axis=1)[:, np.newaxis]
     # How far along its tangent each sample answers for pixels; the end samples for what is beyond.
-    reach = int(np.ceil(half_width.max() + 3.5 * blur + step.max() / 2.0 + _OVERLAP_PX))
-    ahead = np.append(step / 2.0 + _OVERLAP_PX, 4.0 * blur)
-    behind = np.insert(step / 2.0 + _OVERLAP_PX, 0, 4.0 * blur)
+    blurs = np.broadcast_to(np.asarray(blur, dtype=np.float64), half_width.shape)
+    reach = int(np.ceil(half_width.max() + 3.5 * blurs.max() + step.max() / 2.0 + _OVERLAP_PX))
+    ahead = np.append(step / 2.0 + _OVERLAP_PX, 4.0 * blurs[-1])
+    behind = np.insert(step / 2.0 + _OVERLAP_PX, 0, 4.0 * blurs[0])
 
     nearest = np.rint(line)
     grid = np.arange(-reach, reach + 1)
@@ -83,10 +90,10 @@ def stroke(
     across = (row - line[sample, 1]) * tangent[sample, 0]
     across -= (column - line[sample, 0]) * tangent[sample, 1]
     half = half_width[sample]
-    scale = 1.0 / (np.sqrt(2.0) * blur)
+    scale = 1.0 / (np.sqrt(2.0) * blurs[sample])
     coverage = 0.5 * (erf((across + half) * scale) - erf((across - half) * scale))
     for end, outward in ((line[0], -tangent[0]), (line[-1], tangent[-1])):
         beyond = (column - end[0]) * outward[0] + (row - end[1]) * outward[1]
         near = np.hypot(column - end[0], row - end[1]) < 2.0 * reach
-        coverage[near] *= 0.5 * (1.0 - erf(beyond[near] * scale))
-    return Stroke(row, column, across / half, coverage)
+        coverage[near] *= 0.5 * (1.0 - erf(beyond[near] * scale[near]))
+    return Stroke(row, column, sample, across / half, coverage)
