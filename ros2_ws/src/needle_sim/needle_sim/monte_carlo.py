@@ -47,9 +47,8 @@ def monte_carlo(options: MonteCarloOptions) -> int:
     settings = StudySettings(
         CURVATURE, options.depth, STEP_LENGTH, options.disturbances, options.seed
     )
-    new_controller = controller_factory(
-        options.controller, options.disturbances.noise, options.flips
-    )
+    flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
+    new_controller = controller_factory(options.controller, options.disturbances.noise, flips)
     # What is compiled is compiled now, not in the time that is reported.
     run_study(np.zeros((2, 3)), new_controller, settings)
     begin = time.perf_counter()

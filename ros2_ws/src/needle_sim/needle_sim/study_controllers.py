@@ -5,49 +5,66 @@ This is the only module of needle_sim that knows the controller under test.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from needle_common.errors import UserError
-from needle_controller.estimator import Estimator
-from needle_controller.law import Law
+from needle_controller.best import BestSettings, make_best
+from needle_controller.estimator import Estimate, Estimator
+from needle_controller.law import Command
 from needle_controller.luenberger import LuenbergerObserver
 from needle_controller.plane_control import ControlSettings, make_law, observer_settings
 from needle_sim.se3 import FloatArray
 
-CONTROLLERS = ("paper", "open_loop")
-LATER_CONTROLLERS = ("best",)
+CONTROLLERS = ("paper", "best", "open_loop")
 CURVATURE = ControlSettings.curvature
 STEP_LENGTH = ControlSettings.step_length
-# A sensor without noise still has this standard deviation for the gains' design [m].
-_SMALLEST_STD = 1e-5
+# A sensor without noise still has this bound for the controllers' design [m].
+_SMALLEST_NOISE = 1e-5
+_DEPTH_TOLERANCE = 1e-9
 
 
 class SteeredNeedles:
-    """An estimator and a law, called as the node calls them: what `study.Controller` describes."""
+    """An estimator and a law, called as the node calls them: what `study.Controller` describes.
 
-    def __init__(self, estimator: Estimator, law: Law) -> None:
+    Parameters
+    ----------
+    estimator : Estimator
+        For as many needles as there will be tips.
+    law : callable
+        Returns the command for an estimate at an inserted length [m].
+    """
+
+    def __init__(self, estimator: Estimator, law: Callable[[Estimate, float], Command]) -> None:
         self._estimator = estimator
         self._law = law
+        self._insertion = 0.0
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
         self._estimator.reset(tips, np.zeros((len(tips), 2)))
-        return self._law(self._estimator.estimate()).rotation_rate
+        return self._rate()
 
     def step(
         self, d_insertion: float, d_rotation: FloatArray, tips: FloatArray, age: float
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
+        self._insertion += d_insertion
         self._estimator.advance(d_insertion, d_rotation)
         self._estimator.correct(tips, age=age)
-        return self._law(self._estimator.estimate()).rotation_rate
+        return self._rate()
+
+    def _rate(self) -> FloatArray:
+        return self._law(self._estimator.estimate(), self._insertion).rotation_rate
 
 
-def controller_factory(name: str, noise: float, flips: int = 0) -> Callable[[], SteeredNeedles]:
+def controller_factory(
+    name: str, noise: float, flip_depths: Sequence[float] = ()
+) -> Callable[[], SteeredNeedles]:
     """Return what makes the controller of some needles.
 
     Parameters
@@ -56,26 +73,53 @@ def controller_factory(name: str, noise: float, flips: int = 0) -> Callable[[], 
         One of `CONTROLLERS`.
     noise : float
         Largest error of a measured coordinate that the sensor is known to make [m].
-    flips : int
-        How often the bevel is flipped on the way.
+    flip_depths : sequence of float
+        Insertions at which the bevel is flipped, mirrored, in rising order [m].
 
     Raises
     ------
     UserError
         If there is no such controller, or it cannot flip.
     """
-    if name in LATER_CONTROLLERS:
-        raise UserError(f"--controller {name} is not available; there is {', '.join(CONTROLLERS)}")
     if name not in CONTROLLERS:
-        raise UserError(f"--controller {name!r} is not one of {', '.join(CONTROLLERS)}")
-    if flips:
-        raise UserError(f"--flips {flips}: {name} cannot steer with the bevel flipped")
-    std = max(noise / math.sqrt(3.0), _SMALLEST_STD)
+        raise UserError(
+            f"--controller {name!r} is not available; there is {', '.join(CONTROLLERS)}"
+        )
+    noise = max(noise, _SMALLEST_NOISE)
+    if name == "best":
+        return _best_factory(noise, tuple(flip_depths))
+    if flip_depths:
+        raise UserError(
+            f"--flips: {name} cannot steer with the bevel flipped (its coordinates end at roll "
+            "+-90 deg); best can"
+        )
+    std = noise / math.sqrt(3.0)
     settings = dataclasses.replace(ControlSettings(), preset=name, measurement_std=std)
     gains = settings.gains()
+    law = make_law(settings, gains)
 
     def build() -> SteeredNeedles:
         observer = LuenbergerObserver(observer_settings(settings, gains))
-        return SteeredNeedles(observer, make_law(settings, gains))
+        return SteeredNeedles(observer, lambda estimate, _: law(estimate))
+
+    return build
+
+
+def _best_factory(noise: float, flip_depths: tuple[float, ...]) -> Callable[[], SteeredNeedles]:
+    defaults = BestSettings()
+    settings = dataclasses.replace(
+        defaults, filter=dataclasses.replace(defaults.filter, tip_noise_bound=noise)
+    )
+
+    def build() -> SteeredNeedles:
+        estimator, law = make_best(settings)
+
+        def command(estimate: Estimate, insertion: float) -> Command:
+            if not flip_depths:
+                return law(estimate)
+            flipped = bisect.bisect_right(flip_depths, insertion + _DEPTH_TOLERANCE)
+            return law(estimate, bend_sign=-1.0 if flipped % 2 else 1.0)
+
+        return SteeredNeedles(estimator, command)
 
     return build
