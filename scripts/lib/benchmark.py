@@ -1,0 +1,274 @@
+"""`scripts/bench`: every speed and memory figure beside its reference, measured in the same run."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import itertools
+import sys
+import time
+import tracemalloc
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+import reference_loop
+from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_common.errors import UserError
+from needle_controller.gains import sampled_observer_gain
+from needle_controller.joint_history import JointSample
+from needle_controller.plane_control import ControlSettings, PlaneControl
+from needle_controller.target_plane import offset_plane
+from needle_sim import study_noise
+from needle_sim.disturbances import Disturbances
+from needle_sim.start_grids import GRIDS, Bounds
+from needle_sim.study import StudySettings, run_study
+from needle_sim.study_controllers import SteeredNeedles, controller_factory
+
+DESCRIPTION = """\
+Measure what is fast enough and what is not, each figure beside a reference in the same run: the
+machine's own speed falls out of the ratio.
+"""
+EPILOG = """\
+references:
+  plain Python     the same loop, needle by needle, with numbers and `math` (few needles, scaled)
+  python-control   the same loop as interconnected systems of python-control (fewer, scaled)
+
+exit codes: 0 measured, 2 bad input, 130 interrupted.
+"""
+NOISE = 0.001
+STEPS = 120
+NEEDLES = 10_000
+PLAIN_NEEDLES = 40
+CONTROL_NEEDLES = 3
+UPDATES = 2_000
+SETTINGS = ControlSettings()
+STARTS = GRIDS["endpoint"](Bounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 10, 1)
+STUDY = StudySettings(SETTINGS.curvature, 0.120, SETTINGS.step_length, Disturbances(NOISE), seed=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One figure beside its reference; `value` and `reference` in the unit of `unit`."""
+
+    key: str
+    what: str
+    unit: str
+    value: float
+    against: str
+    reference: float
+
+    @property
+    def ratio(self) -> float:
+        """How many times the reference is the value."""
+        return self.reference / self.value
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see --help")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `bench`; returns its exit code."""
+    return run_command(lambda: _bench(sys.argv[1:] if arguments is None else arguments))
+
+
+def _bench(arguments: Sequence[str]) -> int:
+    parser = _Parser(
+        prog="bench",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the figures as one flat JSON object")
+    parser.add_argument("--only", metavar="WORD", help="only rows whose name has this in it")
+    given = parser.parse_args(arguments)
+    if given.json and not Path(given.json).absolute().parent.is_dir():
+        raise UserError(f"--json {given.json}: its folder must exist")
+    benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}
+    if not benches:
+        raise UserError(f"--only {given.only!r} is in none of {', '.join(BENCHES)}")
+    values: dict[str, JsonValue] = {}
+    print(f"{'':34}{'here':>12}  {'reference':>12}  {'ratio':>8}")
+    for row in itertools.chain.from_iterable(bench() for bench in benches.values()):
+        print(
+            f"{row.what:34}{row.value:10.4g} {row.unit:2} {row.reference:10.4g} {row.unit:2} "
+            f"{row.ratio:7.3g}x  {row.against}",
+            flush=True,
+        )
+        values[f"{row.key}_{row.unit}"] = row.value
+        name = row.against.replace(" ", "_").replace("-", "_").replace(",", "").lower()
+        values[f"{row.key}_{name}_{row.unit}"] = row.reference
+        values[f"{row.key}_{name}_ratio"] = row.ratio
+    if given.json:
+        write_json(Path(given.json), values)
+    return EXIT_DONE
+
+
+def design() -> reference_loop.Design:
+    """Return the paper preset's gains for the reference loops."""
+    gains = SETTINGS.gains()
+    observer = sampled_observer_gain(gains.observer_poles, SETTINGS.step_length)
+    return reference_loop.Design(
+        SETTINGS.curvature,
+        SETTINGS.step_length,
+        tuple(gains.feedback.tolist()),
+        tuple(observer.tolist()),
+        SETTINGS.saturation_margin,
+        SETTINGS.demand_margin,
+        SETTINGS.max_rotation_per_length,
+    )
+
+
+def studies() -> Iterator[Row]:
+    """10,000 needles x 120 steps."""
+    plain, with_control = _plain_study(), _control_study()
+    for name, times in (("paper", 5), ("best", 1)):
+        factory = controller_factory(name, NOISE)
+        run_study(STARTS[:2], factory, STUDY)  # compiles
+        seconds = _least_time(partial(run_study, STARTS, factory, STUDY), times)
+        what = f"{name}, {NEEDLES:,} x {STEPS} steps"
+        yield Row(f"study_{name}", what, "s", seconds, "paper in plain Python", plain)
+        yield Row(f"study_{name}", what, "s", seconds, "paper in python-control", with_control)
+
+
+def updates() -> Iterator[Row]:
+    """One update of the node's controller."""
+    d = design()
+    s, errors = (-0.003, 0.0, 0.0), study_noise.uniform(1, 1, 0, 0, UPDATES)[:, 0] * NOISE
+    plain = _least_time(
+        lambda: [
+            reference_loop.law_turn(reference_loop.observer_step(s, d, 0.1, error), d)
+            for error in errors.tolist()
+        ],
+        3,
+    )
+    tips = np.zeros((UPDATES, 3))
+    tips[:, 0] = errors
+    tips[:, 2] = np.arange(UPDATES) * 1e-4
+
+    def steer_paper() -> None:
+        control = PlaneControl(SETTINGS, offset_plane(0.003))
+        for k, tip in enumerate(tips):
+            control.update(tip, JointSample(k, 1e-4 * k, 1e-3 * k))
+
+    def steer_best() -> None:
+        needle = _best()
+        needle.start(tips[:1])
+        turned = np.full(1, 1e-3)
+        for k in range(1, STEPS):
+            needle.step(1e-3, turned, tips[k : k + 1] * [1.0, 1.0, 10.0], 0.0)
+
+    steer_paper()
+    yield Row(
+        "update_paper",
+        "paper, one update of the node's",
+        "us",
+        _least_time(steer_paper, 3) / UPDATES * 1e6,
+        "plain Python",
+        plain / UPDATES * 1e6,
+    )
+    steer_best()
+    yield Row(
+        "update_best",
+        "best, one update",
+        "us",
+        _least_time(steer_best, 3) / STEPS * 1e6,
+        "paper in plain Python",
+        plain / UPDATES * 1e6,
+    )
+
+
+def memory() -> Iterator[Row]:
+    """Peak memory of a study: it must not grow with the steps."""
+    for name in ("paper", "best"):
+        short, long = (_peak_memory(name, depth) for depth in (0.030, 0.120))
+        yield Row(
+            f"memory_{name}",
+            f"{name}, memory of 1,000 x {STEPS}",
+            "MB",
+            long,
+            "1,000 x 30 steps",
+            short,
+        )
+
+
+BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
+    "studies": studies,
+    "updates": updates,
+    "memory": memory,
+}
+
+
+def _noise(needle: int) -> list[float]:
+    """Return the noise on x that the study gives one of its needles."""
+    shares = (study_noise.uniform(1, study_noise.NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
+    return [float(NOISE * (2.0 * share - 1.0)) for share in shares]
+
+
+def _plain_study() -> float:
+    d = design()
+    chosen = range(0, NEEDLES, NEEDLES // PLAIN_NEEDLES)
+    needles = [(STARTS[k].tolist(), _noise(k)) for k in chosen]
+    seconds = _least_time(lambda: [reference_loop.steer(*needle, d) for needle in needles], 2)
+    ends = [reference_loop.steer(*needle, d) for needle in needles]
+    seen = run_study(STARTS, controller_factory("paper", NOISE), STUDY).x_end[list(chosen)]
+    _require_agreement("plain Python", seen.tolist(), ends)
+    return seconds * NEEDLES / len(needles)
+
+
+def _control_study() -> float:
+    d = design()
+    system = reference_loop.control_system(d)
+    needles = [(STARTS[k].tolist(), _noise(k)) for k in range(CONTROL_NEEDLES)]
+    begin = time.process_time()
+    ends = [reference_loop.control_steer(system, *needle) for needle in needles]
+    seconds = time.process_time() - begin
+    _require_agreement(
+        "python-control", ends, [reference_loop.steer(*needle, d) for needle in needles]
+    )
+    return seconds * NEEDLES / len(needles)
+
+
+def _require_agreement(name: str, one: Sequence[float], other: Sequence[float]) -> None:
+    """Refuse to compare loops that do not compute the same."""
+    off = max(abs(a - b) for a, b in zip(one, other, strict=True))
+    if off > 1e-6:
+        raise UserError(f"the loop in {name} ends up to {off:g} m elsewhere: not the same loop")
+
+
+def _peak_memory(name: str, depth: float) -> float:
+    settings = dataclasses.replace(STUDY, depth=depth)
+    factory = controller_factory(name, NOISE)
+    run_study(STARTS[:2], factory, settings)
+    tracemalloc.start()
+    run_study(STARTS[:1000], factory, settings)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak / 1e6
+
+
+def _best() -> SteeredNeedles:
+    return controller_factory("best", NOISE)()
+
+
+def _least_time(work: Callable[[], object], times: int) -> float:
+    """Return the shortest of some times [s] of this process on the processor.
+
+    All that is measured runs in one thread; what else the machine does counts for little.
+    """
+    seconds = []
+    for _ in range(times):
+        begin = time.process_time()
+        work()
+        seconds.append(time.process_time() - begin)
+    return min(seconds)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
