@@ -22,8 +22,11 @@ setup(
     maintainer_email="maintainers@needle-steering.invalid",
     description="Stands in for the rig: needle plant, tissue, stereo renderer, simulated axes.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [
+    entry_points={
+        "console_scripts": [
             "sim_rig = needle_sim.sim_rig_node:main",
             "monte_carlo = needle_sim.monte_carlo:main",
-        ]},
+            "render_images = needle_sim.render_images:main",
+        ]
+    },
 )

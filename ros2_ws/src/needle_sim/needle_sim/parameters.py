@@ -8,6 +8,7 @@ import math
 from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_device_driver.limits import HARD_SPEED_CAP, HARD_STEP_LENGTH_CAP, SafetyLimits
+from needle_sim.scenarios import CLEAN, SCENARIOS
 
 LEVELS = ("tip", "camera", "drive")
 
@@ -100,6 +101,19 @@ class SimRigParameters:
         unit="-",
         read_only=True,
         description="Calibration of the simulated cameras; empty: needle_tracker's own.",
+    )
+    scenario: str = parameter(
+        CLEAN.name,
+        unit="-",
+        choices=tuple(SCENARIOS),
+        read_only=True,
+        description="What troubles the cameras.",
+    )
+    images: str = parameter(
+        "",
+        unit="-",
+        read_only=True,
+        description="New folder for every image, calibration, insertions and truth; empty: none.",
     )
     wait_for_recorder: bool = parameter(
         False,
@@ -194,11 +208,16 @@ class SimRigParameters:
         Raises
         ------
         UserError
-            A parameter out of bounds, or a level that does not exist yet.
+            A parameter out of bounds, a level that does not exist yet, or images wanted of a level
+            that has none.
         """
         check_fields(self)
         if self.level == "drive":
             raise UserError("level drive is not available yet; there are tip and camera")
+        if self.level == "tip" and self.scenario != CLEAN.name:
+            raise UserError(f"scenario = {self.scenario!r}: level tip has no images")
+        if self.level == "tip" and self.images:
+            raise UserError(f"images = {self.images!r}: level tip has no images")
 
     @property
     def limits(self) -> SafetyLimits:

@@ -40,10 +40,12 @@ from needle_device_driver.states import Activity
 from needle_device_driver.supervisor import MotionSupervisor
 from needle_sim.bench import SimulatedBench
 from needle_sim.conversions import to_camera_info, to_image, to_tip, to_tip_pose, to_truth
+from needle_sim.image_folder import ImageFolder, truth_of
 from needle_sim.lock_step import Action, LockStep
 from needle_sim.pace import Pace
 from needle_sim.parameters import SimRigParameters
 from needle_sim.renderer import StereoRenderer
+from needle_sim.scenarios import SCENARIOS
 from needle_sim.stereo_rig import load_stereo_rig
 
 HELP = """\
@@ -133,6 +135,7 @@ class SimRigNode(Node):
             DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
         )
         self._measurements: list[Publisher[Any]] = []
+        self._folder: ImageFolder | None = None
         if self._is_camera:
             self._create_cameras()
         else:
@@ -196,6 +199,8 @@ class SimRigNode(Node):
         """Stop the simulated axes and say so."""
         self._supervisor.close()
         self._device.report()
+        if self._folder is not None:
+            self._folder.close()
 
     def _turn_in_real_time(self, pace: Pace, now: float) -> float:
         if pace.wait(now) > 0.0:
@@ -242,11 +247,18 @@ class SimRigNode(Node):
         self._exposures += 1
         self._truth.publish(to_truth(self._bench.plant.T_rig_tip, stamp))
         if self._is_camera:
-            images = self._renderer.render(
-                self._bench.plant.T_rig_tip,
-                self._bench.plant.centreline(_CENTRELINE_SPACING),
-                number,
-            )
+            pose = self._bench.plant.T_rig_tip
+            line = self._bench.plant.centreline(_CENTRELINE_SPACING)
+            images = self._renderer.render(pose, line, number)
+            if self._folder is not None:
+                there = SCENARIOS[self._settings.scenario].needle and len(line) > 1
+                self._folder.write(
+                    number,
+                    images,
+                    self._bench.insertion.position,
+                    truth_of(pose) if there else None,
+                    self._renderer.share_seen(pose, line, number),
+                )
             for image, frame, camera, (image_raw, camera_info) in zip(
                 images, self._frames, self._cameras, self._views, strict=True
             ):
@@ -352,7 +364,11 @@ class SimRigNode(Node):
         rig = load_stereo_rig(file)
         self._surface_height = rig.surface_height
         self._cameras = (rig.left, rig.right)
-        self._renderer = StereoRenderer(rig, self._settings.seed)
+        self._renderer = StereoRenderer(
+            rig, self._settings.seed, scenario=SCENARIOS[self._settings.scenario]
+        )
+        if self._settings.images:
+            self._folder = ImageFolder(Path(self._settings.images).expanduser(), Path(file))
         self._frames = ("left_camera_optical", "right_camera_optical")
         self._views = [
             (
