@@ -23,6 +23,9 @@ B: Array = np.array([[0.0], [0.0], [1.0]])
 C: Array = np.array([[1.0, 0.0, 0.0]])
 """The linearized system (8): ds/dl = A s + B v, measured w = C s."""
 
+_POWERS: Array = np.stack([np.eye(3), A, 0.5 * (A @ A)])
+_EXPONENTS: Array = np.add.outer(np.arange(3), np.arange(3)) + 1.0
+
 SMALLEST_STEERING = 1e-3
 """Bound on |cos(pitch) cos(roll)| in the inverse of (7): nearer to 0, turning does not steer."""
 
@@ -164,12 +167,7 @@ def process_covariance(density: Array, length: npt.ArrayLike) -> Array:
         The integral of F density F^T over 0..l.
     """
     length = np.asarray(length, dtype=float)[..., None, None]
-    # exp(A l) = I + A l + A^2 l^2 / 2: the integral is a finite double sum.
-    terms = (np.eye(3), A, 0.5 * (A @ A))
-    return np.asarray(
-        sum(
-            (terms[i] @ density @ terms[j].T) * (length ** (i + j + 1) / (i + j + 1))
-            for i in range(3)
-            for j in range(3)
-        )
-    )
+    # exp(A l) = I + A l + A^2 l^2 / 2: the integral is a finite double sum of these two factors.
+    products = np.einsum("iab,bc,jdc->ijad", _POWERS, density, _POWERS)
+    lengths = length**_EXPONENTS / _EXPONENTS
+    return np.asarray(np.einsum("...ij,ijad->...ad", lengths, products))

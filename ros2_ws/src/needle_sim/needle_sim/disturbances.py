@@ -9,6 +9,7 @@ import collections
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
 from needle_common.compiled import compiled
 from needle_sim import study_noise
@@ -95,7 +96,7 @@ def measured(
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
     """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
     share = study_noise.uniform(seed, study_noise.CURVATURE, patch, first, count)[:, 0]
-    return np.asarray(1.0 + patches * (2.0 * share - 1.0))
+    return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
 
 
 class DelayLine:
@@ -140,14 +141,17 @@ class DelayLine:
 
 
 @compiled
-def _add_noise(tips: FloatArray, share: FloatArray, amplitude: float, seen: FloatArray) -> None:
+def _add_noise(
+    tips: FloatArray, share: NDArray[np.float32], amplitude: float, seen: FloatArray
+) -> None:
     for i in range(tips.shape[0]):
         for j in range(3):
             seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
 
 
 def _outliers(seed: int, exposure: int, first: int, count: int) -> FloatArray:
-    share = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+    numbers = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+    share = numbers.astype(np.float64)
     up = 2.0 * share[:, 0] - 1.0
     across = np.sqrt(1.0 - up * up)
     around = 2.0 * np.pi * share[:, 1]

@@ -92,22 +92,6 @@ class NeedleBatch:
 
 
 @compiled
-def _coefficients(square: float) -> tuple[float, float, float]:
-    """Return sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 for a^2."""
-    if square > _SERIES_UP_TO:
-        angle = np.sqrt(square)
-        first = np.sin(angle) / angle
-        half = np.sin(0.5 * angle) / angle
-        return first, 2.0 * half * half, (1.0 - first) / square
-    first = second = third = 0.0
-    for k in range(_TERMS):
-        first = first * square + _FIRST[k]
-        second = second * square + _SECOND[k]
-        third = third * square + _THIRD[k]
-    return first, second, third
-
-
-@compiled
 def _cut(
     position: FloatArray,
     rotation: FloatArray,
@@ -120,25 +104,66 @@ def _cut(
     With omega = (bend, 0, turn) and K its cross-product matrix, the rotation is I + first K +
     second K^2, and the translation length times the last column of I + second K + third K^2.
     """
+    coefficients = np.empty((3, turned.shape[0]))
+    _fill_coefficients(length, turned, curvature, coefficients)
+    motion = (length, turned, curvature)
+    _move_row(position[0], rotation[0:3], motion, coefficients)
+    _move_row(position[1], rotation[3:6], motion, coefficients)
+    _move_row(position[2], rotation[6:9], motion, coefficients)
+
+
+@compiled
+def _fill_coefficients(
+    length: float, turned: FloatArray, curvature: FloatArray, coefficients: FloatArray
+) -> None:
+    """Set sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 for each angle a."""
+    far = 0
+    for i in range(turned.shape[0]):
+        bend = curvature[i] * length
+        square = bend * bend + turned[i] * turned[i]
+        first = second = third = 0.0
+        for k in range(_TERMS):
+            first = first * square + _FIRST[k]
+            second = second * square + _SECOND[k]
+            third = third * square + _THIRD[k]
+        coefficients[0, i] = first
+        coefficients[1, i] = second
+        coefficients[2, i] = third
+        far += square > _SERIES_UP_TO
+    if far == 0:
+        return
+    for i in range(turned.shape[0]):
+        bend = curvature[i] * length
+        square = bend * bend + turned[i] * turned[i]
+        if square > _SERIES_UP_TO:
+            angle = np.sqrt(square)
+            half = np.sin(0.5 * angle) / angle
+            coefficients[0, i] = np.sin(angle) / angle
+            coefficients[1, i] = 2.0 * half * half
+            coefficients[2, i] = (1.0 - coefficients[0, i]) / square
+
+
+@compiled
+def _move_row(
+    along_axis: FloatArray,
+    row: FloatArray,
+    motion: tuple[float, FloatArray, FloatArray],
+    coefficients: FloatArray,
+) -> None:
+    """Move one coordinate of the tips, and turn one row of their rotation matrices."""
+    length, turned, curvature = motion
     for i in range(turned.shape[0]):
         bend = curvature[i] * length
         turn = turned[i]
-        square = bend * bend + turn * turn
-        first, second, third = _coefficients(square)
-        e00 = 1.0 - second * turn * turn
-        e01 = -first * turn
-        e02 = second * bend * turn
-        e11 = 1.0 - second * square
-        e12 = -first * bend
-        e22 = 1.0 - second * bend * bend
-        along0 = length * third * bend * turn
-        along1 = -length * second * bend
-        along2 = length * (1.0 - third * bend * bend)
-        for row in range(3):
-            r0 = rotation[3 * row, i]
-            r1 = rotation[3 * row + 1, i]
-            r2 = rotation[3 * row + 2, i]
-            position[row, i] += r0 * along0 + r1 * along1 + r2 * along2
-            rotation[3 * row, i] = r0 * e00 - r1 * e01 + r2 * e02
-            rotation[3 * row + 1, i] = r0 * e01 + r1 * e11 - r2 * e12
-            rotation[3 * row + 2, i] = r0 * e02 + r1 * e12 + r2 * e22
+        first, second, third = coefficients[0, i], coefficients[1, i], coefficients[2, i]
+        r0, r1, r2 = row[0, i], row[1, i], row[2, i]
+        forward = third * bend * turn * r0 - second * bend * r1 + (1.0 - third * bend * bend) * r2
+        along_axis[i] += length * forward
+        both = second * bend * turn
+        row[0, i] = r0 * (1.0 - second * turn * turn) + r1 * (first * turn) + r2 * both
+        row[1, i] = (
+            r1 * (1.0 - second * (bend * bend + turn * turn))
+            - r0 * (first * turn)
+            + r2 * (first * bend)
+        )
+        row[2, i] = r0 * both - r1 * (first * bend) + r2 * (1.0 - second * bend * bend)

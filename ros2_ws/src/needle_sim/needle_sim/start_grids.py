@@ -40,8 +40,9 @@ def cell_grid(bounds: Bounds, draws: int, seed: int) -> FloatArray:
 
 def random_starts(bounds: Bounds, draws: int, seed: int) -> FloatArray:
     """Return as many starts as the grids have runs, uniform within the bounds, no two alike."""
-    share = study_noise.uniform(seed, study_noise.START, 0, 0, POINTS**3 * draws)
-    return np.asarray((2.0 * share[:, :3] - 1.0) * bounds.half_widths)
+    numbers = study_noise.uniform(seed, study_noise.START, 0, 0, POINTS**3 * draws)
+    share = numbers[:, :3].astype(np.float64)
+    return np.asarray((2.0 * share - 1.0) * bounds.half_widths)
 
 
 GRIDS: Mapping[str, Callable[[Bounds, int, int], FloatArray]] = {

@@ -15,7 +15,7 @@ from needle_sim.needle_batch import NeedleBatch
 from needle_sim.se3 import FloatArray
 from needle_sim.tissue import Torsion
 
-CHUNK = 5000
+CHUNK = 10_000
 """Needles steered at a time: their arrays fit into a processor's cache."""
 
 

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
-
-from needle_sim.se3 import FloatArray
+from numpy.typing import NDArray
 
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE = range(6)
 """What random numbers are for."""
 PER_NEEDLE = 4
-"""Numbers for each needle and draw: one block of the generator."""
+"""Numbers for each needle and draw: two needles share one block of the generator."""
 
 
-def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> FloatArray:
+def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> NDArray[np.float32]:
     """Return four numbers, uniform in [0, 1), for each of some needles.
 
     Philox counts through its sequence by a number that can be set: needle, step and purpose are
-    that number, and each needle has one block of four.
+    that number.
 
     Parameters
     ----------
@@ -32,7 +31,9 @@ def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> Float
     Returns
     -------
     ndarray, shape (count, 4)
-        A row for each needle.
+        A row for each needle; single precision, in steps of 2^-24.
     """
-    bits = np.random.Philox(key=seed, counter=[first, step, purpose, 0])
-    return np.random.Generator(bits).random((count, PER_NEEDLE))
+    block, skip = divmod(first, 2)
+    bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
+    rows = np.random.Generator(bits).random((count + skip, PER_NEEDLE), dtype=np.float32)
+    return rows[skip:]

@@ -31,11 +31,12 @@ def test_a_grid_is_uniform_and_each_start_comes_as_often_as_drawn(name: str) -> 
 def test_random_starts_are_uniform_within_the_bounds_and_follow_the_seed() -> None:
     starts = GRIDS["random"](BOUNDS, 10, 1)
     assert starts.shape == (10_000, 3)
-    assert len(np.unique(starts[:, 0])) == 10_000
+    assert len(np.unique(starts, axis=0)) == 10_000
     assert np.all(np.abs(starts) <= LARGEST)
     # standard error of the mean: 1/sqrt(3)/100
     assert np.all(np.abs(np.mean(starts / LARGEST, axis=0)) < 0.03)
     np.testing.assert_allclose(np.std(starts / LARGEST, axis=0), 1.0 / np.sqrt(3.0), rtol=0.03)
     assert np.all(np.abs(np.corrcoef(starts.T) - np.eye(3)) < 0.05)
     np.testing.assert_array_equal(starts, GRIDS["random"](BOUNDS, 10, 1))
-    assert not np.any(starts == GRIDS["random"](BOUNDS, 10, 2))
+    other = GRIDS["random"](BOUNDS, 10, 2)
+    assert not np.any(np.all(starts == other, axis=1))
