@@ -14,7 +14,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
 
 from needle_common.base_node import run_node
-from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE
+from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_common.parameters import NodeParameters
@@ -22,7 +22,7 @@ from needle_common.parameters import NodeParameters
 HELP = """\
 bad_input: publishes bad tips or lonely images beside the good ones, stamped like joint_states.
 """
-TIPS = ("nan", "frame", "millimetres")
+TIPS = ("not_finite", "frame", "millimetres")
 LEFT_IMAGE = "left_image"
 
 
@@ -31,7 +31,7 @@ class BadInputParameters:
     """What to send."""
 
     kinds: tuple[str, ...] = parameter(
-        ("nan",),
+        ("not_finite",),
         unit="-",
         choices=(*TIPS, LEFT_IMAGE),
         read_only=True,
@@ -88,14 +88,15 @@ def _tip(kind: str, stamp: Time, insertion: float) -> PointStamped:
     message.header.stamp = stamp
     message.header.frame_id = "left_camera_optical" if kind == "frame" else "rig"
     scale = 1000.0 if kind == "millimetres" else 1.0
-    message.point.x = math.nan if kind == "nan" else 0.001 * scale
+    message.point.x = math.nan if kind == "not_finite" else 0.001 * scale
     message.point.z = max(insertion, 0.005) * scale
     return message
 
 
 def _image(stamp: Time) -> Image:
     message = Image(height=768, width=1024, encoding="mono8", step=1024)
-    message.header.stamp = stamp
+    # between two exposures: it must not find a partner
+    message.header.stamp = to_stamp(to_nanoseconds(stamp) - 7_000_000)
     message.header.frame_id = "left_camera_optical"
     message.data = array.array("B", bytes(1024 * 768))
     return message

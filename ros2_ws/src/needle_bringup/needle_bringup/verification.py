@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import os
 import re
@@ -70,6 +71,8 @@ class Run:
         The folder that was asked for.
     left_over : list of str
         Processes that outlived the command.
+    memory_before : frozenset of str
+        Shared memory that was there before it (a killed process leaves some for good).
     """
 
     code: int
@@ -77,6 +80,7 @@ class Run:
     output: str
     bag: Path
     left_over: list[str]
+    memory_before: frozenset[str]
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -93,7 +97,9 @@ class Run:
     def left_in_memory(self) -> list[str]:
         """Shared-memory ports that the nodes left behind."""
         domain = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
-        return shared_memory_of(int(domain[1])) if domain else []
+        if domain is None:
+            return []
+        return [name for name in shared_memory_of(int(domain[1])) if name not in self.memory_before]
 
     @property
     def last_line(self) -> str:
@@ -116,6 +122,7 @@ class StartedRun:
         self._mark = uuid.uuid4().hex
         self._bag = bag
         self._output = bag.with_name(bag.name + ".output")
+        self._memory_before = frozenset(path.name for path in SHARED_MEMORY.iterdir())
         self._begin = time.monotonic()
         with self._output.open("wb") as output:
             self.process = subprocess.Popen(
@@ -140,13 +147,24 @@ class StartedRun:
         UserError
             If the run ends, or the time, before that.
         """
+        self.wait_until_said("ROS_DOMAIN_ID", timeout)
+        found = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
+        if found is None:
+            raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
+        return int(found[1])
+
+    def wait_until_said(self, text: str, timeout: float = 60.0) -> None:
+        """Wait until the run has written `text`, or has ended, or the time [s] has."""
         deadline = time.monotonic() + timeout
-        while time.monotonic() < deadline and self.process.poll() is None:
-            found = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
-            if found:
-                return int(found[1])
-            time.sleep(0.02)
-        raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
+        while text not in self.output and self.process.poll() is None:
+            if time.monotonic() >= deadline:
+                return
+            time.sleep(0.01)
+
+    def interrupt(self, number: signal.Signals) -> None:
+        """Send a signal as a terminal does: to the command's process group."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self.process.pid, number)
 
     def running(self) -> list[tuple[int, str]]:
         """Return (pid, command) of every process of this run."""
@@ -164,7 +182,7 @@ class StartedRun:
         for pid, _ in left_over:
             os.kill(pid, signal.SIGKILL)
         names = [f"{pid} {name}" for pid, name in left_over]
-        return Run(code, wall, self.output, self._bag, names)
+        return Run(code, wall, self.output, self._bag, names, self._memory_before)
 
 
 class Workbench:

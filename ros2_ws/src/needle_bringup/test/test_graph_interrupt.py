@@ -25,19 +25,11 @@ def check_nothing_left(finished: Run) -> None:
     assert finished.left_in_memory == []
 
 
-def until(started: StartedRun, said: str) -> None:
-    """Wait until the run has said so, or has ended."""
-    deadline = time.monotonic() + LIMIT
-    while said not in started.output and started.process.poll() is None:
-        assert time.monotonic() < deadline, started.output
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupted_while_it_steers(tmp_path: Path, number: int) -> None:
     bag = tmp_path / "bag"
     started = start(bag, "--level", "tip")
-    until(started, "30.0 of 120.0 mm")
+    started.wait_until_said("30.0 of 120.0 mm")
     os.kill(started.process.pid, number)
     finished = started.wait(LIMIT)
     assert finished.code == 130, finished.output
@@ -49,7 +41,7 @@ def test_interrupted_while_it_steers(tmp_path: Path, number: int) -> None:
 def test_interrupted_while_the_nodes_start(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     started = start(bag, "--level", "tip")
-    until(started, "ROS_DOMAIN_ID")
+    started.wait_until_said("ROS_DOMAIN_ID")
     os.kill(started.process.pid, signal.SIGTERM)
     finished = started.wait(LIMIT)
     assert finished.code == 130, finished.output
@@ -59,7 +51,7 @@ def test_interrupted_while_the_nodes_start(tmp_path: Path) -> None:
 
 def test_killed_outright_its_nodes_end_too(tmp_path: Path) -> None:
     started = start(tmp_path / "bag", "--level", "tip")
-    until(started, "30.0 of 120.0 mm")
+    started.wait_until_said("30.0 of 120.0 mm")
     started.process.kill()
     started.process.wait()
     deadline = time.monotonic() + LIMIT
@@ -71,7 +63,7 @@ def test_killed_outright_its_nodes_end_too(tmp_path: Path) -> None:
 def test_a_node_that_dies_is_named_and_ends_the_run(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     started = start(bag, "--level", "tip")
-    until(started, "30.0 of 120.0 mm")
+    started.wait_until_said("30.0 of 120.0 mm")
     (pid,) = [pid for pid, command in started.running() if "plane_controller" in command]
     os.kill(pid, signal.SIGKILL)
     finished = started.wait(LIMIT)
