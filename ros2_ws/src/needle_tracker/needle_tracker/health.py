@@ -35,6 +35,7 @@ class Health:
     last_refusal: tuple[float, str] | None = None
     camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
     _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
+    _first_image: float = 0.0
     _last_unpaired: float | None = None
     _unpaired: int = 0
     _done: deque[tuple[float, float]] = dataclasses.field(
@@ -46,6 +47,8 @@ class Health:
 
     def image_came(self, side: str, now: float) -> None:
         """Note an image of one side."""
+        if not self._last_image:
+            self._first_image = now
         self._last_image[side] = now
 
     def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
@@ -111,8 +114,8 @@ class Health:
             if problem:
                 return Level.ERROR, problem
         for side, other in OTHER_SIDE.items():
-            last = self._last_image.get(other)
-            if matcher.waiting(side) and now - (last or 0.0) > PARTNER_LATE:
+            last = self._last_image.get(other, self._first_image)
+            if matcher.waiting(side) and now - last > PARTNER_LATE:
                 return Level.WARN, f"{side} images without {other}"
         if self._last_unpaired is not None and now - self._last_unpaired <= TROUBLE_SHOWN:
             return Level.WARN, "images without a partner were dropped"

@@ -21,6 +21,7 @@ from needle_common.conversions import (
     RELIABLE,
     to_nanoseconds,
 )
+from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
 from needle_tracker.calibration import SIDES, load_calibration
 from needle_tracker.conversions import (
@@ -35,6 +36,7 @@ from needle_tracker.health import Health
 from needle_tracker.insertion_history import InsertionHistory
 from needle_tracker.pairing import Pair, PairMatcher
 from needle_tracker.parameters import StereoTrackerParameters
+from needle_tracker.track import TrackState
 from needle_tracker.tracker import Measurement, StereoTracker
 
 HELP = """
@@ -77,6 +79,8 @@ class StereoTrackerNode(Node):
         self._joints_silent = False
         self._last_stamp: int | None = None
         self._health = Health(Counter(), Counter())
+        # What every start begins with is not worth a warning in the log.
+        self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
 
         self._tip = self.create_publisher(PointStamped, "needle/tip", RELIABLE)
         self._tip_pose = self.create_publisher(
@@ -164,9 +168,17 @@ class StereoTrackerNode(Node):
     def _report(self) -> None:
         now = time.monotonic()
         self._health.note_pairing(now, self._matcher)
-        self._diagnostics.set("track", self._health.track())
-        self._diagnostics.set("images", self._health.images(now, self._matcher))
-        self._diagnostics.set("joints", self._health.joints(self._insertions, self._joints_silent))
+        self._tell("track", self._health.track())
+        self._tell("images", self._health.images(now, self._matcher))
+        self._tell("joints", self._health.joints(self._insertions, self._joints_silent))
+
+    def _tell(self, part: str, diagnostic: Diagnostic) -> None:
+        """Publish a part's health; log it where it turns bad, not each time it still is."""
+        self._diagnostics.set(part, diagnostic)
+        kind = diagnostic.message.partition(":")[0]
+        if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
+            self.get_logger().warning(f"{part}: {diagnostic.message}")
+        self._told[part] = kind
 
 
 def main() -> int:
