@@ -205,7 +205,7 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
 }
 
 
-def _noise(needle: int) -> list[float]:
+def noise_of(needle: int) -> list[float]:
     """Return the noise on x that the study gives one of its needles."""
     shares = (study_noise.uniform(1, study_noise.NOISE, k, needle, 1)[0, 0] for k in range(STEPS))
     return [float(NOISE * (2.0 * share - 1.0)) for share in shares]
@@ -214,7 +214,7 @@ def _noise(needle: int) -> list[float]:
 def _plain_study() -> float:
     d = design()
     chosen = range(0, NEEDLES, NEEDLES // PLAIN_NEEDLES)
-    needles = [(STARTS[k].tolist(), _noise(k)) for k in chosen]
+    needles = [(STARTS[k].tolist(), noise_of(k)) for k in chosen]
     seconds = _least_time(lambda: [reference_loop.steer(*needle, d) for needle in needles], 2)
     ends = [reference_loop.steer(*needle, d) for needle in needles]
     seen = run_study(STARTS, controller_factory("paper", NOISE), STUDY).x_end[list(chosen)]
@@ -225,7 +225,7 @@ def _plain_study() -> float:
 def _control_study() -> float:
     d = design()
     system = reference_loop.control_system(d)
-    needles = [(STARTS[k].tolist(), _noise(k)) for k in range(CONTROL_NEEDLES)]
+    needles = [(STARTS[k].tolist(), noise_of(k)) for k in range(CONTROL_NEEDLES)]
     begin = time.process_time()
     ends = [reference_loop.control_steer(system, *needle) for needle in needles]
     seconds = time.process_time() - begin
