@@ -25,6 +25,7 @@ setup(
     entry_points={
         "console_scripts": [
             "stereo_tracker = needle_tracker.stereo_tracker_node:main",
+            "track_images = needle_tracker.track_images:main",
         ]
     },
 )

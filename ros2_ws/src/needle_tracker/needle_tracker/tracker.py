@@ -12,7 +12,7 @@ import math
 import cv2
 import numpy as np
 
-from needle_tracker.calibration import SIDES, StereoCalibration
+from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
 from needle_tracker.detection import (
     DetectionSettings,
     Image,
@@ -23,7 +23,7 @@ from needle_tracker.detection import (
     full_window,
 )
 from needle_tracker.refraction import RefractedCamera
-from needle_tracker.search_grid import SearchGrid, make_search_grid
+from needle_tracker.search_grid import Reach, SearchGrid, make_search_grid
 from needle_tracker.tip_fit import ImageTip, fit_tip
 from needle_tracker.track import GateSettings, Track, TrackState, tip_at_entry
 from needle_tracker.triangulation import SpatialTip, triangulate
@@ -63,6 +63,46 @@ class TrackerSettings:
     noise_factor: float
     entry_zone: float
     hole_clearance: float
+
+
+def default_settings(phantom: Phantom) -> TrackerSettings:
+    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend).
+
+    Parameters
+    ----------
+    phantom : Phantom
+        From the calibration.
+
+    Returns
+    -------
+    TrackerSettings
+        The same as the node's defaults.
+    """
+    hole_clearance = 2.0e-3
+    gates = GateSettings(
+        reach=Reach(curvature=9.0, entry_angle=0.1745, hole_tolerance=0.5e-3, length=0.15),
+        surface_height=phantom.surface_height,
+        least_distance=hole_clearance + 1.5e-3,
+        tip_lean=0.21,
+        insertion_margin=2.0e-3,
+        step_margin=1.5e-3,
+        free_step=5.0e-3,
+        max_disagreement=1.5e-3,
+        max_miss_px=1.0,
+        max_depth_sigma=2e-3,
+        confirm_pairs=3,
+        lost_after=3,
+        forget_after=30,
+    )
+    return TrackerSettings(
+        gates=gates,
+        needle_width=0.7e-3,
+        bright=False,
+        min_contrast=10.0,
+        noise_factor=5.0,
+        entry_zone=4.5e-3,
+        hole_clearance=hole_clearance,
+    )
 
 
 @dataclasses.dataclass(frozen=True)
