@@ -150,9 +150,9 @@ def render_insertion(
     curvature : float
         Of the needle's path [1/m].
 
-    Yields
-    ------
-    RenderedPair
+    Returns
+    -------
+    iterator of RenderedPair
         One exposure after the other.
 
     Raises
@@ -161,19 +161,23 @@ def render_insertion(
         If no path of this depth stays inside the phantom.
     """
     path = random_path(seed, depth, rig.surface_height, curvature)
-    plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=curvature)
     renderer = StereoRenderer(rig, seed, scenario=scenario)
-    for number in range(frames):
-        insertion = min(number * step, depth)
-        _advance_to(plant, insertion, path.rotation)
-        pose, line = plant.T_rig_tip, plant.centreline(_SPACING)
-        yield RenderedPair(
-            number,
-            renderer.render(pose, line, number),
-            insertion,
-            truth_of(pose) if scenario.needle and insertion > 0.0 else None,
-            renderer.share_seen(pose, line, number),
-        )
+
+    def pairs() -> Iterator[RenderedPair]:
+        plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=curvature)
+        for number in range(frames):
+            insertion = min(number * step, depth)
+            _advance_to(plant, insertion, path.rotation)
+            pose, line = plant.T_rig_tip, plant.centreline(_SPACING)
+            yield RenderedPair(
+                number,
+                renderer.render(pose, line, number),
+                insertion,
+                truth_of(pose) if scenario.needle and insertion > 0.0 else None,
+                renderer.share_seen(pose, line, number),
+            )
+
+    return pairs()
 
 
 def _advance_to(plant: NeedlePlant, insertion: float, rotation: FloatArray) -> None:

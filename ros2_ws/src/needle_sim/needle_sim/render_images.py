@@ -115,8 +115,8 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
         Anything that cannot be rendered as asked.
     """
     given = _parser().parse_args(arguments)
-    depth = _number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") * 1e-3
-    step = _number("--step-mm", given.step_mm, 0.001, 50.0, "mm") * 1e-3
+    depth = _number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
+    step = _number("--step-mm", given.step_mm, 0.001, 50.0, "mm") / 1e3
     frames = math.ceil(depth / step - 1e-9) + 1
     if given.frames is not None:
         frames = _whole("--frames", given.frames, 1, 999_999)
@@ -133,7 +133,7 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
         step=step,
         curvature=_number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
         calibration=None if given.calibration is None else Path(given.calibration).expanduser(),
-        json=None if given.json is None else Path(given.json).expanduser(),
+        json=_writable("--json", given.json),
     )
 
 
@@ -187,6 +187,15 @@ def _whole(name: str, text: str, lower: int, upper: int) -> int:
     if not lower <= value <= upper:
         raise OutOfBoundsError(name, value, lower, upper, "-")
     return value
+
+
+def _writable(name: str, text: str | None) -> Path | None:
+    if text is None:
+        return None
+    path = Path(text).expanduser()
+    if path.is_dir() or not path.parent.is_dir():
+        raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
+    return path
 
 
 if __name__ == "__main__":
