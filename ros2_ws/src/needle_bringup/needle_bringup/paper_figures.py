@@ -82,6 +82,8 @@ def figure_3(results: Results) -> Figure:
         axes[0].legend(loc="best")
         axes[3].plot(trial.insertion_mm, trial.rotation_deg, color=TRUTH, lw=1.3)
         axes[3].set_xlabel("insertion [mm]")
+        if not np.any(trial.rotation_deg):
+            axes[3].set_ylim(-1.0, 1.0)
     for row, name in enumerate(("r1 [mm]", "r2, pitch [deg]", "r3, roll [deg]", "rotation [deg]")):
         grid[row, 0].set_ylabel(name)
     return figure

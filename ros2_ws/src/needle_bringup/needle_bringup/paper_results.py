@@ -66,8 +66,9 @@ class Results:
         Of the study on each grid, by its name.
     runs, longer : dict
         Single runs of those studies, and the same runs inserted farther.
-    scales : dict
-        Figures of the study with the curvature wrong, by the plant's multiple of the assumed.
+    scales, scales_longer : dict
+        Figures of the study with the curvature wrong, by the plant's multiple of the assumed one;
+        at the study's depth and farther in.
     domain_pitch, domain_roll : mapping
         Single runs from starts over (x, pitch) and over (x, roll).
     best : dict
@@ -82,6 +83,7 @@ class Results:
     runs: dict[str, Columns]
     longer: dict[str, Columns]
     scales: dict[float, dict[str, JsonValue]]
+    scales_longer: dict[float, dict[str, JsonValue]]
     domain_pitch: Columns
     domain_roll: Columns
     best: dict[str, JsonValue]
@@ -119,6 +121,13 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
     _, domain_roll = laboratory.study(
         "domain_roll", *anywhere, "--pitch-deg", "0", "--roll-deg", f"{DOMAIN_ROLL_DEG:g}"
     )
+    scales, scales_longer = {}, {}
+    for scale in SCALES:
+        wrong = (*at, *draws, "--kappa-scale", str(scale))
+        scales[scale], _ = laboratory.study(f"scale_{scale:g}", *wrong)
+        scales_longer[scale], _ = laboratory.study(
+            f"scale_{scale:g}_longer", *wrong, "--depth-mm", f"{LONGER_MM:g}"
+        )
     return Results(
         open_loop=read_trial(open_loop),
         closed_loop=read_trial(closed_loop),
@@ -127,10 +136,8 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
         grids=grids,
         runs=runs,
         longer=longer,
-        scales={
-            scale: laboratory.study(f"scale_{scale:g}", *at, *draws, "--kappa-scale", str(scale))[0]
-            for scale in SCALES
-        },
+        scales=scales,
+        scales_longer=scales_longer,
         domain_pitch=domain_pitch,
         domain_roll=domain_roll,
         best=laboratory.study("best", "--controller", "best", "--seed", str(seed), *draws)[0],
