@@ -190,7 +190,7 @@ def _run_nodes(
         "OMP_NUM_THREADS": "1",
     }
     nodes: dict[str, NodeProcess] = {}
-    print(f"recording into {bag} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
+    print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
     failure: NodeProcess | None = None
     try:
         for name, executable in executables.items():
@@ -262,6 +262,11 @@ def _report(
     return EXIT_DONE if summary["converged"] else EXIT_MISSED
 
 
+def shown(path: Path) -> Path:
+    """Return a path as short as it can be typed: relative where it is below the current folder."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
 def _import_report() -> tuple[ModuleType, ...]:
     """Import what makes the report: a second of work, best done while there is time to spare."""
     names = ("report", "bag_reader", "run_summary")
@@ -291,7 +296,7 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
         f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
         f"{figure('depth_error_p95_mm')} mm (95th percentile)",
         f"  speed             {figure('steps_per_s', 1)} steps/s; {figure('wall_s', 1)} s in all",
-        f"  report            {bag / REPORT}",
+        f"  report            {shown(bag / REPORT)}",
     ]
     if not summary.get("reached_depth"):
         reason = summary.get("reason") or "no reason given"
