@@ -59,7 +59,7 @@ def render(renderer: StereoRenderer, plant: NeedlePlant | None, number: int) -> 
 
 def taken(with_it: Pair, without: Pair) -> np.ndarray:
     """What something takes from both images; the same exposure has the same noise."""
-    return np.stack(without).astype(float) - np.stack(with_it)
+    return np.asarray(np.stack(without).astype(float) - np.stack(with_it))
 
 
 def cameras(rig: StereoRig) -> tuple[Camera, Camera]:
@@ -198,9 +198,11 @@ def test_the_shadow_lies_on_the_floor(rig: StereoRig, floor_depth: float) -> Non
         u_right, v_right = project([height, *fsolve(miss, [0.0, 0.05])], rig.right, 0.0175, 1.3)
         return float(v_right - np.interp(u_right, np.arange(250, 650), right))
 
-    misses = [right_row(u, v, floor_depth) for u, v in zip(columns, left, strict=True)]
+    misses = [right_row(float(u), v, floor_depth) for u, v in zip(columns, left, strict=True)]
     assert np.abs(misses).max() < 0.3
-    higher = [right_row(u, v, floor_depth - 0.003) for u, v in zip(columns, left, strict=True)]
+    higher = [
+        right_row(float(u), v, floor_depth - 0.003) for u, v in zip(columns, left, strict=True)
+    ]
     assert np.abs(higher).min() > 3.0
 
 

@@ -9,8 +9,10 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
+import cv2
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -459,9 +461,36 @@ def test_camera_exposes_pairs_again_when_lost_and_ends_where_the_tip_leaves_the_
         assert "the run has ended" in rig.call("reset").message
 
 
+def test_what_it_renders_is_written_with_insertion_and_truth(tmp_path: Path) -> None:
+    folder = tmp_path / "images"
+    with running(level="camera", scenario="clutter", seed=3, images=str(folder)) as rig:
+        rig.prepare()
+        partner = rig.partner
+        rig.until(lambda: len(partner.pairs) == 1, "first pair")
+        assert rig.step(0.002).frame_id == "succeeded"
+        rig.until(lambda: len(partner.pairs) == 2, "pair after the step")
+        sent, truth = partner.pairs, partner.truths[1].pose.position
+    for number, pair in enumerate(sent):
+        for side, image in pair.items():
+            written = cv2.imread(str(folder / side / f"{number:06d}.png"), cv2.IMREAD_UNCHANGED)
+            assert written is not None
+            assert written.tobytes() == bytes(image.data)
+    lines = (folder / "insertion.csv").read_text().splitlines()
+    assert lines[:2] == ["name,insertion_m", "000000.png,0.0"]
+    assert float(lines[2].split(",")[1]) == pytest.approx(0.002)
+    lines = (folder / "truth.csv").read_text().splitlines()
+    assert lines[1] == "000000.png,,,,,,,,0.0,0.0"
+    assert [float(value) for value in lines[2].split(",")[1:4]] == [truth.x, truth.y, truth.z]
+    assert (folder / "calibration.yaml").is_file()
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
+        ({"scenario": "fog"}, "scenario = 'fog' is not one of clean"),
+        ({"scenario": "clutter"}, "scenario = 'clutter': level tip has no images"),
+        ({"images": "somewhere"}, "images = 'somewhere': level tip has no images"),
+        ({"level": "camera", "images": "/dev/null/x"}, "cannot write /dev/null/x"),
         ({"level": "drive"}, "drive is not available yet"),
         ({"level": "x"}, "level"),
         ({"curvature": -1.0}, "curvature"),
