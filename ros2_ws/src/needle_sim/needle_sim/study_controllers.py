@@ -5,7 +5,6 @@ This is the only module of needle_sim that knows the controller under test.
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
 import math
 from collections.abc import Callable, Sequence
@@ -15,6 +14,7 @@ import numpy as np
 from needle_common.errors import UserError
 from needle_controller.best import BestSettings, make_best
 from needle_controller.estimator import Estimate, Estimator
+from needle_controller.flip_plan import FlipPlan
 from needle_controller.law import Command
 from needle_controller.luenberger import LuenbergerObserver
 from needle_controller.plane_control import ControlSettings, make_law, observer_settings
@@ -25,7 +25,6 @@ CURVATURE = ControlSettings.curvature
 STEP_LENGTH = ControlSettings.step_length
 # A sensor without noise still has this bound for the controllers' design [m].
 _SMALLEST_NOISE = 1e-5
-_DEPTH_TOLERANCE = 1e-9
 
 
 class SteeredNeedles:
@@ -106,6 +105,7 @@ def controller_factory(
 
 
 def _best_factory(noise: float, flip_depths: tuple[float, ...]) -> Callable[[], SteeredNeedles]:
+    plan = FlipPlan(flip_depths)
     defaults = BestSettings()
     settings = dataclasses.replace(
         defaults, filter=dataclasses.replace(defaults.filter, tip_noise_bound=noise)
@@ -113,13 +113,11 @@ def _best_factory(noise: float, flip_depths: tuple[float, ...]) -> Callable[[], 
 
     def build() -> SteeredNeedles:
         estimator, law = make_best(settings)
-
-        def command(estimate: Estimate, insertion: float) -> Command:
-            if not flip_depths:
-                return law(estimate)
-            flipped = bisect.bisect_right(flip_depths, insertion + _DEPTH_TOLERANCE)
-            return law(estimate, bend_sign=-1.0 if flipped % 2 else 1.0)
-
-        return SteeredNeedles(estimator, command)
+        return SteeredNeedles(
+            estimator,
+            lambda estimate, insertion: law(
+                estimate, plan.bend_sign(insertion) if plan.depths else 0.0
+            ),
+        )
 
     return build
