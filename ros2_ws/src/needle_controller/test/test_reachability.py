@@ -23,7 +23,9 @@ from needle_sim.plant import NeedlePlant, initial_pose
 CURVATURE = 1.0 / 0.122
 
 
-def follow(x: Array, pitch: Array, legs: list[tuple[Array, float]]) -> tuple[Array, Array, Array]:
+def follow(
+    x: Array, pitch: Array, legs: list[tuple[Array, Array | float]]
+) -> tuple[Array, Array, Array]:
     """Return x, pitch and the steepest pitch after legs of (length, sine of roll)."""
     x, pitch = x + 0.0, pitch + 0.0
     steepest = np.abs(pitch)
@@ -81,7 +83,7 @@ def test_the_plant_gets_there_in_the_least_insertion_and_no_sooner() -> None:
 def test_random_rolls_never_beat_the_bounds() -> None:
     rng, count, length = default_rng(1), 20_000, 0.06
     pitch0 = 0.1
-    x, pitch = np.zeros(count), np.full(count, pitch0)
+    x, pitch = np.zeros(count), np.full(count, pitch0, dtype=float)
     for _ in range(6):
         x, pitch, _ = follow(x, pitch, [(np.full(count, 0.01), rng.uniform(-1, 1, count))])
     level = np.abs(pitch) < 0.02
