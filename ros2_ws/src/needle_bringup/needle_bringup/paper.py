@@ -98,8 +98,12 @@ def _folder(keep: str | None) -> Iterator[Path]:
     folder = Path(tempfile.mkdtemp(prefix="needle_paper_"))
     try:
         yield folder
-    finally:
+    except UserError:
+        raise  # it may name a log in there
+    except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def _checkout() -> Path:

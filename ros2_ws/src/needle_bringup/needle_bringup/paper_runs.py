@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -46,6 +47,7 @@ class Laboratory:
         """
         bag = self._folder / name
         if not (bag / SUMMARY).is_file():
+            shutil.rmtree(bag, ignore_errors=True)  # what an earlier, broken run left
             command = [*self._simulate, *arguments, "--bag", str(bag)]
             _run(name, command, (EXIT_DONE, EXIT_MISSED))
         return read_run(bag)
