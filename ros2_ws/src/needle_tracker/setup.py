@@ -26,6 +26,7 @@ setup(
         "console_scripts": [
             "stereo_tracker = needle_tracker.stereo_tracker_node:main",
             "track_images = needle_tracker.track_images:main",
+            "calibrate_stereo = needle_tracker.calibrate_stereo:main",
         ]
     },
 )

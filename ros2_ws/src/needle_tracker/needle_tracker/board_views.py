@@ -1,0 +1,94 @@
+"""From images to what both cameras saw of the board."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from needle_common.errors import UserError
+from needle_tracker.calibration import SIDES
+from needle_tracker.calibration_session import Session
+from needle_tracker.image_files import Image, open_pairs
+from needle_tracker.rig_model import BoardView, Corners
+
+Sizes = dict[str, tuple[int, int]]
+
+
+def board_view(name: str, session: Session, images: dict[str, Image]) -> BoardView:
+    """Return what both cameras saw of the board in one exposure.
+
+    Parameters
+    ----------
+    name : str
+        The exposure's name; the session says by it where the board lay.
+    session : Session
+        Board and places.
+    images : dict of str to ndarray
+        The left and the right image, grey.
+    """
+    seen = []
+    for side in SIDES:
+        numbers, pixels = session.board.find(images[side])
+        seen.append(Corners(session.board.corners[numbers], pixels))
+    return BoardView(name, session.place_of(name), seen[0], seen[1])
+
+
+def views_in_folders(
+    left: Path, right: Path, session: Session, on_view: Callable[[BoardView], None] | None = None
+) -> tuple[list[BoardView], Sizes]:
+    """Find the board in all image pairs of two folders.
+
+    Parameters
+    ----------
+    left, right : Path
+        Folders with images of the same names, or two videos (names: the frames' numbers).
+    session : Session
+        Board and places.
+    on_view : callable, optional
+        Called with each view.
+
+    Returns
+    -------
+    views : list of BoardView
+        One for each pair, in the order of the names.
+    sizes : dict of str to (int, int)
+        Width and height of each side's images.
+
+    Raises
+    ------
+    UserError
+        Folders, names or files that are wrong, images of different sizes, a place in the session
+        that no image has.
+    """
+    views: list[BoardView] = []
+    sizes: Sizes = {}
+    pairs = open_pairs(left, right)
+    if pairs.unpaired:
+        raise UserError(f"{len(pairs.unpaired)} images have no partner: {pairs.unpaired[0]}")
+    for pair in pairs:
+        images = {}
+        for side, folder, image in (("left", left, pair.left), ("right", right, pair.right)):
+            if image is None:
+                raise UserError(f"cannot read {folder / pair.name}: not an image in 8 bit")
+            size = (image.shape[1], image.shape[0])
+            if sizes.setdefault(side, size) != size:
+                raise UserError(
+                    f"{folder / pair.name} is {size[0]}x{size[1]}, the {side} images before it "
+                    f"are {sizes[side][0]}x{sizes[side][1]}"
+                )
+            images[side] = image
+        views.append(board_view(Path(pair.name).stem, session, images))
+        if on_view is not None:
+            on_view(views[-1])
+    used = [view.place for view in views]
+    for name, place in session.places.items():
+        if not any(place is one for one in used):
+            raise UserError(f"the session's places.{name} has no image in {left}")
+    return views, sizes
+
+
+def nothing_seen(view: BoardView) -> bool:
+    """Return whether neither camera saw the board."""
+    return not np.any([len(view.corners(side).points) for side in SIDES])
