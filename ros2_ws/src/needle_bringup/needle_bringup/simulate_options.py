@@ -25,7 +25,7 @@ examples:
   scripts/simulate
       camera images, the paper's controller, start 3 mm beside the plane, 120 mm deep
   scripts/simulate --level tip --seed 7
-      no images: the tip is measured with the paper's +-1 mm noise; a few seconds
+      no images: the tip is measured with the paper's +-1 mm noise; quicker
   scripts/simulate --controller open_loop --level tip --noise-mm 0
       no steering: where the needle goes by itself (14.6 mm beside the plane; exit code 1)
   scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
