@@ -43,7 +43,7 @@ class PitchObserverSettings:
 
     linear: LinearObserverSettings
     pitch_std: float = math.radians(2.0)
-    pole: float = 50.0
+    pole: float = 15.0
 
     def __post_init__(self) -> None:
         """Check every field."""

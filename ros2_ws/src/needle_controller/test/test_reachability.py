@@ -54,8 +54,12 @@ def test_no_switching_rolls_reach_the_plane_sooner(x: float, pitch: float) -> No
             start = np.full(first.shape, x), np.full(first.shape, pitch)
             _, before, _ = follow(*start, [(first, one), (second, two)])
             # The last leg levels out.
-            third = -before / (three * CURVATURE)
-            legs = [(first, one), (second, two), (np.maximum(third, 0.0), three)]
+            third = np.asarray(-before / (three * CURVATURE), dtype=float)
+            legs: list[tuple[Array, Array | float]] = [
+                (first, one),
+                (second, two),
+                (np.maximum(third, 0.0), three),
+            ]
             end, _, _ = follow(*start, legs)
             there = (np.abs(end) < 0.4e-3) & (third >= 0.0)
             if np.any(there):
