@@ -421,3 +421,34 @@ def test_a_plan_says_the_side_at_every_depth() -> None:
             evenly_spaced_flips(count, depth)
     with pytest.raises(UserError, match="first_sign"):
         FlipPlan(first_sign=0.0)
+
+
+def test_a_flip_turns_the_error_of_the_curvature_round() -> None:
+    """What the covariance says of s2 and s3 together has the sign of what many needles show."""
+    rng, count = default_rng(7), 2000
+    plant = plant_at(rng.normal(0.0, 1.0, (count, 3)) * [0.0, 0.05, 0.15])
+    linear = settings(process_noise=np.zeros((3, 3)), initial_pitch_std=0.05, initial_roll_std=0.15)
+    one = LinearObserver(linear)
+    one.reset(tip(plant) + rng.uniform(-1e-3, 1e-3, (count, 3)), np.zeros(2))
+    for _ in range(30):
+        plant.advance(STEP, 0.0)
+        one.advance(STEP, 0.0)
+        one.correct(tip(plant) + rng.uniform(-1e-3, 1e-3, (count, 3)))
+    correlations = []
+    for sign in (1.0, -1.0):
+        one.flip_to(sign)
+        turn = mirrored_turn(one.estimate().reduced[:, 2], sign)
+        plant.advance(0.0, turn)
+        one.advance(0.0, turn)
+        true = linearized_from_reduced(true_reduced(plant), CURVATURE)
+        error = one.estimate().linearized - true
+        said = np.mean(one._covariance.reshape(-1, 3, 3), axis=0)
+        correlations.append(
+            (
+                np.corrcoef(error[:, 1], error[:, 2])[0, 1],
+                said[1, 2] / np.sqrt(said[1, 1] * said[2, 2]),
+            )
+        )
+    for seen, said in correlations:
+        assert seen == pytest.approx(said, abs=0.15)
+    assert correlations[0][0] * correlations[1][0] < 0.0
