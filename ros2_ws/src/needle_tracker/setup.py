@@ -27,6 +27,8 @@ setup(
             "stereo_tracker = needle_tracker.stereo_tracker_node:main",
             "track_images = needle_tracker.track_images:main",
             "calibrate_stereo = needle_tracker.calibrate_stereo:main",
+            "check_calibration = needle_tracker.check_calibration_node:main",
+            "stereo_camera = needle_tracker.stereo_camera_node:main",
         ]
     },
 )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from needle_common.errors import UserError
 from needle_tracker.calibration import SIDES
@@ -13,6 +13,7 @@ from needle_tracker.calibration_session import Session
 from needle_tracker.image_files import Image, open_pairs
 from needle_tracker.rig_model import BoardView, Corners
 
+Array = NDArray[np.float64]
 Sizes = dict[str, tuple[int, int]]
 
 
@@ -36,7 +37,7 @@ def board_view(name: str, session: Session, images: dict[str, Image]) -> BoardVi
 
 
 def views_in_folders(
-    left: Path, right: Path, session: Session, on_view: Callable[[BoardView], None] | None = None
+    left: Path, right: Path, session: Session, *, all_places: bool = True
 ) -> tuple[list[BoardView], Sizes]:
     """Find the board in all image pairs of two folders.
 
@@ -46,8 +47,8 @@ def views_in_folders(
         Folders with images of the same names, or two videos (names: the frames' numbers).
     session : Session
         Board and places.
-    on_view : callable, optional
-        Called with each view.
+    all_places : bool
+        Whether each of the session's places must have an image.
 
     Returns
     -------
@@ -80,11 +81,9 @@ def views_in_folders(
                 )
             images[side] = image
         views.append(board_view(Path(pair.name).stem, session, images))
-        if on_view is not None:
-            on_view(views[-1])
     used = [view.place for view in views]
     for name, place in session.places.items():
-        if not any(place is one for one in used):
+        if all_places and not any(place is one for one in used):
             raise UserError(f"the session's places.{name} has no image in {left}")
     return views, sizes
 
@@ -92,3 +91,28 @@ def views_in_folders(
 def nothing_seen(view: BoardView) -> bool:
     """Return whether neither camera saw the board."""
     return not np.any([len(view.corners(side).points) for side in SIDES])
+
+
+def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
+    """Return what both cameras saw of a board that stood still, the mean of several exposures.
+
+    Parameters
+    ----------
+    name : str
+        The view's name; the session says by it where the board lay.
+    session : Session
+        Board and places.
+    pairs : list of dict of str to ndarray
+        Left and right images.
+    """
+    seen = []
+    for side in SIDES:
+        found: dict[int, list[Array]] = {}
+        for images in pairs:
+            for number, pixel in zip(*session.board.find(images[side]), strict=True):
+                found.setdefault(int(number), []).append(pixel)
+        # A corner that only some exposures show is at the border of what can be seen.
+        kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
+        pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
+        seen.append(Corners(session.board.corners[kept], pixels))
+    return BoardView(name, session.place_of(name), seen[0], seen[1])

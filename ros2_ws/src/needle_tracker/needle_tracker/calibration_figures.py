@@ -25,42 +25,45 @@ _FRUSTUM = 0.25  # [m]
 
 def rig_figure(result: RigCalibration) -> Figure:
     """Return the rig from the side and along the needle: cameras, surface, boards, frustums."""
-    figure = Figure(figsize=(11.0, 6.5), layout="constrained")
+    figure = Figure(figsize=(9.0, 8.5), layout="constrained")
     FigureCanvasAgg(figure)
     calibration = result.calibration
     height = calibration.phantom.surface_height
     planes = ((2, "z (insertion) [mm]"), (1, "y [mm]"))
-    for number, (axis, label) in enumerate(planes):
+    for number, (axis, axis_label) in enumerate(planes):
         axes = figure.add_subplot(1, 2, number + 1)
-        axes.axhline(_MM * height, color="#2e9d55", label="surface")
-        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)")
+        # The legend names each thing once.
+        named = number == 1
+        axes.axhline(_MM * height, color="#2e9d55", label="surface" if named else None)
+        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)" if named else None)
         for i, view in enumerate(result.model.views):
             outline = _outline(result, i)
             axes.plot(_MM * outline[:, axis], _MM * outline[:, 0], **_style(view))
         for side in SIDES:
             camera = calibration.left if side == "left" else calibration.right
-            _draw_camera(axes, camera, axis, _COLOURS[side], f"{side} camera")
+            label = f"{side} camera" if named else None
+            _draw_camera(axes, camera, axis, _COLOURS[side], label)
         axes.set_aspect("equal")
-        axes.set_xlabel(label)
+        axes.set_xlabel(axis_label)
         axes.set_ylabel("x (up) [mm]")
         axes.grid(color="#e4e6ea")
     axes.plot([], [], color="#9aa0a8", label="board held freely")
     axes.plot([], [], color="#1b1b1b", label="board of known place in air")
     axes.plot([], [], color="#b03060", label="board under the surface")
-    axes.legend(loc="upper right", fontsize=8)
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
     figure.suptitle("The rig as calibrated")
     return figure
 
 
 def residual_figure(result: RigCalibration) -> Figure:
     """Return each camera's residuals over the image (enlarged) and the error of every view."""
-    figure = Figure(figsize=(11.0, 8.0), layout="constrained")
+    figure = Figure(figsize=(11.0, 8.5))
     FigureCanvasAgg(figure)
     enlarged = 20.0 / max(result.fit.corner_sigma_px, 1e-3)
     for number, side in enumerate(SIDES):
         camera = result.calibration.left if side == "left" else result.calibration.right
         pixels, errors = result.model.pixels[side], result.residuals(side)
-        axes = figure.add_subplot(2, 2, number + 1)
+        axes = figure.add_axes((0.05 + 0.49 * number, 0.52, 0.44, 0.43))
         axes.quiver(
             pixels[:, 0], pixels[:, 1], errors[:, 0], errors[:, 1],
             angles="xy", scale_units="xy", scale=1.0 / enlarged,
@@ -70,7 +73,7 @@ def residual_figure(result: RigCalibration) -> Figure:
         axes.set_title(
             f"{side}: {result.reprojection_rms_px(side):.3f} px rms, drawn {enlarged:.0f} times"
         )
-    axes = figure.add_subplot(2, 1, 2)
+    axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
     places = np.arange(len(result.model.views))
     for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):
         errors = np.array([result.reprojection_rms_px(side, int(i)) for i in places])
@@ -109,7 +112,7 @@ def _style(view: BoardView) -> dict[str, Any]:
     return {"color": "#b03060" if view.under_surface else "#1b1b1b", "linewidth": 2.0}
 
 
-def _draw_camera(axes: Any, camera: Camera, axis: int, colour: str, label: str) -> None:
+def _draw_camera(axes: Any, camera: Camera, axis: int, colour: str, label: str | None) -> None:
     centre = camera.centre
     corners = np.array(
         [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float

@@ -5,8 +5,9 @@ What calibration and its check have in common. Parameters are one vector:
     left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
     refractive index, surface height; for each view of the board: rotation (3), translation (3).
 
-Rotations and translations are increments on the transforms that the model starts from:
-T = [exp(rotation) R | t + translation], in the optical frame for cameras, in `rig` for boards.
+Rotations and translations are increments on the transforms that the model starts from. A camera
+turns about its own centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
+first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
 """
 
 from __future__ import annotations
@@ -184,7 +185,11 @@ class RigModel:
         start, own = self._start[side], parameters[camera_slice(side)]
         fx, fy, cx, cy = own[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        transform = moved(start.T_optical_rig, own[len(LENS) :])
+        # Turned about its own centre, then shifted.
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec(own[len(LENS) : len(LENS) + 3]).as_matrix()
+        step[:3, 3] = own[len(LENS) + 3 :]
+        transform = step @ start.T_optical_rig
         return Camera(start.width, start.height, matrix, own[4:9].copy(), transform)
 
 
