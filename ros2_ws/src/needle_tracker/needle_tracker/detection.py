@@ -1,10 +1,14 @@
-"""Find the needle in one image: the best path outwards from the entry, and where it ends.
+"""Find what may be the needle in one image: paths outwards from the entry, and where they end.
 
-A centre-surround filter turns a thin dark line into a bright ridge. Dynamic programming over the
-polar search grid finds the path with the largest sum of (ridge - threshold): evidence adds up
-along the needle and is used up beyond its end, so that the maximum is at the tip, short gaps are
-bridged, and nothing that is not joined to the entry is followed.
+A centre-surround filter turns a thin line into a ridge. Dynamic programming over the polar search
+grid finds the paths with the largest sum of (ridge - threshold): evidence adds up along the needle
+and is used up beyond its end, so that the maximum is at the tip, short gaps are bridged, and
+nothing that is not joined to the entry is followed. Several paths are returned, each in a direction
+of its own: which one is the needle, two views decide together.
 """
+
+# Compiled functions take plain numbers, one by one.
+# ruff: noqa: PLR0917
 
 from __future__ import annotations
 
@@ -15,14 +19,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_common.compiled import compiled
 from needle_tracker.search_grid import SearchGrid
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 Ridge = NDArray[np.float32]
+Rows = NDArray[np.int64]
 
 _SLOPE = 1.0  # largest sideways step along a path, per step outwards (45 deg from the radius)
 _IMPOSSIBLE = np.float32(-1e6)
+_CUT_ROWS = 6
+_APART = math.radians(3.0)  # paths that end closer to each other are one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,8 +39,8 @@ class DetectionSettings:
 
     Attributes
     ----------
-    bright : bool
-        Whether the needle is brighter than what is around it.
+    bright : bool or None
+        Whether the needle is brighter than what is around it; None where that is not known.
     needle_width_px : float
         Its width in the image.
     min_contrast : float
@@ -41,42 +49,21 @@ class DetectionSettings:
         Ridge threshold in standard deviations of the ridge image's noise.
     min_length : float
         Shortest visible path that counts [m].
+    min_coverage : float
+        Least share of a path that looks like a needle.
     """
 
-    bright: bool = False
+    bright: bool | None = None
     needle_width_px: float = 4.6
     min_contrast: float = 10.0
     noise_factor: float = 5.0
     min_length: float = 2.0e-3
-
-
-@dataclasses.dataclass(frozen=True)
-class Window:
-    """The part of a search grid that a prediction leaves.
-
-    Attributes
-    ----------
-    first_row, last_row : int
-        Rows to search, inclusive.
-    start_column : int
-        Column in which the path starts, in `first_row`; -1 for any.
-    start_half_width : int
-        Tolerance of `start_column`.
-    lowest_column, highest_column : int
-        Columns to search, inclusive.
-    """
-
-    first_row: int
-    last_row: int
-    start_column: int
-    start_half_width: int
-    lowest_column: int
-    highest_column: int
+    min_coverage: float = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
 class Path:
-    """A needle's path in one image, from the entry's side to the tip.
+    """A path in one image, from the entry's side to where it may end.
 
     Attributes
     ----------
@@ -86,25 +73,52 @@ class Path:
         The same in the image, good to about one cell [px].
     contrast : float
         Median ridge along the path [grey levels].
+    bright : bool
+        Whether it is brighter than what is around it.
+    coverage : float
+        Share of it that looks like a needle.
+    evidence : float
+        Sum along it, in units of the threshold.
     """
 
-    rows: NDArray[np.intp]
-    columns: NDArray[np.intp]
+    rows: Rows
+    columns: Rows
     pixels: Array
     contrast: float
+    bright: bool = False
+    coverage: float = 1.0
+    evidence: float = 0.0
 
 
-def full_window(grid: SearchGrid, last_row: int | None = None) -> Window:
-    """Return the window of the whole grid (up to `last_row`)."""
-    rows = len(grid.distances) - 1
-    last = rows if last_row is None else min(last_row, rows)
-    return Window(0, last, -1, 0, 0, len(grid.angles) - 1)
+def cut_path(path: Path, grid: SearchGrid, length: float) -> Path:
+    """Return the part of a path up to a length from the entry [m], measured in the plane x = 0."""
+    distance = grid.distances[path.rows]
+    angle = grid.angles[path.columns]
+    # Over a few rows at once: cells make steps.
+    places = np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)[::_CUT_ROWS]
+    steps = np.linalg.norm(np.diff(places, axis=0, prepend=np.zeros((1, 2))), axis=1)
+    run = np.interp(np.arange(len(distance)), np.arange(len(steps)) * _CUT_ROWS, np.cumsum(steps))
+    run[(len(steps) - 1) * _CUT_ROWS :] += (
+        distance[(len(steps) - 1) * _CUT_ROWS :] - distance[(len(steps) - 1) * _CUT_ROWS]
+    )
+    count = max(int(np.searchsorted(run, length)), 2)
+    return dataclasses.replace(
+        path,
+        rows=path.rows[:count],
+        columns=path.columns[:count],
+        pixels=path.pixels[:count],
+    )
 
 
-def find_path(
-    image: Image, grid: SearchGrid, window: Window, settings: DetectionSettings
-) -> Path | None:
-    """Return the needle's path within a window of the search grid.
+def find_paths(
+    image: Image,
+    grid: SearchGrid,
+    settings: DetectionSettings,
+    *,
+    ends: tuple[int, int] | None = None,
+    count: int = 4,
+) -> list[Path]:
+    """Return paths that may be the needle.
 
     Parameters
     ----------
@@ -112,78 +126,89 @@ def find_path(
         The camera's image.
     grid : SearchGrid
         The camera's grid.
-    window : Window
-        Where to look.
     settings : DetectionSettings
         How the needle looks.
+    ends : pair of int, optional
+        First and last row in which a path may end; any by default.
+    count : int
+        Most paths for either polarity.
 
     Returns
     -------
-    Path or None
-        None where nothing in the window looks like a needle.
+    list of Path
+        Those with the most evidence first; empty where nothing looks like a needle.
     """
-    rows = slice(window.first_row, window.last_row + 1)
-    columns = slice(window.lowest_column, window.highest_column + 1)
-    reachable = grid.reachable[rows, columns]
-    if reachable.shape[0] < 2 or not reachable.any():
-        return None
-    pixels = grid.pixels[rows, columns]
-    ridge = _sampled_ridge(image, pixels, reachable, settings)
+    first_end, last_end = (0, len(grid.distances) - 1) if ends is None else ends
+    last_end = min(last_end, len(grid.distances) - 1)
+    first_end = max(min(first_end, last_end), 1)
+    rows = last_end + 1
+    reachable = grid.reachable[:rows]
+    if rows < 2 or not reachable.any():
+        return []
+    ridge = _sampled_ridge(image, grid, rows, settings)
     noise = _noise(ridge[reachable])
     # The filter passes about half of a line's contrast.
-    threshold = np.float32(max(settings.noise_factor * noise, 0.5 * settings.min_contrast))
-    evidence = np.clip(ridge - threshold, -threshold, 2.0 * threshold)
-    evidence = np.where(reachable, evidence, -threshold).astype(np.float32)
+    threshold = max(settings.noise_factor * noise, 0.5 * settings.min_contrast)
     steps = np.maximum(
-        1,
-        np.ceil(_SLOPE * grid.row_pitch / (grid.distances[rows] * grid.angle_pitch)).astype(int),
-    )
-    start = None
-    if window.start_column >= 0:
-        centre = window.start_column - window.lowest_column
-        start = (centre - window.start_half_width, centre + window.start_half_width)
-    cells = _best_path(evidence, steps, start)
-    if cells is None:
-        return None
-    path_rows, path_columns = cells
-    if len(path_rows) * grid.row_pitch < settings.min_length:
-        return None
-    contrast = float(np.median(ridge[path_rows, path_columns]))
-    if contrast < threshold:
-        return None
-    return Path(
-        path_rows + window.first_row,
-        path_columns + window.lowest_column,
-        pixels[path_rows, path_columns].astype(np.float64),
-        contrast,
-    )
+        1, np.ceil(_SLOPE * grid.row_pitch / (grid.distances[:rows] * grid.angle_pitch))
+    ).astype(np.int64)
+    apart = max(round(_APART / grid.angle_pitch), 1)
+    least = max(int(settings.min_length / grid.row_pitch), 2)
+    found = []
+    for bright in (False, True) if settings.bright is None else (settings.bright,):
+        sign = np.float32(1.0 if bright else -1.0)
+        cells, lengths, sums = _best_paths(
+            ridge, reachable, steps, sign, np.float32(threshold), first_end, count, apart
+        )
+        for path_columns, end_row, evidence in zip(cells, lengths, sums, strict=True):
+            if end_row + 1 < least:
+                continue
+            path_rows = np.arange(end_row + 1)
+            columns = path_columns[: end_row + 1]
+            values = sign * ridge[path_rows, columns]
+            coverage = float(np.mean(values > threshold))
+            contrast = float(np.median(values))
+            if coverage < settings.min_coverage or contrast < threshold:
+                continue
+            pixels = grid.pixels[path_rows, columns].astype(np.float64)
+            found.append(
+                Path(path_rows, columns, pixels, contrast, bright, coverage, float(evidence))
+            )
+    return sorted(found, key=lambda path: -path.evidence)
 
 
-def _sampled_ridge(
-    image: Image, pixels: NDArray[np.float32], reachable: NDArray[np.bool_], s: DetectionSettings
-) -> Ridge:
-    """Return the ridge image at half resolution, sampled at the grid's pixels."""
-    seen = pixels[reachable]
-    margin = 8.0 * s.needle_width_px
-    height, width = image.shape
-    # Even corners, so that the half-size grid is the same for every window.
-    x0 = 2 * int(max(0.0, float(seen[:, 0].min()) - margin) // 2)
-    y0 = 2 * int(max(0.0, float(seen[:, 1].min()) - margin) // 2)
-    x1 = int(min(width, float(seen[:, 0].max()) + margin + 1))
-    y1 = int(min(height, float(seen[:, 1].max()) + margin + 1))
+def _sampled_ridge(image: Image, grid: SearchGrid, rows: int, s: DetectionSettings) -> Ridge:
+    """Return what is brighter than its surroundings, at half resolution, on the grid's cells."""
+    x0, y0, x1, y1 = grid.bounds(rows, 8.0 * s.needle_width_px, image.shape)
     half_size = ((x1 - x0) // 2, (y1 - y0) // 2)
     cut = image[y0 : y0 + 2 * half_size[1], x0 : x0 + 2 * half_size[0]]
     half = cv2.resize(cut, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
-    near = cv2.GaussianBlur(half, (0, 0), 0.2 * s.needle_width_px)
+    near = cv2.GaussianBlur(half, (0, 0), max(0.2 * s.needle_width_px, 0.5))
     size = 2 * round(1.4 * s.needle_width_px) + 1
-    around = cv2.blur(half, (size, size))
-    ridge = near - around if s.bright else around - near
+    ridge = np.subtract(near, cv2.blur(half, (size, size)), out=near)
     # Pixel centres: the half-size pixel i covers the pixels 2 i and 2 i + 1.
-    map_x = (pixels[..., 0] - np.float32(x0 + 0.5)) * np.float32(0.5)
-    map_y = (pixels[..., 1] - np.float32(y0 + 0.5)) * np.float32(0.5)
-    return np.asarray(
-        cv2.remap(ridge, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    )
+    return _sampled(ridge, grid.pixels[:rows], grid.reachable[:rows], x0 + 0.5, y0 + 0.5)
+
+
+@compiled
+def _sampled(
+    ridge: Ridge, pixels: NDArray[np.float32], reachable: NDArray[np.bool_], x0: float, y0: float
+) -> Ridge:
+    rows, columns = reachable.shape
+    height, width = ridge.shape
+    values = np.zeros((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if not reachable[i, j]:
+                continue
+            x = min(max(0.5 * (pixels[i, j, 0] - x0), 0.0), width - 1.001)
+            y = min(max(0.5 * (pixels[i, j, 1] - y0), 0.0), height - 1.001)
+            column, row = int(x), int(y)
+            a, b = x - column, y - row
+            above = (1.0 - a) * ridge[row, column] + a * ridge[row, column + 1]
+            below = (1.0 - a) * ridge[row + 1, column] + a * ridge[row + 1, column + 1]
+            values[i, j] = (1.0 - b) * above + b * below
+    return values
 
 
 def _noise(values: NDArray[np.float32]) -> float:
@@ -192,47 +217,59 @@ def _noise(values: NDArray[np.float32]) -> float:
     return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
 
 
-def _best_path(
-    evidence: Ridge, steps: NDArray[np.int_], start: tuple[int, int] | None
-) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-    """Return rows and columns of the path with the most evidence, None if no sum is positive.
+@compiled
+def _best_paths(
+    ridge: Ridge,
+    reachable: NDArray[np.bool_],
+    steps: Rows,
+    sign: np.float32,
+    threshold: np.float32,
+    first_end: int,
+    count: int,
+    apart: int,
+) -> tuple[Rows, Rows, Array]:
+    """Return columns (count, rows), end rows and sums of the paths with the most evidence.
 
-    The path starts in the first row (within `start`, if given), may end in any row and moves at
-    most `steps[row]` columns sideways from a row to the next.
+    A path starts in the first row, ends in `first_end` or later and moves at most `steps[row]`
+    columns sideways from a row to the next. Ends are more than `apart` columns from each other.
     """
-    rows, columns = evidence.shape
-    total = np.empty_like(evidence)
-    total[0] = evidence[0]
-    if start is not None:
-        low, high = max(start[0], 0), min(start[1], columns - 1)
-        allowed = np.zeros(columns, dtype=bool)
-        allowed[low : high + 1] = True
-        total[0, ~allowed] = _IMPOSSIBLE
-    for row in range(1, rows):
-        width = 2 * int(steps[row]) + 1
-        best = cv2.dilate(
-            total[row - 1 : row],
-            np.ones((1, width), np.uint8),
-            borderType=cv2.BORDER_CONSTANT,
-            borderValue=float(_IMPOSSIBLE),
-        )
-        total[row] = best.reshape(-1) + evidence[row]
-    end_row, column = (int(i) for i in np.unravel_index(int(np.argmax(total)), total.shape))
-    if not total[end_row, column] > 0.0:
-        return None
-    path = np.empty(end_row + 1, dtype=np.intp)
-    path[end_row] = column
-    for row in range(end_row, 0, -1):
-        step = int(steps[row])
-        low = max(column - step, 0)
-        before = total[row - 1, low : column + step + 1]
-        # Of equals the straightest: a flat stretch must not pull the path to one side.
-        ties = np.flatnonzero(before == before.max()) + low
-        column = int(ties[np.argmin(np.abs(ties - column))])
-        path[row - 1] = column
-    return np.arange(end_row + 1, dtype=np.intp), path
-
-
-def columns_within(grid: SearchGrid, distance: float, half_width: float) -> int:
-    """Return how many columns a lateral width [m] covers at a distance from the entry [m]."""
-    return math.ceil(half_width / (max(distance, 1e-3) * grid.angle_pitch))
+    rows, columns = ridge.shape
+    total = np.empty((rows, columns), np.float32)
+    best_end = np.full(columns, _IMPOSSIBLE, np.float32)
+    end_row = np.zeros(columns, np.int64)
+    for i in range(rows):
+        step = steps[i]
+        for j in range(columns):
+            value = -threshold
+            if reachable[i, j]:
+                value = min(max(sign * ridge[i, j] - threshold, -threshold), 2.0 * threshold)
+            if i:
+                best = _IMPOSSIBLE
+                for k in range(max(j - step, 0), min(j + step, columns - 1) + 1):
+                    best = max(best, total[i - 1, k])
+                value += best
+            total[i, j] = value
+            if i >= first_end and value > best_end[j]:
+                best_end[j] = value
+                end_row[j] = i
+    cells = np.zeros((count, rows), np.int64)
+    lengths = np.zeros(count, np.int64)
+    sums = np.zeros(count)
+    for n in range(count):
+        column = int(np.argmax(best_end))
+        if not best_end[column] > 0.0:
+            break
+        sums[n] = best_end[column] / threshold
+        lengths[n] = end_row[column]
+        best_end[max(column - apart, 0) : column + apart + 1] = _IMPOSSIBLE
+        cells[n, lengths[n]] = column
+        for i in range(lengths[n], 0, -1):
+            # Of equals the straightest: a flat stretch must not pull the path to one side.
+            chosen, best = column, total[i - 1, column]
+            for away in range(1, steps[i] + 1):
+                for k in (column - away, column + away):
+                    if 0 <= k < columns and total[i - 1, k] > best:
+                        chosen, best = k, total[i - 1, k]
+            column = chosen
+            cells[n, i - 1] = column
+    return cells, lengths, sums

@@ -53,10 +53,10 @@ class StereoTrackerParameters:
         read_only=True,
     )
     needle_polarity: str = parameter(
-        "dark",
+        "auto",
         unit="-",
-        description="Whether the needle is darker or brighter than what is around it.",
-        choices=("dark", "bright"),
+        description="Whether the needle is darker or brighter than what is around it; auto: found.",
+        choices=("auto", "dark", "bright"),
         read_only=True,
     )
     min_contrast: float = parameter(
@@ -140,9 +140,9 @@ class StereoTrackerParameters:
         read_only=True,
     )
     step_margin: float = parameter(
-        1.5e-3,
+        1.0e-3,
         unit="m",
-        description="Tolerance of the tip's move against the insertion since the last tip.",
+        description="Tolerance of the tip against where the last tip and the insertion have it.",
         lower=0.1e-3,
         upper=0.05,
         read_only=True,
@@ -231,7 +231,7 @@ class StereoTrackerParameters:
             free_step=self.free_step,
             max_disagreement=self.max_disagreement,
             max_miss_px=1.0,
-            max_depth_sigma=2e-3,
+            max_depth_sigma=1e-3,
             confirm_pairs=self.confirm_pairs,
             lost_after=self.lost_after,
             forget_after=self.forget_after,
@@ -239,7 +239,7 @@ class StereoTrackerParameters:
         return TrackerSettings(
             gates=gates,
             needle_width=self.needle_width,
-            bright=self.needle_polarity == "bright",
+            bright=None if self.needle_polarity == "auto" else self.needle_polarity == "bright",
             min_contrast=self.min_contrast,
             noise_factor=self.noise_factor,
             entry_zone=self.entry_zone,

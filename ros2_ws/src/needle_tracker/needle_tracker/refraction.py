@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.calibration import Camera, Phantom
 from needle_tracker.camera_model import optical_rays, project_optical
+from needle_tracker.compiled_projection import pack_camera
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,7 @@ class RefractedCamera:
         self._rotation = camera.T_optical_rig[:3, :3]
         self._translation = camera.T_optical_rig[:3, 3]
         self._camera_height = float(self._centre[0]) - phantom.surface_height
+        self.packed = pack_camera(camera, phantom)
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
         """Return the refracted rays, in the phantom, that pixels look along.

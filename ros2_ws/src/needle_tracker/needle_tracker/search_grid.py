@@ -66,12 +66,15 @@ class SearchGrid:
         Where the camera sees the grid's points.
     reachable : ndarray, shape (rows, columns)
         Whether the needle can be there and the camera sees it.
+    pixel_bounds : ndarray, shape (rows, 2, 2), float32
+        Least and largest pixel coordinates of the reachable cells up to each row.
     """
 
     distances: Array
     angles: Array
     pixels: NDArray[np.float32]
     reachable: Mask
+    pixel_bounds: NDArray[np.float32]
 
     @property
     def row_pitch(self) -> float:
@@ -87,6 +90,34 @@ class SearchGrid:
         """Return the index of the row nearest to a distance from the entry [m]."""
         row = round((distance - float(self.distances[0])) / self.row_pitch)
         return min(max(row, 0), len(self.distances) - 1)
+
+    def bounds(
+        self, rows: int, margin_px: float, shape: tuple[int, ...]
+    ) -> tuple[int, int, int, int]:
+        """Return the part of the image that the first rows take.
+
+        Parameters
+        ----------
+        rows : int
+            How many rows.
+        margin_px : float
+            Room around them [px].
+        shape : tuple of int
+            Height and width of the image.
+
+        Returns
+        -------
+        tuple of int
+            First column and row (even, so that half-size images agree), and those after the last.
+        """
+        low, high = self.pixel_bounds[rows - 1]
+        height, width = shape[:2]
+        return (
+            2 * int(max(0.0, float(low[0]) - margin_px) // 2),
+            2 * int(max(0.0, float(low[1]) - margin_px) // 2),
+            int(min(width, float(high[0]) + margin_px + 1)),
+            int(min(height, float(high[1]) + margin_px + 1)),
+        )
 
 
 def make_search_grid(
@@ -150,9 +181,14 @@ def make_search_grid(
             & (pixels[..., 1] <= camera.height - 1 - border_px)
         )
     reachable = inside & (np.abs(angles)[None, :] <= limit[:, None])
+    pixels32 = np.nan_to_num(pixels, nan=-1e3).astype(np.float32)
+    low = np.where(reachable[..., None], pixels32, np.float32(1e9)).min(axis=1)
+    high = np.where(reachable[..., None], pixels32, np.float32(-1e9)).max(axis=1)
+    bounds = np.stack([np.minimum.accumulate(low), np.maximum.accumulate(high)], axis=1)
     return SearchGrid(
         np.asarray(distances, dtype=np.float64),
         np.asarray(angles, dtype=np.float64),
-        np.nan_to_num(pixels, nan=-1e3).astype(np.float32),
+        pixels32,
         reachable,
+        bounds,
     )

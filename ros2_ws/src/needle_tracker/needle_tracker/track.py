@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
+from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,16 @@ from needle_tracker.search_grid import Reach
 from needle_tracker.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
+
+DISAGREE_ALONG = "views disagree along the needle"
+_WAY_TIPS = 64
+_WAY_LENGTH = 2.5e-3  # long enough for a heading, short enough to follow a bend [m]
+_HEADING_TOLERANCE = 0.12  # [rad]
+_HIDDEN_PER_LOST = 4
+# Of a prediction: what moves at rest, and how well the heading is known.
+_DRIFT = 0.05e-3  # [m]
+_HEADING_SIGMA = 0.06  # [rad]
+_LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
 class TrackState(enum.Enum):
@@ -46,7 +57,7 @@ class GateSettings:
     insertion_margin : float
         Tolerance between tip and insertion [m].
     step_margin : float
-        Tolerance of a move beyond the insertion in between [m].
+        Tolerance of the tip against where the last one and the insertion have it [m].
     free_step : float
         Largest move per pair where the insertion is not known [m].
     max_disagreement : float
@@ -80,11 +91,30 @@ class GateSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Anchor:
-    """The last believed tip."""
+    """The last believed tip, or where it should be now.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        In `rig` [m].
+    direction : ndarray, shape (3,)
+        Unit vector along the visible end.
+    heading : ndarray, shape (3,)
+        Unit vector of where the tip is going: of its way so far, where there is enough.
+    insertion : float or None
+        Of that moment [m].
+    covariance : ndarray, shape (3, 3)
+        Of the position [m^2].
+    ahead : float
+        How far this is ahead of the last believed tip [m].
+    """
 
     position: Array
     direction: Array
+    heading: Array
     insertion: float | None
+    covariance: Array
+    ahead: float = 0.0
 
 
 def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) -> str | None:
@@ -111,7 +141,7 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
     # Steered ever the same way, and a little more for what the margins leave open.
     largest_turn = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
     checks = [
-        (tip.disagreement > settings.max_disagreement, "views disagree along the needle"),
+        (tip.disagreement > settings.max_disagreement, DISAGREE_ALONG),
         (tip.disagreement_across > settings.max_miss_px, "views disagree across the needle"),
         (largest_sigma > settings.max_depth_sigma, "too uncertain"),
         (tip.position[0] > settings.surface_height, "above the surface"),
@@ -151,7 +181,9 @@ class Track:
         """Forget everything."""
         self.state = TrackState.SEARCHING
         self.anchor: Anchor | None = None
+        self._way: deque[Anchor] = deque(maxlen=_WAY_TIPS)
         self._misses = 0
+        self._hidden = 0
         self._agreeing = 0
 
     def enter(self) -> None:
@@ -172,20 +204,33 @@ class Track:
         Anchor or None
             The last believed tip, moved on along its direction by the insertion since.
         """
-        if self.anchor is None or self.state is TrackState.LOST:
+        anchor = self.anchor
+        if anchor is None:
             return None
-        position = self.anchor.position
-        if insertion is not None and self.anchor.insertion is not None:
-            position = position + (insertion - self.anchor.insertion) * self.anchor.direction
-        return dataclasses.replace(self.anchor, position=position, insertion=insertion)
+        ahead = 0.0
+        if insertion is not None and anchor.insertion is not None:
+            ahead = insertion - anchor.insertion
+        position = anchor.position + ahead * anchor.heading
+        sideways = _DRIFT + _HEADING_SIGMA * abs(ahead)
+        covariance = anchor.covariance + sideways**2 * np.eye(3)
+        return dataclasses.replace(
+            anchor, position=position, insertion=insertion, covariance=covariance, ahead=ahead
+        )
 
     def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
         """Return why a measured tip is not believed, None where it passes all gates."""
         reason = refusal(tip, insertion, self._settings)
         if reason is None and self.anchor is not None:
-            move = float(np.linalg.norm(tip.position - self.anchor.position))
-            if move > self._largest_move(insertion):
-                return "too far from the last tip"
+            predicted = self.predict(insertion)
+            if predicted is not None:
+                miss = float(np.linalg.norm(tip.position - predicted.position))
+                if miss > self.tolerance(predicted):
+                    return "too far from the last tip"
+                if predicted.insertion is not None and self.state is TrackState.TRACKING:
+                    off = tip.position - predicted.position
+                    spread = predicted.covariance + tip.covariance
+                    if float(off @ np.linalg.solve(spread, off)) > _LARGEST_SURPRISE:
+                        return "too far from the prediction"
         return reason
 
     def accept(self, tip: SpatialTip, insertion: float | None) -> bool:
@@ -196,8 +241,11 @@ class Track:
             wanted = 1 if known else self._settings.confirm_pairs
             confirmed = self._agreeing >= wanted
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
-        self._misses = 0
-        self.anchor = Anchor(tip.position, tip.direction, insertion)
+        position, covariance = tip.position, tip.covariance
+        self._misses = self._hidden = 0
+        heading = self._heading(position, tip.direction, insertion)
+        self.anchor = Anchor(position, tip.direction, heading, insertion, covariance)
+        self._way.append(self.anchor)
         return self.state is TrackState.TRACKING
 
     def miss(self) -> None:
@@ -212,13 +260,51 @@ class Track:
         if self.state is TrackState.LOST and self._misses >= settings.forget_after:
             self.reset()
 
-    def _largest_move(self, insertion: float | None) -> float:
-        anchor = self.anchor
-        if anchor is None:
-            return math.inf
-        if insertion is not None and anchor.insertion is not None:
-            return abs(insertion - anchor.insertion) + self._settings.step_margin
-        return self._settings.free_step * (self._misses + 1)
+    def hide(self) -> None:
+        """Note a pair that shows the shaft where it should be, but its end in neither view."""
+        self._hidden += 1
+        if self._hidden > _HIDDEN_PER_LOST * self._settings.lost_after:
+            self.miss()
+
+    def tolerance(self, predicted: Anchor) -> float:
+        """Return how far a tip may be from where `predict` has it [m].
+
+        The needle goes the stage's way, bending at most by its largest curvature, and its heading
+        is known to a few degrees.
+        """
+        settings = self._settings
+        if predicted.insertion is None or self.anchor is None or self.anchor.insertion is None:
+            return settings.free_step * (self._misses + self._hidden + 1)
+        ahead = abs(predicted.ahead)
+        bend = 0.5 * settings.reach.curvature * ahead * ahead
+        return settings.step_margin + _HEADING_TOLERANCE * ahead + bend
+
+    def merged(self, tip: SpatialTip, insertion: float | None) -> SpatialTip:
+        """Return a tip merged with its prediction: a view that something spoils counts less.
+
+        In clear images the measurement is so much better than the prediction that it hardly moves.
+        """
+        predicted = self.predict(insertion)
+        known = predicted is not None and predicted.insertion is not None
+        if predicted is None or not known or self.state is not TrackState.TRACKING:
+            return tip
+        gain = predicted.covariance @ np.linalg.inv(predicted.covariance + tip.covariance)
+        position = predicted.position + gain @ (tip.position - predicted.position)
+        covariance = (np.eye(3) - gain) @ predicted.covariance
+        covariance = 0.5 * (covariance + covariance.T)
+        return dataclasses.replace(tip, position=position, covariance=covariance)
+
+    def _heading(self, position: Array, direction: Array, insertion: float | None) -> Array:
+        """Return the way of the last millimetres; the visible end's direction before that."""
+        if insertion is None:
+            return direction
+        for old in reversed(self._way):
+            if old.insertion is None or old.insertion > insertion:
+                break
+            if insertion - old.insertion >= _WAY_LENGTH:
+                way = position - old.position
+                return np.asarray(way / np.linalg.norm(way))
+        return direction
 
 
 def tip_at_entry(insertion: float, hole_tolerance: float, entry_angle: float) -> SpatialTip:

@@ -7,31 +7,29 @@ randomness, one thread.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import cv2
 import numpy as np
 
 from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
-from needle_tracker.detection import (
-    DetectionSettings,
-    Image,
-    Path,
-    Window,
-    columns_within,
-    find_path,
-    full_window,
-)
+from needle_tracker.compiled_projection import project_point
+from needle_tracker.detection import DetectionSettings, Image, Path, cut_path, find_paths
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach, SearchGrid, make_search_grid
-from needle_tracker.tip_fit import ImageTip, fit_tip
-from needle_tracker.track import GateSettings, Track, TrackState, tip_at_entry
+from needle_tracker.shaft import shaft_points, shaft_problem
+from needle_tracker.tip_fit import Expected, ImageTip, fit_expected, fit_tip, hidden
+from needle_tracker.track import DISAGREE_ALONG, GateSettings, Track, TrackState, tip_at_entry
 from needle_tracker.triangulation import SpatialTip, triangulate
 
-_REGION_BEHIND = 14e-3  # the region covers the pre-bend (9 mm) and some of the shaft [m]
-_REGION_AHEAD = 3e-3
-_REGION_SIDEWAYS = 3e-3
-_START_SIDEWAYS = 2e-3
+HIDDEN = "the end is hidden in both images"
+_SIDEWAYS = 0.9e-3  # the strip reaches so far beside the prediction [m] ...
+_ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma) [m]
+_FOLLOW_DIRECTLY = 6e-3  # up to here the prediction is as good as the strip is wide [m]
+_FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
+_CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
+_GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,8 +42,8 @@ class TrackerSettings:
         Bounds that a believed tip keeps.
     needle_width : float
         Diameter of the needle [m].
-    bright : bool
-        Whether it is brighter than its surroundings.
+    bright : bool or None
+        Whether it is brighter than its surroundings; None: found out.
     min_contrast : float
         Least contrast [grey levels].
     noise_factor : float
@@ -58,7 +56,7 @@ class TrackerSettings:
 
     gates: GateSettings
     needle_width: float
-    bright: bool
+    bright: bool | None
     min_contrast: float
     noise_factor: float
     entry_zone: float
@@ -85,11 +83,11 @@ def default_settings(phantom: Phantom) -> TrackerSettings:
         least_distance=hole_clearance + 1.5e-3,
         tip_lean=0.21,
         insertion_margin=2.0e-3,
-        step_margin=1.5e-3,
+        step_margin=1.0e-3,
         free_step=5.0e-3,
         max_disagreement=1.5e-3,
         max_miss_px=1.0,
-        max_depth_sigma=2e-3,
+        max_depth_sigma=1e-3,
         confirm_pairs=3,
         lost_after=3,
         forget_after=30,
@@ -97,7 +95,7 @@ def default_settings(phantom: Phantom) -> TrackerSettings:
     return TrackerSettings(
         gates=gates,
         needle_width=0.7e-3,
-        bright=False,
+        bright=None,
         min_contrast=10.0,
         noise_factor=5.0,
         entry_zone=4.5e-3,
@@ -119,15 +117,12 @@ class Measurement:
         Why there is no believed tip; empty where there is one.
     image_tips : pair of (ImageTip or None)
         What was found in the left and the right image, believed or not.
-    paths : pair of (Path or None)
-        Coarse paths behind `image_tips`.
     """
 
     tip: SpatialTip | None
     state: TrackState
     reason: str
     image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
-    paths: tuple[Path | None, Path | None] = (None, None)
 
 
 class StereoTracker:
@@ -152,14 +147,15 @@ class StereoTracker:
         )
         self.grids = (self._grid(self.views[0]), self._grid(self.views[1]))
         self._detection = (self._look(self.views[0]), self._look(self.views[1]))
+        self._entries = tuple(view.project(np.zeros(3)) for view in self.views)
         self._shapes = tuple((camera.height, camera.width) for camera in cameras)
         self.track = Track(settings.gates)
-        self._paths: tuple[Path, Path] | None = None
+        self._last: tuple[ImageTip, ImageTip] | None = None
 
     def reset(self) -> None:
         """Forget the track."""
         self.track.reset()
-        self._paths = None
+        self._last = None
 
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair.
@@ -189,7 +185,7 @@ class StereoTracker:
             if int(image[::8, ::8].max()) < self.settings.min_contrast:
                 return self.skip(f"{side} image is black")
         if insertion is not None and insertion < self.settings.entry_zone:
-            self._paths = None
+            self._last = None
             self.track.enter()
             tip = tip_at_entry(
                 insertion,
@@ -197,20 +193,23 @@ class StereoTracker:
                 self.settings.gates.reach.entry_angle,
             )
             return Measurement(tip, self.track.state, "")
-        windows = self._region(insertion)
-        measured = None
-        if windows is not None:
-            measured = self._measure(images, windows, insertion)
-        if measured is None or measured.tip is None:
-            measured = self._measure(images, self._everywhere(insertion), insertion)
+        measured = self._follow(images, insertion)
+        if measured is None:
+            measured = self._acquire(images, insertion)
         if measured.tip is None:
-            self._paths = None if self.track.state is not TrackState.TRACKING else self._paths
-            self.track.miss()
+            if measured.reason == HIDDEN:
+                self.track.hide()
+            else:
+                self.track.miss()
+            if self.track.anchor is None:
+                self._last = None
             return dataclasses.replace(measured, state=self.track.state)
-        believed = self.track.accept(measured.tip, insertion)
-        found = measured.paths
-        if found[0] is not None and found[1] is not None:
-            self._paths = (found[0], found[1])
+        merged = self.track.merged(measured.tip, insertion)
+        measured = dataclasses.replace(measured, tip=merged)
+        believed = self.track.accept(merged, insertion)
+        left_tip, right_tip = measured.image_tips
+        if left_tip is not None and right_tip is not None:
+            self._last = (left_tip, right_tip)
         if not believed:
             return dataclasses.replace(
                 measured, tip=None, state=self.track.state, reason="not confirmed yet"
@@ -222,76 +221,113 @@ class StereoTracker:
         self.track.miss()
         return Measurement(None, self.track.state, reason)
 
-    def _measure(
-        self, images: tuple[Image, Image], windows: tuple[Window, Window], insertion: float | None
-    ) -> Measurement:
-        tips: list[ImageTip | None] = [None, None]
-        paths: list[Path | None] = [None, None]
+    def _follow(self, images: tuple[Image, Image], insertion: float | None) -> Measurement | None:
+        """Look where the tip should be; None where that is not known or nothing is seen there."""
+        predicted = self.track.predict(insertion)
+        last = self._last
+        if predicted is None or last is None or abs(predicted.ahead) > _FOLLOW_AHEAD:
+            return None
+        known = predicted.insertion is not None and insertion is not None
+        loose = 0.1 * abs(predicted.ahead)
+        tips: list[ImageTip] = []
+        for i in range(2):
+            point = np.empty(2)
+            project_point(self.views[i].packed, predicted.position, point)
+            scale = self._detection[i].needle_width_px / self.settings.needle_width
+            if not math.isfinite(point[0]):
+                return None
+            room = math.dist(point, self._entries[i]) - self.settings.hole_clearance * scale
+            expected = Expected(
+                point,
+                last[i].direction,
+                room,
+                round(min(max((_SIDEWAYS + loose) * scale, 6.0), 20.0)),
+                (_ALONG + loose) * scale if known else 0.0,
+                last[i].contrast,
+            )
+            tip = None
+            if known and abs(predicted.ahead) < _FOLLOW_DIRECTLY:
+                on_line = dataclasses.replace(expected, search=0)
+                tip = fit_expected(images[i], on_line, last[i].bright, self._detection[i])
+            if tip is None:
+                tip = fit_expected(images[i], expected, last[i].bright, self._detection[i])
+            if tip is None:
+                return None
+            tips.append(tip)
+        found = (tips[0], tips[1])
+        if not (found[0].clear or found[1].clear):
+            return Measurement(None, self.track.state, HIDDEN, found)
+        measured = self._judged(found, insertion)
+        return measured if measured.tip is not None else None
+
+    def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
+        """Look everywhere that can be reached (with this insertion, where known)."""
+        state = self.track.state
+        candidates: list[list[tuple[Path, ImageTip]]] = []
         reason = ""
         for i, side in enumerate(SIDES):
-            path = find_path(images[i], self.grids[i], windows[i], self._detection[i])
-            paths[i] = path
-            if path is None:
-                reason = reason or f"no needle in the {side} image"
-                continue
-            tips[i] = fit_tip(images[i], path, self._detection[i])
-            if tips[i] is None:
-                reason = reason or f"no clear tip in the {side} image"
-        found = (tips[0], tips[1])
-        routes = (paths[0], paths[1])
-        state = self.track.state
-        if found[0] is None or found[1] is None:
-            return Measurement(None, state, reason, found, routes)
-        tip = triangulate(self.views, (found[0], found[1]))
-        if tip is None:
-            return Measurement(None, state, "views do not meet", found, routes)
-        refused = self.track.judge(tip, insertion)
-        if refused is not None:
-            return Measurement(None, state, refused, found, routes)
-        return Measurement(tip, state, "", found, routes)
-
-    def _everywhere(self, insertion: float | None) -> tuple[Window, Window]:
-        """Windows of all that can be reached (with this insertion, where known)."""
-        windows = []
-        for grid in self.grids:
-            last = None
+            look = self._detection[i]
+            if self._last is not None and look.bright is None:
+                look = dataclasses.replace(look, bright=self._last[i].bright)
+            paths = find_paths(images[i], self.grids[i], look, ends=self._ends(i, insertion))
+            sigma = 0.0
             if insertion is not None:
-                last = grid.row_of(insertion + self.settings.gates.insertion_margin + 3e-3)
-            windows.append(full_window(grid, last))
-        return windows[0], windows[1]
+                paths = [cut_path(path, self.grids[i], insertion) for path in paths]
+                scale = look.needle_width_px / self.settings.needle_width
+                sigma = _CUT * scale
+            fitted = [(path, fit_tip(images[i], path, look, sigma)) for path in paths]
+            candidates.append([(path, tip) for path, tip in fitted if tip is not None])
+            if not paths:
+                reason = reason or f"no needle in the {side} image"
+            elif not candidates[-1]:
+                reason = reason or f"no clear tip in the {side} image"
+        if reason:
+            return Measurement(None, state, reason)
+        pairs = sorted(
+            itertools.product(*candidates),
+            key=lambda pair: -pair[0][0].evidence - pair[1][0].evidence,
+        )
+        first: Measurement | None = None
+        for (left_path, left), (right_path, right) in pairs:
+            if left_path.bright is not right_path.bright or not (left.clear or right.clear):
+                continue
+            measured = self._judged((left, right), insertion)
+            if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
+                measured = self._one_sided((left, right), insertion) or measured
+            if measured.tip is not None:
+                points = shaft_points(self.views, (left_path, right_path), measured.tip.position)
+                gates = self.settings.gates
+                problem = shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
+                if problem is None:
+                    return measured
+                measured = dataclasses.replace(measured, tip=None, reason=problem)
+            first = first or measured
+        return first or Measurement(None, state, "views do not meet")
 
-    def _region(self, insertion: float | None) -> tuple[Window, Window] | None:
-        """Windows around the predicted tip, None without a prediction."""
-        predicted = self.track.predict(insertion)
-        if predicted is None or self._paths is None:
+    def _one_sided(self, found: tuple[ImageTip, ImageTip], insertion: float) -> Measurement | None:
+        """Believe the one end of two that fits the track; None where none or both do."""
+        left, right = found
+        sides = [(left, hidden(right)), (hidden(left), right)]
+        measured = [self._judged(side, insertion) for side in sides]
+        fitting = [m for m in measured if m.tip is not None]
+        return fitting[0] if len(fitting) == 1 else None
+
+    def _judged(self, found: tuple[ImageTip, ImageTip], insertion: float | None) -> Measurement:
+        state = self.track.state
+        tip = triangulate(self.views, found)
+        if tip is None:
+            return Measurement(None, state, "views do not meet", found)
+        refused = self.track.judge(tip, insertion)
+        return Measurement(tip if refused is None else None, state, refused or "", found)
+
+    def _ends(self, i: int, insertion: float | None) -> tuple[int, int] | None:
+        """Return the rows of a grid in which the needle can end, None for all."""
+        if insertion is None:
             return None
-        windows = []
-        for view, grid, path in zip(self.views, self.grids, self._paths, strict=True):
-            # Where the camera sees the predicted tip, in the plane of the grid.
-            origin, direction = view.rays(view.project(predicted.position))
-            if not np.all(np.isfinite(direction)):
-                return None
-            seen = origin - direction * (origin[0] / direction[0])
-            distance = math.hypot(float(seen[1]), float(seen[2]))
-            first = max(grid.row_of(distance - _REGION_BEHIND), int(path.rows[0]))
-            last = grid.row_of(distance + _REGION_AHEAD)
-            if first >= int(path.rows[-1]) or last - first < 4:
-                return None
-            body = path.columns[int(np.searchsorted(path.rows, first)) :]
-            angle = math.atan2(float(seen[1]), float(seen[2]))
-            column = round((angle - float(grid.angles[0])) / grid.angle_pitch)
-            room = columns_within(grid, float(grid.distances[first]), _REGION_SIDEWAYS)
-            windows.append(
-                Window(
-                    first,
-                    last,
-                    int(body[0]),
-                    columns_within(grid, float(grid.distances[first]), _START_SIDEWAYS),
-                    max(min(int(body.min()), column) - room, 0),
-                    min(max(int(body.max()), column) + room, len(grid.angles) - 1),
-                )
-            )
-        return windows[0], windows[1]
+        gates, grid = self.settings.gates, self.grids[i]
+        room = gates.insertion_margin + _GRID_MARGIN
+        shortest = gates.reach.shortest_chord(insertion)
+        return grid.row_of(shortest - room), grid.row_of(insertion + room)
 
     def _grid(self, view: RefractedCamera) -> SearchGrid:
         return make_search_grid(

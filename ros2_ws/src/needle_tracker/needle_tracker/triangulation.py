@@ -12,6 +12,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.compiled_projection import solve_position
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.tip_fit import ImageTip
 
@@ -102,25 +103,18 @@ def triangulate(
         np.stack([[-tip.direction[1], tip.direction[0]], tip.direction]) for tip in tips
     ]  # rows: across, along
     sigmas = np.array([s for tip in tips for s in (tip.sigma_across, tip.sigma_along)])
-    for _ in range(_ITERATIONS):
-        jacobians = [view.jacobian(position) for view in views]
-        rows = np.concatenate([axis @ j for axis, j in zip(axes, jacobians, strict=True)])
-        residual = np.concatenate(
-            [
-                axis @ (tip.point - view.project(position))
-                for axis, tip, view in zip(axes, tips, views, strict=True)
-            ]
-        )
-        weighted = rows / sigmas[:, None]
-        normal = weighted.T @ weighted
-        if not np.all(np.isfinite(normal)) or np.linalg.cond(normal) > 1e12:
-            return None
-        step = np.linalg.solve(normal, weighted.T @ (residual / sigmas))
-        position = position + step
-        if float(np.abs(step).max()) < 1e-10:
-            break
-    else:
+    position = np.array(position)
+    converged, normal, residual, found = solve_position(
+        np.stack([view.packed for view in views]),
+        np.stack([tip.point for tip in tips]),
+        np.stack(axes),
+        sigmas,
+        position,
+        _ITERATIONS,
+    )
+    if not converged:
         return None
+    jacobians = [found[0], found[1]]
     heading = _shaft_direction(jacobians, axes, [tip.sigma_angle for tip in tips])
     if heading is None:
         return None
@@ -129,10 +123,13 @@ def triangulate(
         return None
     # Residual along the shaft in the images, as lengths along the shaft in space.
     scales = [float(axis[1] @ j @ direction) for axis, j in zip(axes, jacobians, strict=True)]
-    along = abs(residual[1] / scales[0] - residual[3] / scales[1])
+    # An end that only one camera sees has nothing to disagree with.
+    along = 0.0
+    if tips[0].clear and tips[1].clear:
+        along = abs(residual[1] / scales[0] - residual[3] / scales[1])
     return SpatialTip(
         position,
-        np.linalg.inv(normal),
+        np.asarray(np.linalg.inv(normal), dtype=np.float64),
         direction,
         direction_covariance,
         float(along),

@@ -14,12 +14,14 @@ from needle_tracker.tip_fit import fit_tip
 SETTINGS = DetectionSettings()
 
 
-def coarse_path(start: np.ndarray, end: np.ndarray, offset: np.ndarray) -> Path:
+def coarse_path(
+    start: np.ndarray, end: np.ndarray, offset: np.ndarray, bright: bool = False
+) -> Path:
     steps = np.arange(0.0, float(np.linalg.norm(end - start)), 3.3)
     direction = (end - start) / np.linalg.norm(end - start)
     pixels = start + steps[:, None] * direction + offset
     cells = np.arange(len(steps))
-    return Path(cells, cells, pixels, 50.0)
+    return Path(cells, cells, pixels, 50.0, bright)
 
 
 @pytest.mark.parametrize("bright", [False, True])
@@ -28,7 +30,6 @@ def test_end_and_direction_to_a_fraction_of_a_pixel(
     make_line: Callable[..., np.ndarray], angle_deg: float, bright: bool
 ) -> None:
     rng = np.random.default_rng(int(angle_deg) + 100)
-    settings = DetectionSettings(bright=bright)
     along, across = [], []
     for _ in range(12):
         direction = np.array([math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))])
@@ -37,8 +38,9 @@ def test_end_and_direction_to_a_fraction_of_a_pixel(
         image = make_line((300, 300), np.stack([start, end]), 4.6, 60.0 + 120 * bright, 120.0)
         image += np.linspace(0.0, 40.0, 300)[None, :] + rng.normal(0.0, 4.0, image.shape)
         noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
-        path = coarse_path(start, end + rng.uniform(-6, 6) * direction, rng.uniform(-1.5, 1.5, 2))
-        tip = fit_tip(noisy, path, settings)
+        about = end + rng.uniform(-6, 6) * direction
+        path = coarse_path(start, about, rng.uniform(-1.5, 1.5, 2), bright)
+        tip = fit_tip(noisy, path, SETTINGS)
         assert tip is not None
         error = tip.point - end
         along.append(error @ direction)
