@@ -17,6 +17,9 @@ from needle_common.errors import UserError
 RIG_FILE = "config/rig.yaml"
 NODES = ("recorder", "sim_rig", "stereo_tracker", "plane_controller", "operator")
 
+# A sensor without noise still has this bound for the controllers' design [m].
+SMALLEST_NOISE = 1e-5
+
 # Parameter that simulate sets -> the option that it comes from.
 OPTIONS = {
     "level": "--level",
@@ -28,6 +31,8 @@ OPTIONS = {
     "torsion_lag": "--lag-mm",
     "real_time_factor": "--real-time-factor",
     "tip_noise": "--noise-mm",
+    "tip_noise_bound": "--noise-mm",
+    "measurement_std": "--noise-mm",
     "bag": "--bag",
     "preset": "--controller",
     "depth": "--depth-mm",
@@ -120,6 +125,12 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         },
         "operator": {},
     }
+    if options.noise_mm is not None:
+        # The sensor's own data sheet: the controllers know how far off a tip can be.
+        bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
+        parameters["plane_controller"]["tip_noise"] = "bounded"
+        parameters["plane_controller"]["tip_noise_bound"] = bound
+        parameters["plane_controller"]["measurement_std"] = bound / math.sqrt(3.0)
     for node, values in parameters.items():
         values["use_sim_time"] = node != "recorder"
     return {node: parameters[node] for node in nodes_of(options)}

@@ -23,7 +23,7 @@ the nodes' logs.
 EPILOG = """\
 examples:
   scripts/simulate
-      camera images, the paper's controller, start 3 mm beside the plane, 120 mm deep
+      camera images, controller best, start 3 mm beside the plane, 120 mm deep
   scripts/simulate --level tip --seed 7
       no images: the tip is measured with the paper's +-1 mm noise; quicker
   scripts/simulate --controller open_loop --level tip --noise-mm 0
@@ -40,8 +40,7 @@ missing, 130 interrupted.
 
 LEVELS = ("tip", "camera")
 LATER_LEVELS = ("drive",)
-CONTROLLERS = ("paper", "open_loop")
-LATER_CONTROLLERS = ("best",)
+CONTROLLERS = ("best", "paper", "open_loop")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,7 +48,7 @@ class SimulateOptions:
     """What one run of `simulate` was asked for; mm and degrees, as the user writes them."""
 
     level: str = "camera"
-    controller: str = "paper"
+    controller: str = "best"
     initial_x_mm: float = -3.0
     initial_pitch_deg: float = 2.0
     initial_roll_deg: float = 15.0
@@ -79,7 +78,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     """
     given = _parser().parse_args(_join_initial(arguments))
     _one_of("--level", given.level, LEVELS, LATER_LEVELS)
-    _one_of("--controller", given.controller, CONTROLLERS, LATER_CONTROLLERS)
+    _one_of("--controller", given.controller, CONTROLLERS, ())
     noise = None
     if given.level == "tip":
         noise = _number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
@@ -123,9 +122,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     add(
         "--controller",
-        default="paper",
+        default="best",
         metavar="paper|best|open_loop",
-        help="how the needle is turned (default: paper; best comes later)",
+        help="how the needle is turned: as in the paper, by the best controller known here, or not "
+        "at all (default: best)",
     )
     add(
         "--initial",

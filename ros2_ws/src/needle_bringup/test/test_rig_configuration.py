@@ -80,3 +80,14 @@ def test_every_yaml_of_the_package_parses() -> None:
     folder = Path(__file__).parents[1] / "config"
     for path in folder.glob("*.yaml"):
         assert yaml.safe_load(path.read_text())
+
+
+def test_the_controller_knows_the_sensor_of_its_level() -> None:
+    tip = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.5), Path("bag"))
+    assert tip["plane_controller"]["tip_noise"] == "bounded"
+    assert tip["plane_controller"]["tip_noise_bound"] == pytest.approx(0.0005)
+    exact = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.0), Path("bag"))
+    assert exact["plane_controller"]["tip_noise_bound"] > 0.0
+    camera = command_line_parameters(SimulateOptions(), Path("bag"))
+    assert "tip_noise" not in camera["plane_controller"]
+    assert rig_parameters()["plane_controller"]["tip_noise"] == "normal"

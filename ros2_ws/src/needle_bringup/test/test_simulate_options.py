@@ -7,7 +7,7 @@ from needle_common.errors import UserError
 
 
 def test_the_defaults_are_the_designed_ones() -> None:
-    assert parse([]) == SimulateOptions(level="camera", controller="paper", depth_mm=120.0)
+    assert parse([]) == SimulateOptions(level="camera", controller="best", depth_mm=120.0)
 
 
 @pytest.mark.parametrize("words", [["--initial", "-3,2,15"], ["--initial=-3,2,15"]])
@@ -29,7 +29,7 @@ def test_noise_belongs_to_level_tip() -> None:
     ("words", "named"),
     [
         (["--level", "drive"], "does not exist yet"),
-        (["--controller", "best"], "does not exist yet"),
+        (["--controller", "worst"], "worst"),
         (["--level", "x"], "'x'"),
         (["--initial", "-3,2"], "X_MM,PITCH_DEG,ROLL_DEG"),
         (["--initial", "-3,nan,2"], "PITCH_DEG"),

@@ -50,8 +50,14 @@ class NodeParameters(Generic[P]):
         values: dict[str, Any] = {}
         for name, (spec, default) in known.items():
             value = list(default) if isinstance(default, tuple) else default
+            # An empty list has no type of its own in ROS; every list of ours holds numbers.
+            empty = value == []
+            if empty:
+                value = Parameter.Type.DOUBLE_ARRAY
             try:
-                node.declare_parameter(name, value, _descriptor(spec, default))
+                declared = node.declare_parameter(name, value, _descriptor(spec, default))
+                if empty and declared.value is None:
+                    node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])])
             except InvalidParameterTypeException as error:
                 given = node._parameter_overrides[name].value
                 raise UserError(

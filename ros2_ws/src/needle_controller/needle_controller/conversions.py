@@ -61,10 +61,10 @@ def to_tip(message: PointStamped) -> TipMeasurement:
     )
 
 
-def to_plane(message: PoseStamped, depth: float) -> TargetPlane:
+def to_plane(message: PoseStamped) -> TargetPlane:
     """Return the plane a message asks for; raises UserError as `plane_from_pose` does."""
     p, q = message.pose.position, message.pose.orientation
-    return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w], depth)
+    return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
 
 
 def to_device_status(message: DiagnosticStatus) -> DeviceStatus:
@@ -122,13 +122,17 @@ def to_control_input(update: ControlUpdate, stamp_ns: int) -> Vector3Stamped:
 
 def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
     """Return needle/controller_status as a line of health."""
+    reachable, reachable_depth = "", ""
+    if steering.reach is not None:
+        reachable = str(bool(steering.reach.reachable)).lower()
+        reachable_depth = repr(float(steering.reach.depth))
     values = {
         "state": steering.state.value,
         "step": str(steering.step),
         "insertion_m": repr(steering.insertion),
         "target_offset_m": repr(steering.control.plane.offset),
-        "reachable": "",
-        "reachable_depth_m": "",
+        "reachable": reachable,
+        "reachable_depth_m": reachable_depth,
         "reason": steering.reason,
         "awaiting": steering.awaiting.value,
         "tip_after_ns": str(steering.tip_after_ns),

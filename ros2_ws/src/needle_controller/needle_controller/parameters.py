@@ -5,9 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
+import numpy as np
+
 from needle_common.parameter_fields import check_fields, parameter
-from needle_controller.plane_control import PRESETS, ControlSettings
+from needle_controller.control_settings import PRESETS, TIP_NOISES, ControlSettings
+from needle_controller.flip_plan import FlipPlan
+from needle_controller.presets import make_controller
 from needle_controller.steering import SteeringSettings
+from needle_controller.target_plane import check_within_reach, offset_plane
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +28,8 @@ class PlaneControllerParameters:
     preset: str = parameter(
         ControlSettings.preset,
         unit="-",
-        description="paper = observer and law of [KC09], open_loop = no rotation.",
+        description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
+        "open_loop = no rotation.",
         choices=PRESETS,
     )
     curvature: float = parameter(
@@ -96,6 +102,27 @@ class PlaneControllerParameters:
         lower=1e-6,
         upper=0.01,
     )
+    tip_noise: str = parameter(
+        ControlSettings.tip_noise,
+        unit="-",
+        description="best: a measured coordinate is off by up to tip_noise_bound (bounded), or "
+        "with standard deviation measurement_std (normal).",
+        choices=TIP_NOISES,
+    )
+    tip_noise_bound: float = parameter(
+        ControlSettings.tip_noise_bound,
+        unit="m",
+        description="Largest error of one measured tip coordinate, where tip_noise is bounded.",
+        lower=1e-6,
+        upper=0.1,
+    )
+    flip_depths: tuple[float, ...] = parameter(
+        ControlSettings.flip_depths,
+        unit="m",
+        description="best: insertions at which the bevel is flipped within the plane, increasing.",
+        lower=0.0,
+        upper=1.0,
+    )
     state_weights: tuple[float, ...] = parameter(
         ControlSettings.state_weights,
         unit="1/m^2, -, m^2",
@@ -160,7 +187,10 @@ class PlaneControllerParameters:
     def __post_init__(self) -> None:
         """Check the whole, gains included."""
         check_fields(self)
+        check_within_reach(offset_plane(self.target_offset), self.curvature, self.depth)
+        FlipPlan(self.flip_depths).check_within(self.depth)
         self.control().gains()
+        make_controller(self.control(), np.eye(3))
 
     def control(self) -> ControlSettings:
         """Return what estimator and law are made of."""

@@ -36,7 +36,7 @@ from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.plane_control import PlaneControl
 from needle_controller.steering import Action, Log, PublishUpdate, SendStep, Steering
-from needle_controller.target_plane import offset_plane
+from needle_controller.target_plane import check_within_reach, offset_plane
 
 HELP = """
 plane_controller: steers the needle into the target plane, one insertion step per measured tip.
@@ -141,7 +141,9 @@ class PlaneControllerNode(Node):
 
     def _on_plane(self, message: PoseStamped) -> None:
         try:
-            plane = conversions.to_plane(message, self._settings.values.depth)
+            plane = conversions.to_plane(message)
+            values = self._settings.values
+            check_within_reach(plane, values.curvature, values.depth)
         except UserError as error:
             self._plane_complaint = f"{error}; the last plane stays"
             self._do([Log("warning", self._plane_complaint)])

@@ -11,11 +11,8 @@ import dataclasses
 import enum
 
 from needle_controller.joint_history import JointHistory, JointSample
-from needle_controller.plane_control import (
-    LARGEST_START_ROLL,
-    ControlUpdate,
-    PlaneControl,
-)
+from needle_controller.plane_control import LARGEST_START_ROLL, ControlUpdate, PlaneControl
+from needle_controller.reachability import Reachability, reachability
 from needle_controller.tip_gate import (
     AcceptedTip,
     TipMeasurement,
@@ -23,6 +20,8 @@ from needle_controller.tip_gate import (
     refuse_position,
 )
 
+PLANE_TOLERANCE = 1e-3
+"""Distance from the plane at which the needle counts as in it, [KC09] IV-A [m]."""
 DEPTH_TOLERANCE = 1e-6
 """Insertion short of the depth that counts as there [m]."""
 REST_INSERTION = 2e-6
@@ -168,6 +167,7 @@ class Steering:
         self.watchdog_trips = 0
         self.insertion = 0.0
         self.rejection = ""
+        self.reach: Reachability | None = None
         self.joints = JointHistory()
         self._device: DeviceStatus | None = None
         self._retracted = False
@@ -394,6 +394,13 @@ class Steering:
         self.rejection = ""
         self.insertion = joints.insertion
         update = self.control.update(tip.position, joints)
+        self.reach = reachability(
+            update.estimate.reduced,
+            update.estimate.curvature,
+            insertion=joints.insertion,
+            end=settings.depth,
+            tolerance=PLANE_TOLERANCE,
+        )
         self.reason = "; ".join(update.estimate.warnings)
         actions: list[Action] = [PublishUpdate(tip.stamp_ns, update)]
         if self.state is State.WAITING_FOR_TIP:

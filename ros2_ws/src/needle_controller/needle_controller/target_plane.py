@@ -9,9 +9,12 @@ import numpy.typing as npt
 
 from needle_common.errors import UserError
 from needle_controller.arrays import Array
+from needle_controller.reachability import check_offset
 
 _UNIT_TOLERANCE = 1e-3
 RIG = "rig"
+SHORTEST_JUDGED_DEPTH = 0.12
+"""Depth of the insertions of [KC09] IV-B [m]; shorter runs are parts of one."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,7 +56,7 @@ def offset_plane(offset: float) -> TargetPlane:
 
 
 def plane_from_pose(
-    frame_id: str, position: npt.ArrayLike, quaternion: npt.ArrayLike, depth: float
+    frame_id: str, position: npt.ArrayLike, quaternion: npt.ArrayLike
 ) -> TargetPlane:
     """Return the plane that a pose asks for.
 
@@ -65,8 +68,6 @@ def plane_from_pose(
         Origin of `target_plane` [m].
     quaternion : array_like, shape (4,)
         Its orientation, x y z w, of unit length.
-    depth : float
-        Insertion at which the needle ends [m].
 
     Returns
     -------
@@ -76,9 +77,8 @@ def plane_from_pose(
     Raises
     ------
     UserError
-        Another frame, numbers that are not finite, a quaternion that is not of unit length, a plane
-        that lies farther from the entry than the needle is long, or one that the entering needle
-        stands on at right angles.
+        Another frame, numbers that are not finite, a quaternion that is not of unit length, or a
+        plane that the entering needle stands on at right angles.
     """
     if frame_id != RIG:
         raise UserError(f"target_plane is given in frame '{frame_id}', wants '{RIG}'")
@@ -92,11 +92,6 @@ def plane_from_pose(
     transform[:3, :3] = _rotation_from_quaternion(q / norm)
     transform[:3, 3] = origin
     plane = TargetPlane(transform)
-    if abs(plane.offset) > depth:
-        raise UserError(
-            f"target_plane lies {abs(plane.offset):g} m from the entry point, "
-            f"farther than the needle goes (depth {depth:g} m)"
-        )
     # The entering needle's sine of pitch in the plane's coordinates.
     if abs(transform[2, 0]) > np.sin(np.deg2rad(80.0)):
         angle = np.rad2deg(np.arcsin(min(1.0, abs(transform[2, 0]))))
@@ -104,6 +99,28 @@ def plane_from_pose(
             f"the needle enters at {angle:.0f} deg to target_plane, wants at most 80 deg"
         )
     return plane
+
+
+def check_within_reach(plane: TargetPlane, curvature: float, depth: float) -> None:
+    """Check that a needle that is still out could be steered into a plane.
+
+    Parameters
+    ----------
+    plane : TargetPlane
+        The wanted plane.
+    curvature : float
+        kappa [1/m].
+    depth : float
+        Insertion at which steering ends [m]; a run that is shorter than `SHORTEST_JUDGED_DEPTH` is
+        judged as if it went on to there.
+
+    Raises
+    ------
+    UserError
+        The plane is farther than the needle can ever go: says how far it can.
+    """
+    pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
+    check_offset(plane.offset, curvature, max(depth, SHORTEST_JUDGED_DEPTH), pitch)
 
 
 def _rotation_from_quaternion(q: Array) -> Array:

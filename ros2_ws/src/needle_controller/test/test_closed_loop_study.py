@@ -9,7 +9,7 @@ from needle_controller.arrays import Array
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.luenberger import LuenbergerObserver
 from needle_controller.parameters import PlaneControllerParameters
-from needle_controller.plane_control import make_law, observer_settings
+from needle_controller.presets import make_law, observer_settings
 from needle_sim.plant import NeedlePlant
 
 STEP = 0.001

@@ -14,6 +14,7 @@ from needle_common.errors import UserError
 from needle_controller.arrays import Array
 from needle_controller.bend_side import bend_sign_of, mirrored_turn, reduced_on_side
 from needle_controller.bend_side_law import TwoSidedLinearizingLaw
+from needle_controller.control_settings import ControlSettings
 from needle_controller.feedback_linearization import linearized_from_reduced
 from needle_controller.flip_plan import FlipPlan, evenly_spaced_flips
 from needle_controller.innovation_gate import InnovationGate
@@ -22,7 +23,7 @@ from needle_controller.law import LinearizingLaw
 from needle_controller.linear_observer import LinearObserver, LinearObserverSettings
 from needle_controller.luenberger import LuenbergerObserver
 from needle_controller.pitch_observer import PitchObserver, PitchObserverSettings
-from needle_controller.plane_control import ControlSettings, make_law, observer_settings
+from needle_controller.presets import make_law, observer_settings
 from needle_sim.plant import NeedlePlant
 
 CONTROL = ControlSettings()

@@ -307,7 +307,7 @@ def test_covariance_follows_the_messages_convention(bench: Bench) -> None:
     bench.start()
     bench.step()
     bench.until(lambda: bool(bench.received["needle/estimate"]))
-    estimate = bench.node._steering.control._observer.estimate()
+    estimate = bench.node._steering.control._estimator.estimate()
     published = np.reshape(bench.received["needle/estimate"][-1].pose.covariance, (6, 6))
     scale = 1e-4
     rng = np.random.default_rng(1)

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from needle_common.errors import UserError
 from needle_controller.joint_history import JointSample
-from needle_controller.target_plane import offset_plane, plane_from_pose
+from needle_controller.target_plane import check_within_reach, offset_plane, plane_from_pose
 from needle_controller.tip_gate import (
     AcceptedTip,
     TipMeasurement,
@@ -27,7 +27,7 @@ def test_the_papers_start_is_3_mm_below_a_plane_at_plus_3_mm() -> None:
 def test_a_general_pose_is_a_rigid_transform() -> None:
     rotation = Rotation.from_euler("xyz", [0.3, -0.4, 0.5])
     origin = np.array([0.001, -0.02, 0.03])
-    plane = plane_from_pose("rig", origin, rotation.as_quat(), DEPTH)
+    plane = plane_from_pose("rig", origin, rotation.as_quat())
     np.testing.assert_allclose(plane.T_rig_plane[:3, :3], rotation.as_matrix(), atol=1e-12)
     np.testing.assert_allclose(plane.T_plane_rig @ plane.T_rig_plane, np.eye(4), atol=1e-12)
     points = np.arange(12.0).reshape(2, 2, 3)
@@ -36,9 +36,7 @@ def test_a_general_pose_is_a_rigid_transform() -> None:
         rotation.inv().apply((points - origin).reshape(-1, 3)),
     )
     # The distance of the entry from the plane does not depend on where in the plane its origin is.
-    moved = plane_from_pose(
-        "rig", origin + rotation.apply([0.0, 0.05, -0.02]), rotation.as_quat(), DEPTH
-    )
+    moved = plane_from_pose("rig", origin + rotation.apply([0.0, 0.05, -0.02]), rotation.as_quat())
     assert moved.offset == pytest.approx(plane.offset)
 
 
@@ -51,7 +49,6 @@ def test_a_general_pose_is_a_rigid_transform() -> None:
         ("rig", [0, 0, 0], [0, 0, np.inf, 1], "not finite"),
         ("rig", [0, 0, 0], [0, 0, 0, 0], "length 0"),
         ("rig", [0, 0, 0], [0, 0, 0, 2], "length 2"),
-        ("rig", [3.0, 0, 0], UNIT, "farther"),
         ("rig", [0, 0, 0], [0, np.sqrt(0.5), 0, np.sqrt(0.5)], "90 deg"),
     ],
 )
@@ -59,7 +56,7 @@ def test_planes_nothing_can_reach_are_refused(
     frame: str, position: list[float], quaternion: list[float], said: str
 ) -> None:
     with pytest.raises(UserError, match=said):
-        plane_from_pose(frame, position, quaternion, DEPTH)
+        plane_from_pose(frame, position, quaternion)
 
 
 def tip(x: float, y: float, z: float, *, stamp_ns: int = 100, frame: str = "rig") -> TipMeasurement:
@@ -95,3 +92,19 @@ def test_places_no_needle_can_reach_are_named() -> None:
     assert "jumped" in str(refuse_position(tip(0.008, 0.0, 0.019), NOW, LAST, 0.004))
     assert refuse_position(tip(0.0, 0.0, 0.0249), NOW, None, 0.004) is None
     assert refuse_position(tip(0.0, 0.0, 0.0251), NOW, None, 0.004) is not None
+
+
+@pytest.mark.parametrize("offset", [0.05, -0.05, 3.0])
+def test_a_plane_farther_than_the_needle_can_go_is_refused_with_what_it_reaches(
+    offset: float,
+) -> None:
+    with pytest.raises(UserError, match=r"cannot be reached.*reaches planes from .* to "):
+        check_within_reach(offset_plane(offset), 1 / 0.122, DEPTH)
+
+
+def test_reach_is_judged_at_the_runs_depth_but_not_for_a_part_of_an_insertion() -> None:
+    check_within_reach(offset_plane(0.02), 1 / 0.122, DEPTH)
+    check_within_reach(offset_plane(0.02), 1 / 0.122, 0.01)
+    with pytest.raises(UserError, match="cannot be reached"):
+        check_within_reach(offset_plane(0.05), 1 / 0.122, 0.15)
+    check_within_reach(offset_plane(0.05), 1 / 0.122, 0.19)

@@ -12,15 +12,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from needle_common.errors import UserError
-from needle_controller.best import BestSettings, make_best
-from needle_controller.estimator import Estimate, Estimator
-from needle_controller.flip_plan import FlipPlan
-from needle_controller.law import Command
-from needle_controller.luenberger import LuenbergerObserver
-from needle_controller.plane_control import ControlSettings, make_law, observer_settings
+from needle_controller.control_settings import PRESETS, ControlSettings
+from needle_controller.estimator import Estimator
+from needle_controller.presets import StepLaw, make_controller
 from needle_sim.se3 import FloatArray
 
-CONTROLLERS = ("paper", "best", "open_loop")
 CURVATURE = ControlSettings.curvature
 STEP_LENGTH = ControlSettings.step_length
 # A sensor without noise still has this bound for the controllers' design [m].
@@ -38,7 +34,7 @@ class SteeredNeedles:
         Returns the command for an estimate at an inserted length [m].
     """
 
-    def __init__(self, estimator: Estimator, law: Callable[[Estimate, float], Command]) -> None:
+    def __init__(self, estimator: Estimator, law: StepLaw) -> None:
         self._estimator = estimator
         self._law = law
         self._insertion = 0.0
@@ -69,7 +65,7 @@ def controller_factory(
     Parameters
     ----------
     name : str
-        One of `CONTROLLERS`.
+        One of `PRESETS`.
     noise : float
         Largest error of a measured coordinate that the sensor is known to make [m].
     flip_depths : sequence of float
@@ -80,44 +76,15 @@ def controller_factory(
     UserError
         If there is no such controller, or it cannot flip.
     """
-    if name not in CONTROLLERS:
-        raise UserError(
-            f"--controller {name!r} is not available; there is {', '.join(CONTROLLERS)}"
-        )
+    if name not in PRESETS:
+        raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
     noise = max(noise, _SMALLEST_NOISE)
-    if name == "best":
-        return _best_factory(noise, tuple(flip_depths))
-    if flip_depths:
-        raise UserError(
-            f"--flips: {name} cannot steer with the bevel flipped (its coordinates end at roll "
-            "+-90 deg); best can"
-        )
-    std = noise / math.sqrt(3.0)
-    settings = dataclasses.replace(ControlSettings(), preset=name, measurement_std=std)
-    gains = settings.gains()
-    law = make_law(settings, gains)
-
-    def build() -> SteeredNeedles:
-        observer = LuenbergerObserver(observer_settings(settings, gains))
-        return SteeredNeedles(observer, lambda estimate, _: law(estimate))
-
-    return build
-
-
-def _best_factory(noise: float, flip_depths: tuple[float, ...]) -> Callable[[], SteeredNeedles]:
-    plan = FlipPlan(flip_depths)
-    defaults = BestSettings()
     settings = dataclasses.replace(
-        defaults, filter=dataclasses.replace(defaults.filter, tip_noise_bound=noise)
+        ControlSettings(),
+        preset=name,
+        tip_noise_bound=noise,
+        measurement_std=noise / math.sqrt(3.0),
+        flip_depths=tuple(flip_depths),
     )
-
-    def build() -> SteeredNeedles:
-        estimator, law = make_best(settings)
-        return SteeredNeedles(
-            estimator,
-            lambda estimate, insertion: law(
-                estimate, plan.bend_sign(insertion) if plan.depths else 0.0
-            ),
-        )
-
-    return build
+    make_controller(settings, np.eye(3))
+    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3)))
