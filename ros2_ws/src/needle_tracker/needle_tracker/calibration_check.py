@@ -34,7 +34,7 @@ Array = NDArray[np.float64]
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
 CAUSES = (*CAMERAS, *PHANTOM)
 LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
-LARGEST_CORNER_SIGMA_PX = 0.3
+LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
 TURN_LIMIT = np.deg2rad(0.01)  # a camera turned by more was touched, whatever it does to tips
 
 
@@ -133,9 +133,10 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     unseen = tip_error_p95(calibration, covariance)
     asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
     problems = []
-    if sigma > LARGEST_CORNER_SIGMA_PX:
+    misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
+    if misfit > LARGEST_MISFIT_PX:
         problems.append(
-            f"corners miss by {sigma:.2f} px in a way that no turned camera, index or surface "
+            f"corners miss by {misfit:.2f} px in a way that no turned camera, index or surface "
             "explains: another lens setting, or a target that is not flat or not where it is said"
         )
     if shift > limit:
@@ -152,6 +153,27 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
         )
     reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
     return CheckResult(deviations, shift, unseen, sigma, reprojection, problems)
+
+
+def _noise_px(views: list[BoardView]) -> float:
+    """Return a corner's noise, whatever the calibration: what a smooth map leaves [px].
+
+    A polynomial of degree 4 in the board's coordinates follows perspective, lens and refraction to
+    a few thousandths of a pixel.
+    """
+    total, spare = 0.0, 0
+    for view in views:
+        for side in SIDES:
+            seen = view.corners(side)
+            degree = 4 if len(seen.points) >= 40 else 2
+            flat = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
+            x, y = (flat / np.abs(flat).max()).T
+            terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+            basis = np.stack(terms, axis=-1)
+            rest = seen.pixels - basis @ np.linalg.lstsq(basis, seen.pixels, rcond=None)[0]
+            total += float(np.sum(rest**2))
+            spare += 2 * max(len(seen.points) - basis.shape[1], 0)
+    return float(np.sqrt(total / spare)) if spare else 0.0
 
 
 def _causes(model: RigModel, sigma: float) -> list[str]:

@@ -6,7 +6,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol, cast
 
 import cv2
 import numpy as np
@@ -143,6 +143,8 @@ class CameraPair:
         self._captures: dict[str, cv2.VideoCapture] = {}
         opened = open_capture or _open_device
         for side, name in (("left", settings.left), ("right", settings.right)):
+            if name.startswith("/dev/") and not Path(name).exists():
+                raise UserError(f"{side} camera {name} does not exist")
             capture = opened(name)
             if not capture.isOpened():
                 self.close()
@@ -284,6 +286,8 @@ def _check_sizes(pair: NamedPair, sizes: Sizes) -> None:
 
 
 def _open_device(name: str) -> cv2.VideoCapture:
+    # What goes wrong is said by us, in one line; OpenCV's own lines are for its developers.
+    cast(Any, cv2).setLogLevel(0)
     if name.isdecimal():
         return cv2.VideoCapture(int(name), cv2.CAP_V4L2)
     return cv2.VideoCapture(name, cv2.CAP_V4L2)

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_tracker.calibration_session import Place
 from needle_tracker.charuco import CharucoBoard
 from needle_tracker.rig_model import BoardView, Corners
+
+Array = NDArray[np.float64]
 
 SIDES = ("left", "right")
 BOARD = CharucoBoard()
@@ -22,21 +27,21 @@ SIZE = (1024, 768)
 class TrueRig:
     """What a calibration file says, read without the code under test."""
 
-    content: dict
+    content: dict[str, Any]
 
     @classmethod
-    def read(cls, path) -> TrueRig:
+    def read(cls, path: Path) -> TrueRig:
         return cls(yaml.safe_load(path.read_text()))
 
     @property
     def height(self) -> float:
-        return self.content["phantom"]["surface_height"]
+        return float(self.content["phantom"]["surface_height"])
 
     @property
     def index(self) -> float:
-        return self.content["phantom"]["refractive_index"]
+        return float(self.content["phantom"]["refractive_index"])
 
-    def camera(self, side):
+    def camera(self, side: str) -> tuple[Array, Array, Array, Array]:
         c = self.content[side]
         matrix = np.reshape(c["camera_matrix"]["data"], (3, 3))
         pose = c["T_optical_rig"]
@@ -44,7 +49,7 @@ class TrueRig:
         translation = np.array(pose["translation"])
         return matrix, np.array(c["distortion_coefficients"]["data"]), rotation, translation
 
-    def turned(self, side, degrees, axis="y") -> TrueRig:
+    def turned(self, side: str, degrees: float, axis: str = "y") -> TrueRig:
         """A rig with one camera turned about an axis of its optical frame."""
         content = yaml.safe_load(yaml.safe_dump(self.content))
         pose = content[side]["T_optical_rig"]
@@ -53,12 +58,12 @@ class TrueRig:
         pose["translation"] = turn.apply(pose["translation"]).tolist()
         return TrueRig(content)
 
-    def with_phantom(self, **values) -> TrueRig:
+    def with_phantom(self, **values: float) -> TrueRig:
         content = yaml.safe_load(yaml.safe_dump(self.content))
         content["phantom"].update(values)
         return TrueRig(content)
 
-    def project(self, side, points, under):
+    def project(self, side: str, points: Array, under: bool) -> Array:
         """Pixels of points in rig; `under` says that they are seen through the surface."""
         matrix, distortion, rotation, translation = self.camera(side)
         points = np.asarray(points, dtype=float).reshape(-1, 3)
@@ -67,9 +72,9 @@ class TrueRig:
         pixels, _ = cv2.projectPoints(
             points, cv2.Rodrigues(rotation)[0], translation, matrix, distortion
         )
-        return np.asarray(pixels).reshape(-1, 2)
+        return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
-    def _crossings(self, centre, points):
+    def _crossings(self, centre: Array, points: Array) -> Array:
         """Where light crosses the surface: least time, by bisection on its derivative."""
         side = points[:, 1:] - centre[1:]
         distance = np.linalg.norm(side, axis=1)
@@ -85,7 +90,14 @@ class TrueRig:
         crossing[:, 1:] = centre[1:] + side * fraction[:, None]
         return crossing
 
-    def view(self, name, pose, place, rng, noise=0.1) -> BoardView:
+    def view(
+        self,
+        name: str,
+        pose: Array,
+        place: Place | None,
+        rng: np.random.Generator,
+        noise: float = 0.1,
+    ) -> BoardView:
         """The board's corners inside both images, with noise."""
         points = BOARD.corners
         under = place is not None and place.under_surface
@@ -97,7 +109,9 @@ class TrueRig:
             seen.append(Corners(points[inside], pixels[inside]))
         return BoardView(name, place, seen[0], seen[1])
 
-    def draw(self, side, pose, under, noise=2.0, rng=None, super_px=2):
+    def draw(
+        self, side: str, pose: Array, under: bool, rng: np.random.Generator, super_px: int = 2
+    ) -> NDArray[np.uint8]:
         """A grey image of the board, each pixel mapped back by a fine grid of true projections."""
         shape = (SIZE[1] * super_px, SIZE[0] * super_px)
         square_px = 40 * super_px
@@ -137,12 +151,11 @@ class TrueRig:
                 block[mask > 0] = 30.0 + patch[mask > 0] * (190.0 / 255.0)
         image = cv2.GaussianBlur(image, (0, 0), 0.7 * super_px)
         image = cv2.resize(image, SIZE, interpolation=cv2.INTER_AREA)
-        if rng is not None:
-            image = image + rng.normal(0.0, noise, image.shape)
-        return np.clip(np.round(image), 0, 255).astype(np.uint8)
+        noisy = image + rng.normal(0.0, 2.0, image.shape)
+        return np.asarray(np.clip(np.round(noisy), 0, 255), dtype=np.uint8)
 
 
-def flat_pose(origin, pitch_deg=0.0, tilt_deg=0.0):
+def flat_pose(origin: Any, pitch_deg: float = 0.0, tilt_deg: float = 0.0) -> Array:
     """T_rig_board of a board face up: columns along z, rows along y; then tilted in place."""
     pose = np.eye(4)
     flat = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
@@ -151,12 +164,12 @@ def flat_pose(origin, pitch_deg=0.0, tilt_deg=0.0):
     return pose
 
 
-def free_pose(rng):
+def free_pose(rng: np.random.Generator, tilts_deg: tuple[float, float] = (15, 42)) -> Array:
     """A board held in the working volume, its middle seen by both cameras, tilted."""
     centre = np.array(
-        [rng.uniform(0.03, 0.09), rng.uniform(-0.012, 0.012), rng.uniform(0.05, 0.075)]
+        [rng.uniform(0.06, 0.10), rng.uniform(-0.012, 0.012), rng.uniform(0.05, 0.075)]
     )
-    tilt = np.deg2rad(rng.uniform(15, 42))
+    tilt = np.deg2rad(rng.uniform(*tilts_deg))
     axis = rng.uniform(0, 2 * np.pi)
     pose = flat_pose(np.zeros(3))
     turn = Rotation.from_rotvec(tilt * np.array([0.0, np.cos(axis), np.sin(axis)]))
@@ -167,7 +180,7 @@ def free_pose(rng):
     return pose
 
 
-def surface_places(height):
+def surface_places(height: float) -> dict[str, Place]:
     """Where the board lay on the surface: flat, twice."""
     return {
         "surface_a": Place(flat_pose([height + 1e-3, -0.045, 0.0025])),
@@ -175,7 +188,7 @@ def surface_places(height):
     }
 
 
-def under_places(height, sigma=2e-5):
+def under_places(height: float, sigma: float = 2e-5) -> dict[str, Place]:
     """Where it lay under the surface: deep and flat, and on a wedge."""
     return {
         "under_deep": Place(flat_pose([height - 0.033, -0.045, 0.0025]), True, sigma),
@@ -188,16 +201,23 @@ def under_places(height, sigma=2e-5):
     }
 
 
-def scatter(pose, sigma, rng):
+def scatter(pose: Array, sigma: float, rng: np.random.Generator) -> Array:
     """A place as it really is: known to `sigma` only."""
-    moved = pose.copy()
+    moved = np.array(pose, dtype=np.float64)
     turn = Rotation.from_rotvec(rng.normal(0.0, 2 * sigma / 0.12, 3))
     moved[:3, :3] = turn.as_matrix() @ pose[:3, :3]
     moved[:3, 3] += rng.normal(0.0, sigma, 3)
     return moved
 
 
-def take(rig, rng, free=20, surface=True, under=True, noise=0.1):
+def take(
+    rig: TrueRig,
+    rng: np.random.Generator,
+    free: int = 20,
+    surface: bool = True,
+    under: bool = True,
+    noise: float = 0.1,
+) -> list[BoardView]:
     """Views of a calibration session; places are those the session file says."""
     views = [rig.view(f"free_{i:02d}", free_pose(rng), None, rng, noise) for i in range(free)]
     if surface:
