@@ -256,6 +256,10 @@ def _spin(node: Node) -> int:
     try:
         while not node.finished:
             executor.spin_once()
+    except RuntimeError:
+        # A signal ends the context also in the middle of a callback: rclpy then cannot publish.
+        if node.context.ok():
+            raise
     finally:
         node.close()
         executor.shutdown()
