@@ -30,6 +30,7 @@ Rows = NDArray[np.int64]
 _SLOPE = 1.0  # largest sideways step along a path, per step outwards (45 deg from the radius)
 _IMPOSSIBLE = np.float32(-1e6)
 _CUT_ROWS = 6
+_NOISE_PITCH = 5
 _APART = math.radians(3.0)  # paths that end closer to each other are one
 
 
@@ -110,6 +111,24 @@ def cut_path(path: Path, grid: SearchGrid, length: float) -> Path:
     )
 
 
+def distinct(paths: list[Path]) -> list[Path]:
+    """Return the paths without those that end where one before them does, the same way."""
+    kept: list[Path] = []
+    for path in paths:
+        if not any(_alike(path, other) for other in kept):
+            kept.append(path)
+    return kept
+
+
+def _alike(one: Path, other: Path) -> bool:
+    return (
+        one.bright is other.bright
+        and len(one.rows) > _CUT_ROWS < len(other.rows)
+        and abs(len(one.rows) - len(other.rows)) <= 1
+        and bool(np.abs(one.columns[-_CUT_ROWS:-1:2] - other.columns[-_CUT_ROWS:-1:2]).max() <= 1)
+    )
+
+
 def find_paths(
     image: Image,
     grid: SearchGrid,
@@ -145,8 +164,7 @@ def find_paths(
     reachable = grid.reachable[:rows]
     if rows < 2 or not reachable.any():
         return []
-    ridge = _sampled_ridge(image, grid, rows, settings)
-    noise = _noise(ridge[reachable])
+    ridge, noise = _sampled_ridge(image, grid, rows, settings)
     # The filter passes about half of a line's contrast.
     threshold = max(settings.noise_factor * noise, 0.5 * settings.min_contrast)
     steps = np.maximum(
@@ -177,8 +195,10 @@ def find_paths(
     return sorted(found, key=lambda path: -path.evidence)
 
 
-def _sampled_ridge(image: Image, grid: SearchGrid, rows: int, s: DetectionSettings) -> Ridge:
-    """Return what is brighter than its surroundings, at half resolution, on the grid's cells."""
+def _sampled_ridge(
+    image: Image, grid: SearchGrid, rows: int, s: DetectionSettings
+) -> tuple[Ridge, float]:
+    """Return what is brighter than its surroundings, on the grid's cells, and its noise."""
     x0, y0, x1, y1 = grid.bounds(rows, 8.0 * s.needle_width_px, image.shape)
     half_size = ((x1 - x0) // 2, (y1 - y0) // 2)
     cut = image[y0 : y0 + 2 * half_size[1], x0 : x0 + 2 * half_size[0]]
@@ -187,7 +207,8 @@ def _sampled_ridge(image: Image, grid: SearchGrid, rows: int, s: DetectionSettin
     size = 2 * round(1.4 * s.needle_width_px) + 1
     ridge = np.subtract(near, cv2.blur(half, (size, size)), out=near)
     # Pixel centres: the half-size pixel i covers the pixels 2 i and 2 i + 1.
-    return _sampled(ridge, grid.pixels[:rows], grid.reachable[:rows], x0 + 0.5, y0 + 0.5)
+    sampled = _sampled(ridge, grid.pixels[:rows], grid.reachable[:rows], x0 + 0.5, y0 + 0.5)
+    return sampled, _noise(ridge)
 
 
 @compiled
@@ -211,9 +232,9 @@ def _sampled(
     return values
 
 
-def _noise(values: NDArray[np.float32]) -> float:
+def _noise(ridge: Ridge) -> float:
     """Return a standard deviation that lines and spots do not spoil."""
-    sample = values[:: max(1, len(values) // 4000)]
+    sample = ridge[::_NOISE_PITCH, ::_NOISE_PITCH].reshape(-1)
     return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
 
 

@@ -16,6 +16,7 @@ from needle_tracker.search_grid import Reach
 Array = NDArray[np.float64]
 
 _STATIONS = 10
+_OTHER_POINTS = 40
 _SMOOTH_CELLS = 7
 _LEAST_STATIONS = 4
 _TOLERANCE = 3e-3  # of a station, beyond what the needle can reach [m]
@@ -43,6 +44,8 @@ def shaft_points(
         In `rig` [m]; few or none where the shaft runs along the cameras' baseline.
     """
     pixels = [_smooth(path.pixels) for path in paths]
+    pixels[1] = pixels[1][:: max(len(pixels[1]) // _OTHER_POINTS, 1)]
+    alike = len(pixels[1]) / len(pixels[0])
     chosen = np.unique(np.linspace(0, len(pixels[0]) - 1, _STATIONS + 1).astype(int))[:-1]
     origins, directions = views[0].rays(pixels[0][chosen])
     other_origins, other_directions = views[1].rays(pixels[1])
@@ -59,8 +62,8 @@ def shaft_points(
         if not len(crossings):
             continue
         # Of several the one about as far along the path.
-        i = int(crossings[np.argmin(np.abs(crossings - chosen[k]))])
-        if abs(row[i + 1] - row[i]) < _LEAST_SINE * 5e-4:
+        i = int(crossings[np.argmin(np.abs(crossings - alike * chosen[k]))])
+        if abs(row[i + 1] - row[i]) < _LEAST_SINE * 5e-4 / alike:
             continue
         share = row[i] / (row[i] - row[i + 1])
         origin = (1.0 - share) * other_origins[i] + share * other_origins[i + 1]

@@ -34,7 +34,7 @@ _AHEAD_WIDTHS = 6.5
 _AGREE_PX = 0.7  # what agrees with a line [px]
 _VOTE_STEP_PX = 0.3
 _SHIFTS, _TILTS = 9, 8
-_ROWS_ALIKE = 4.0
+_ROWS_ALIKE = 3.0
 
 
 @compiled

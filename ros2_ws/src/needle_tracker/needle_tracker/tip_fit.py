@@ -14,10 +14,12 @@ from needle_tracker.strip_fit import fit_strip
 
 Array = NDArray[np.float64]
 
-_LINE_SYSTEMATIC_PX = 0.02  # what calibration and the needle's bend leave in the line
-_END_SYSTEMATIC_PX = 0.12  # bevel, blur, light: where "half" is
+_LINE_SYSTEMATIC_PX = 0.018  # what calibration and the needle's bend leave in the line
+_END_SYSTEMATIC_PX = 0.045  # bevel, blur, light: where "half" is
 _HIDDEN_END_PX = 25.0  # an end that cannot be seen is as good as unknown
-_HIDDEN_FACTOR = 2.0  # what hides the end is beside the line too
+_END_DOUBT_PX = 4.5  # for each unit of mass too little before, or left after, the end
+_SOUND_END = 0.02
+_HIDDEN_FACTOR = 3.0  # what hides the end is beside the line too
 _CLEAR_BEFORE = (0.65, 1.45)
 _CLEAR_AFTER = 0.3
 _PATH_SEARCH_PX = 6
@@ -155,6 +157,7 @@ def fit_expected(
         clear = False
     if not clear and expected.sigma_along <= 0.0:
         return None
+    doubt = _END_DOUBT_PX * max(abs(before - 1.0) - _SOUND_END, abs(after) - _SOUND_END, 0.0)
     line_px = LINE_WIDTHS * settings.needle_width_px
     height, width = image.shape
     if not (2.0 <= u <= width - 3.0 and 2.0 <= v <= height - 3.0):
@@ -163,7 +166,7 @@ def fit_expected(
         point=np.array([u, v]),
         direction=np.array([d_u, d_v]),
         sigma_across=math.hypot(across, _LINE_SYSTEMATIC_PX) * (1.0 if clear else _HIDDEN_FACTOR),
-        sigma_along=math.hypot(along, _END_SYSTEMATIC_PX) if clear else _HIDDEN_END_PX,
+        sigma_along=math.hypot(along, _END_SYSTEMATIC_PX, doubt) if clear else _HIDDEN_END_PX,
         sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC_PX / line_px),
         contrast=contrast,
         clear=clear,

@@ -9,24 +9,21 @@ from __future__ import annotations
 import dataclasses
 import enum
 import math
-from collections import deque
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.search_grid import Reach
+from needle_tracker.tip_motion import TipMotion
 from needle_tracker.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
 DISAGREE_ALONG = "views disagree along the needle"
-_WAY_TIPS = 64
-_WAY_LENGTH = 2.5e-3  # long enough for a heading, short enough to follow a bend [m]
+TOO_FAR = "too far from the last tip"
 _HEADING_TOLERANCE = 0.12  # [rad]
 _HIDDEN_PER_LOST = 4
-# Of a prediction: what moves at rest, and how well the heading is known.
-_DRIFT = 0.05e-3  # [m]
-_HEADING_SIGMA = 0.06  # [rad]
+_RIVALS = 2
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
@@ -95,26 +92,20 @@ class Anchor:
 
     Attributes
     ----------
-    position : ndarray, shape (3,)
-        In `rig` [m].
-    direction : ndarray, shape (3,)
-        Unit vector along the visible end.
-    heading : ndarray, shape (3,)
-        Unit vector of where the tip is going: of its way so far, where there is enough.
+    motion : TipMotion
+        Position and heading.
     insertion : float or None
         Of that moment [m].
-    covariance : ndarray, shape (3, 3)
-        Of the position [m^2].
     ahead : float
         How far this is ahead of the last believed tip [m].
+    known : bool
+        Whether that follows from the insertion.
     """
 
-    position: Array
-    direction: Array
-    heading: Array
+    motion: TipMotion
     insertion: float | None
-    covariance: Array
     ahead: float = 0.0
+    known: bool = False
 
 
 def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) -> str | None:
@@ -181,9 +172,10 @@ class Track:
         """Forget everything."""
         self.state = TrackState.SEARCHING
         self.anchor: Anchor | None = None
-        self._way: deque[Anchor] = deque(maxlen=_WAY_TIPS)
         self._misses = 0
         self._hidden = 0
+        self._rival: Anchor | None = None
+        self._rivals = 0
         self._agreeing = 0
 
     def enter(self) -> None:
@@ -207,15 +199,11 @@ class Track:
         anchor = self.anchor
         if anchor is None:
             return None
-        ahead = 0.0
+        ahead, known = 0.0, False
         if insertion is not None and anchor.insertion is not None:
-            ahead = insertion - anchor.insertion
-        position = anchor.position + ahead * anchor.heading
-        sideways = _DRIFT + _HEADING_SIGMA * abs(ahead)
-        covariance = anchor.covariance + sideways**2 * np.eye(3)
-        return dataclasses.replace(
-            anchor, position=position, insertion=insertion, covariance=covariance, ahead=ahead
-        )
+            ahead, known = insertion - anchor.insertion, True
+        motion = anchor.motion.advanced(ahead, self._settings.reach.curvature)
+        return Anchor(motion, insertion, ahead, known)
 
     def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
         """Return why a measured tip is not believed, None where it passes all gates."""
@@ -223,30 +211,78 @@ class Track:
         if reason is None and self.anchor is not None:
             predicted = self.predict(insertion)
             if predicted is not None:
-                miss = float(np.linalg.norm(tip.position - predicted.position))
+                miss = float(np.linalg.norm(tip.position - predicted.motion.position))
                 if miss > self.tolerance(predicted):
-                    return "too far from the last tip"
-                if predicted.insertion is not None and self.state is TrackState.TRACKING:
-                    off = tip.position - predicted.position
-                    spread = predicted.covariance + tip.covariance
-                    if float(off @ np.linalg.solve(spread, off)) > _LARGEST_SURPRISE:
-                        return "too far from the prediction"
+                    return TOO_FAR
+                following = predicted.known and self.state is TrackState.TRACKING
+                if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
+                    return "too far from the prediction"
         return reason
 
-    def accept(self, tip: SpatialTip, insertion: float | None) -> bool:
-        """Take a tip that passed `judge`; return whether it is believed from now on."""
+    def accept(
+        self, tip: SpatialTip, insertion: float | None, *, anew: bool = False
+    ) -> SpatialTip | None:
+        """Take a tip that passed `judge`.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            As measured.
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+        anew : bool
+            Whether what was known before was wrong.
+
+        Returns
+        -------
+        SpatialTip or None
+            What is believed, None where nothing is yet. While the needle is followed the tip is
+            merged with its prediction, so that a view that something spoils counts less; in clear
+            images it is so much better than its prediction that this hardly moves it.
+        """
+        predicted = self.predict(insertion)
         if self.state is not TrackState.TRACKING:
             known = insertion is not None
             self._agreeing = self._agreeing + 1 if self.state is TrackState.CONFIRMING else 1
             wanted = 1 if known else self._settings.confirm_pairs
             confirmed = self._agreeing >= wanted
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
-        position, covariance = tip.position, tip.covariance
-        self._misses = self._hidden = 0
-        heading = self._heading(position, tip.direction, insertion)
-        self.anchor = Anchor(position, tip.direction, heading, insertion, covariance)
-        self._way.append(self.anchor)
-        return self.state is TrackState.TRACKING
+        self._misses = self._hidden = self._rivals = 0
+        self._rival = None
+        motion = TipMotion.start(tip)
+        if predicted is not None and predicted.known and not anew:
+            motion = predicted.motion.updated(tip)
+            tip = dataclasses.replace(
+                tip, position=motion.position, covariance=motion.covariance[:3, :3].copy()
+            )
+        self.anchor = Anchor(motion, insertion)
+        return tip if self.state is TrackState.TRACKING else None
+
+    def contest(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Note a tip that only the last one speaks against; return whether it has won.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            One that passed all gates but `TOO_FAR`, its whole shaft included.
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+
+        Returns
+        -------
+        bool
+            Whether the track is lost and enough such tips in a row agree: then the track was wrong.
+        """
+        rival = self._rival
+        agrees = False
+        if rival is not None and insertion is not None and rival.insertion is not None:
+            ahead = insertion - rival.insertion
+            motion = rival.motion.advanced(ahead, self._settings.reach.curvature)
+            miss = float(np.linalg.norm(tip.position - motion.position))
+            agrees = miss <= self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
+        self._rivals = self._rivals + 1 if agrees else 1
+        self._rival = Anchor(TipMotion.start(tip), insertion)
+        return self.state is TrackState.LOST and self._rivals >= _RIVALS
 
     def miss(self) -> None:
         """Note a pair without a believed tip."""
@@ -273,38 +309,11 @@ class Track:
         is known to a few degrees.
         """
         settings = self._settings
-        if predicted.insertion is None or self.anchor is None or self.anchor.insertion is None:
+        if not predicted.known:
             return settings.free_step * (self._misses + self._hidden + 1)
         ahead = abs(predicted.ahead)
         bend = 0.5 * settings.reach.curvature * ahead * ahead
         return settings.step_margin + _HEADING_TOLERANCE * ahead + bend
-
-    def merged(self, tip: SpatialTip, insertion: float | None) -> SpatialTip:
-        """Return a tip merged with its prediction: a view that something spoils counts less.
-
-        In clear images the measurement is so much better than the prediction that it hardly moves.
-        """
-        predicted = self.predict(insertion)
-        known = predicted is not None and predicted.insertion is not None
-        if predicted is None or not known or self.state is not TrackState.TRACKING:
-            return tip
-        gain = predicted.covariance @ np.linalg.inv(predicted.covariance + tip.covariance)
-        position = predicted.position + gain @ (tip.position - predicted.position)
-        covariance = (np.eye(3) - gain) @ predicted.covariance
-        covariance = 0.5 * (covariance + covariance.T)
-        return dataclasses.replace(tip, position=position, covariance=covariance)
-
-    def _heading(self, position: Array, direction: Array, insertion: float | None) -> Array:
-        """Return the way of the last millimetres; the visible end's direction before that."""
-        if insertion is None:
-            return direction
-        for old in reversed(self._way):
-            if old.insertion is None or old.insertion > insertion:
-                break
-            if insertion - old.insertion >= _WAY_LENGTH:
-                way = position - old.position
-                return np.asarray(way / np.linalg.norm(way))
-        return direction
 
 
 def tip_at_entry(insertion: float, hole_tolerance: float, entry_angle: float) -> SpatialTip:

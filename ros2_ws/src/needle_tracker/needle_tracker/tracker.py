@@ -15,12 +15,19 @@ import numpy as np
 
 from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
 from needle_tracker.compiled_projection import project_point
-from needle_tracker.detection import DetectionSettings, Image, Path, cut_path, find_paths
+from needle_tracker.detection import DetectionSettings, Image, Path, cut_path, distinct, find_paths
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach, SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
 from needle_tracker.tip_fit import Expected, ImageTip, fit_expected, fit_tip, hidden
-from needle_tracker.track import DISAGREE_ALONG, GateSettings, Track, TrackState, tip_at_entry
+from needle_tracker.track import (
+    DISAGREE_ALONG,
+    TOO_FAR,
+    GateSettings,
+    Track,
+    TrackState,
+    tip_at_entry,
+)
 from needle_tracker.triangulation import SpatialTip, triangulate
 
 HIDDEN = "the end is hidden in both images"
@@ -89,7 +96,7 @@ def default_settings(phantom: Phantom) -> TrackerSettings:
         max_miss_px=1.0,
         max_depth_sigma=1e-3,
         confirm_pairs=3,
-        lost_after=3,
+        lost_after=6,
         forget_after=30,
     )
     return TrackerSettings(
@@ -117,12 +124,15 @@ class Measurement:
         Why there is no believed tip; empty where there is one.
     image_tips : pair of (ImageTip or None)
         What was found in the left and the right image, believed or not.
+    contested : SpatialTip or None
+        The tip that is not believed.
     """
 
     tip: SpatialTip | None
     state: TrackState
     reason: str
     image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
+    contested: SpatialTip | None = None
 
 
 class StereoTracker:
@@ -204,17 +214,13 @@ class StereoTracker:
             if self.track.anchor is None:
                 self._last = None
             return dataclasses.replace(measured, state=self.track.state)
-        merged = self.track.merged(measured.tip, insertion)
-        measured = dataclasses.replace(measured, tip=merged)
-        believed = self.track.accept(merged, insertion)
+        anew = measured.contested is not None
+        believed = self.track.accept(measured.tip, insertion, anew=anew)
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:
             self._last = (left_tip, right_tip)
-        if not believed:
-            return dataclasses.replace(
-                measured, tip=None, state=self.track.state, reason="not confirmed yet"
-            )
-        return dataclasses.replace(measured, state=self.track.state)
+        reason = "not confirmed yet" if believed is None else ""
+        return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
@@ -227,13 +233,13 @@ class StereoTracker:
         last = self._last
         if predicted is None or last is None or abs(predicted.ahead) > _FOLLOW_AHEAD:
             return None
-        known = predicted.insertion is not None and insertion is not None
+        known = predicted.known
         loose = 0.1 * abs(predicted.ahead)
         tips: list[ImageTip] = []
         for i in range(2):
             point = np.empty(2)
-            project_point(self.views[i].packed, predicted.position, point)
-            scale = self._detection[i].needle_width_px / self.settings.needle_width
+            project_point(self.views[i].packed, predicted.motion.position, point)
+            scale = self._scale(i)
             if not math.isfinite(point[0]):
                 return None
             room = math.dist(point, self._entries[i]) - self.settings.hole_clearance * scale
@@ -263,46 +269,80 @@ class StereoTracker:
     def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
         """Look everywhere that can be reached (with this insertion, where known)."""
         state = self.track.state
-        candidates: list[list[tuple[Path, ImageTip]]] = []
-        reason = ""
+        paths: list[list[Path]] = []
         for i, side in enumerate(SIDES):
-            look = self._detection[i]
-            if self._last is not None and look.bright is None:
-                look = dataclasses.replace(look, bright=self._last[i].bright)
-            paths = find_paths(images[i], self.grids[i], look, ends=self._ends(i, insertion))
-            sigma = 0.0
-            if insertion is not None:
-                paths = [cut_path(path, self.grids[i], insertion) for path in paths]
-                scale = look.needle_width_px / self.settings.needle_width
-                sigma = _CUT * scale
-            fitted = [(path, fit_tip(images[i], path, look, sigma)) for path in paths]
-            candidates.append([(path, tip) for path, tip in fitted if tip is not None])
-            if not paths:
-                reason = reason or f"no needle in the {side} image"
-            elif not candidates[-1]:
-                reason = reason or f"no clear tip in the {side} image"
-        if reason:
-            return Measurement(None, state, reason)
-        pairs = sorted(
-            itertools.product(*candidates),
-            key=lambda pair: -pair[0][0].evidence - pair[1][0].evidence,
-        )
+            paths.append(self._paths(images[i], i, insertion))
+            if not paths[i]:
+                return Measurement(None, state, f"no needle in the {side} image")
+        # Fitted as they are needed: the first pair is mostly the right one.
+        fitted: tuple[dict[int, ImageTip | None], dict[int, ImageTip | None]] = ({}, {})
+        pairs = [
+            pair
+            for pair in itertools.product(range(len(paths[0])), range(len(paths[1])))
+            if paths[0][pair[0]].bright is paths[1][pair[1]].bright
+        ]
+        pairs.sort(key=lambda pair: -paths[0][pair[0]].evidence - paths[1][pair[1]].evidence)
         first: Measurement | None = None
-        for (left_path, left), (right_path, right) in pairs:
-            if left_path.bright is not right_path.bright or not (left.clear or right.clear):
+        for pair in pairs:
+            for i in range(2):
+                if pair[i] not in fitted[i]:
+                    path = paths[i][pair[i]]
+                    sigma = 0.0 if insertion is None else _CUT * self._scale(i)
+                    fitted[i][pair[i]] = fit_tip(images[i], path, self._detection[i], sigma)
+            left, right = fitted[0][pair[0]], fitted[1][pair[1]]
+            left_path, right_path = paths[0][pair[0]], paths[1][pair[1]]
+            if left is None or right is None or not (left.clear or right.clear):
                 continue
-            measured = self._judged((left, right), insertion)
-            if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
-                measured = self._one_sided((left, right), insertion) or measured
+            chosen = (left_path, right_path)
+            measured = self._considered(chosen, (left, right), insertion)
             if measured.tip is not None:
-                points = shaft_points(self.views, (left_path, right_path), measured.tip.position)
-                gates = self.settings.gates
-                problem = shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
-                if problem is None:
-                    return measured
-                measured = dataclasses.replace(measured, tip=None, reason=problem)
+                return measured
             first = first or measured
-        return first or Measurement(None, state, "views do not meet")
+        if first is not None:
+            return first
+        for i, side in enumerate(SIDES):
+            if not any(fitted[i].values()):
+                return Measurement(None, state, f"no clear tip in the {side} image")
+        return Measurement(None, state, "views do not meet")
+
+    def _considered(
+        self, paths: tuple[Path, Path], found: tuple[ImageTip, ImageTip], insertion: float | None
+    ) -> Measurement:
+        """Judge a pair that was found without a prediction; its whole shaft counts too."""
+        measured = self._judged(found, insertion)
+        if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
+            measured = self._one_sided(found, insertion) or measured
+        contested = measured.reason == TOO_FAR and found[0].clear and found[1].clear
+        tip = measured.contested if contested else measured.tip
+        if tip is None:
+            return measured
+        problem = self._shaft_problem(paths, tip, insertion)
+        if problem is not None:
+            return dataclasses.replace(measured, tip=None, reason=problem)
+        if contested and self.track.contest(tip, insertion):
+            return dataclasses.replace(measured, tip=tip, reason="")
+        return measured
+
+    def _paths(self, image: Image, i: int, insertion: float | None) -> list[Path]:
+        """Return what may be the needle in an image, as long as the insertion says."""
+        look, grid = self._detection[i], self.grids[i]
+        if self._last is not None and look.bright is None:
+            look = dataclasses.replace(look, bright=self._last[i].bright)
+        paths = find_paths(image, grid, look, ends=self._ends(i, insertion))
+        if insertion is not None:
+            paths = [cut_path(path, grid, insertion) for path in paths]
+        return distinct(paths)
+
+    def _scale(self, i: int) -> float:
+        """Return the pixels per metre of one camera."""
+        return self._detection[i].needle_width_px / self.settings.needle_width
+
+    def _shaft_problem(
+        self, paths: tuple[Path, Path], tip: SpatialTip, insertion: float | None
+    ) -> str | None:
+        gates = self.settings.gates
+        points = shaft_points(self.views, paths, tip.position)
+        return shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
 
     def _one_sided(self, found: tuple[ImageTip, ImageTip], insertion: float) -> Measurement | None:
         """Believe the one end of two that fits the track; None where none or both do."""
@@ -318,7 +358,9 @@ class StereoTracker:
         if tip is None:
             return Measurement(None, state, "views do not meet", found)
         refused = self.track.judge(tip, insertion)
-        return Measurement(tip if refused is None else None, state, refused or "", found)
+        if refused is None:
+            return Measurement(tip, state, "", found)
+        return Measurement(None, state, refused, found, tip)
 
     def _ends(self, i: int, insertion: float | None) -> tuple[int, int] | None:
         """Return the rows of a grid in which the needle can end, None for all."""

@@ -82,19 +82,19 @@ def test_shortest_chord_is_an_arcs() -> None:
 def test_with_the_insertion_known_one_tip_confirms(gates: GateSettings) -> None:
     track = Track(gates)
     states = [track.state]
-    assert track.accept(tip(), 0.05)
+    assert track.accept(tip(), 0.05) is not None
     states.append(track.state)
     assert states == [TrackState.SEARCHING, TrackState.TRACKING]
     prediction = track.predict(0.051)
     assert prediction is not None
-    np.testing.assert_allclose(prediction.position, [0.0, 0.0, 0.051])
+    np.testing.assert_allclose(prediction.motion.position, [0.0, 0.0, 0.051])
 
 
 def test_without_it_several_must_agree(gates: GateSettings) -> None:
     track = Track(gates)
-    assert [track.accept(tip(), None) for _ in range(3)] == [False, False, True]
+    assert [track.accept(tip(), None) is not None for _ in range(3)] == [False, False, True]
     track.reset()
-    assert not track.accept(tip(), None)
+    assert track.accept(tip(), None) is None
     states = [track.state]
     track.miss()
     states.append(track.state)

@@ -1,0 +1,80 @@
+"""Where the tip goes: a Kalman filter over the insertion for its position and heading.
+
+The state is the tip p and its heading h, a vector of about unit length; the needle goes its
+heading's way, which bends by at most the largest curvature: p' = p + s h, h' = h + (random, up to
+kappa s), with s the insertion in between.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.triangulation import SpatialTip
+
+Array = NDArray[np.float64]
+
+_DRIFT = 0.02e-3  # what moves from pair to pair at rest [m]
+_LEAN_SIGMA = 0.12  # between the visible end and the heading (pre-bend) [rad]
+# What spoils a view spoils the next one's too: the gain is not all believed.
+_ALIKE = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class TipMotion:
+    """Position and heading with their covariance.
+
+    Attributes
+    ----------
+    position : ndarray, shape (3,)
+        In `rig` [m].
+    heading : ndarray, shape (3,)
+        About a unit vector.
+    covariance : ndarray, shape (6, 6)
+        Of both [m^2, m, -].
+    """
+
+    position: Array
+    heading: Array
+    covariance: Array
+
+    @classmethod
+    def start(cls, tip: SpatialTip) -> TipMotion:
+        """Return the state after a first tip: the heading is that of the visible end, loosely."""
+        covariance = np.zeros((6, 6))
+        covariance[:3, :3] = tip.covariance
+        covariance[3:, 3:] = _LEAN_SIGMA**2 * np.eye(3)
+        return cls(tip.position, tip.direction, covariance)
+
+    def advanced(self, ahead: float, curvature: float) -> TipMotion:
+        """Return the state `ahead` farther along the insertion (negative: drawn back) [m]."""
+        transition = np.eye(6)
+        transition[:3, 3:] = ahead * np.eye(3)
+        turned = curvature * abs(ahead)
+        noise = np.zeros((6, 6))
+        noise[:3, :3] = (_DRIFT**2 + (0.5 * turned * ahead) ** 2) * np.eye(3)
+        noise[3:, 3:] = turned**2 * np.eye(3)
+        return TipMotion(
+            self.position + ahead * self.heading,
+            self.heading,
+            transition @ self.covariance @ transition.T + noise,
+        )
+
+    def surprise(self, tip: SpatialTip) -> float:
+        """Return the squared distance of a measured tip, over the covariance of both."""
+        off = tip.position - self.position
+        return float(off @ np.linalg.solve(self.covariance[:3, :3] + tip.covariance, off))
+
+    def updated(self, tip: SpatialTip) -> TipMotion:
+        """Return the state with a measured tip taken in."""
+        gain = self.covariance[:, :3] @ np.linalg.inv(self.covariance[:3, :3] + tip.covariance)
+        change = gain @ (tip.position - self.position)
+        covariance = self.covariance - gain @ self.covariance[:3, :]
+        covariance[:3, :3] = (1.0 - _ALIKE) * covariance[:3, :3] + _ALIKE * tip.covariance
+        return TipMotion(
+            self.position + change[:3],
+            self.heading + change[3:],
+            0.5 * (covariance + covariance.T),
+        )
