@@ -18,9 +18,10 @@ import numpy as np
 import reference_loop
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_controller.control_settings import ControlSettings
 from needle_controller.gains import sampled_observer_gain
 from needle_controller.joint_history import JointSample
-from needle_controller.plane_control import ControlSettings, PlaneControl
+from needle_controller.plane_control import PlaneControl
 from needle_controller.target_plane import offset_plane
 from needle_sim import study_noise
 from needle_sim.disturbances import Disturbances

@@ -22,9 +22,11 @@ setup(
     maintainer_email="maintainers@needle-steering.invalid",
     description="The rig as a whole: operator, recorder, report, launch files, configuration.",
     license="Apache-2.0",
-    entry_points={"console_scripts": [
+    entry_points={
+        "console_scripts": [
             "recorder = needle_bringup.recorder_node:main",
             "operator = needle_bringup.operator_node:main",
             "report = needle_bringup.report:main",
-        ]},
+        ]
+    },
 )

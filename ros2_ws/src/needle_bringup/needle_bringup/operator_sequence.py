@@ -85,6 +85,7 @@ class OperatorSequence:
         self._refused_since: float | None = None
         self._homed = False
         self._steered = False
+        self._said_since_start: Mapping[str, str] | None = None
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
         self.insertion = 0.0
@@ -119,6 +120,7 @@ class OperatorSequence:
         if call.service == "device/enable" and not self._homed:
             return None
         self._pending = True
+        self._said_since_start = None
         return call
 
     def take_answer(self, success: bool, message: str, now: float) -> None:
@@ -133,6 +135,10 @@ class OperatorSequence:
             self._refused_since = None
             self._deadline = now + self._wait_timeout
             self._progress_at = now
+            said = self._said_since_start or {}
+            if self.steering and said.get("state") == "FAULT":
+                # The controller's status can overtake its answer.
+                self._judge(said)
             return
         self._refusal = message
         self._retry_at = now + RETRY_AFTER
@@ -156,8 +162,12 @@ class OperatorSequence:
         progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
-        if not self.steering:
-            return
+        if self.steering:
+            self._judge(values)
+        elif self._pending:
+            self._said_since_start = values
+
+    def _judge(self, values: Mapping[str, str]) -> None:
         state = values.get("state", "")
         if state == "DONE":
             self.outcome = Outcome(

@@ -122,6 +122,7 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
             "preset": options.controller,
             "depth": options.depth_mm * 1e-3,
             "target_offset": -options.initial_x_mm * 1e-3,
+            "wait_for_recorder": True,
         },
         "operator": {},
     }

@@ -31,7 +31,7 @@ def test_it_steers_records_and_reports(tmp_path: Path, level: str) -> None:
     summary = json.loads(result.read_text())
     assert summary == json.loads((bag / "summary.json").read_text())
     assert summary["level"] == level
-    assert summary["controller"] == "paper"
+    assert summary["controller"] == "best"
     assert summary["steps"] == 10
     assert summary["converged"] is False
     assert summary["insertion_final_mm"] == pytest.approx(10.0, abs=0.01)
@@ -46,8 +46,10 @@ def test_one_seed_is_one_run_and_another_another(tmp_path: Path) -> None:
     bags = {}
     for name, seed in (("one", "5"), ("again", "5"), ("other", "6")):
         bags[name] = tmp_path / name
-        run(bags[name], "--level", "tip", *SHORT, "--seed", seed)
+        finished = run(bags[name], "--level", "tip", *SHORT, "--seed", seed)
+        assert finished.code == 1, finished.output
     one, again, other = (payloads(bag, TOPICS) for bag in bags.values())
+    assert [len(one[topic]) for topic in TOPICS] == [11, 10, 11]
     for topic in TOPICS:
         assert one[topic] == again[topic]
     assert one["/needle/tip"] != other["/needle/tip"]

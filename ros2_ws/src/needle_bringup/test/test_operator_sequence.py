@@ -157,3 +157,18 @@ def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
     finished.interrupt()
     assert finished.outcome is not None
     assert finished.outcome.done
+
+
+def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    sequence.see_device({"homed": "true", "state": "DISABLED"})
+    for _ in PREPARATION[:-1]:
+        sequence.next_call(1.0)
+        sequence.take_answer(True, "", 1.0)
+    sequence.next_call(1.0)
+    sequence.see_controller(steering(state="FAULT", reason="the needle is gone"), 1.0)
+    assert outcome(sequence) is None
+    sequence.take_answer(True, "", 1.0)
+    assert sequence.outcome is not None
+    assert "the needle is gone" in sequence.outcome.reason

@@ -123,6 +123,12 @@ class PlaneControllerParameters:
         lower=0.0,
         upper=1.0,
     )
+    wait_for_recorder: bool = parameter(
+        False,
+        unit="-",
+        read_only=True,
+        description="Steering starts only when a node named recorder listens to everything.",
+    )
     state_weights: tuple[float, ...] = parameter(
         ControlSettings.state_weights,
         unit="1/m^2, -, m^2",

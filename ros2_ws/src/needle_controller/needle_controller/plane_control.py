@@ -135,4 +135,6 @@ class PlaneControl:
         estimator.reset(np.zeros(3), np.zeros(2))
         estimator.advance(self._settings.step_length, 0.0)
         estimator.correct([0.0, 0.0, self._settings.step_length], self._settings.tip_covariance())
-        law(estimator.estimate(), self._settings.step_length)
+        estimate = estimator.estimate()
+        law(estimate, self._settings.step_length)
+        estimate.covariance  # noqa: B018 - lazy, and compiled too

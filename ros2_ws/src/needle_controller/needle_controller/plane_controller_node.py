@@ -21,7 +21,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
 from needle_common.conversions import (
     JOINT_STATES,
     LATCHED,
@@ -108,6 +108,11 @@ class PlaneControllerNode(Node):
         self._do([])
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        missing = self._unrecorded()
+        if missing:
+            response.success = False
+            response.message = f"waiting for {', '.join(missing)}"
+            return response
         reply, actions = self._steering.on_start()
         self._do(actions)
         response.success, response.message = reply.success, reply.message
@@ -118,6 +123,21 @@ class PlaneControllerNode(Node):
         self._do(actions)
         response.success, response.message = reply.success, reply.message
         return response
+
+    def _unrecorded(self) -> list[str]:
+        if not self._settings.values.wait_for_recorder:
+            return []
+        return unrecorded(
+            self,
+            (
+                self._commands,
+                self._estimates,
+                self._reduced,
+                self._linearized,
+                self._inputs,
+                self._status,
+            ),
+        )
 
     def _on_joints(self, message: JointState) -> None:
         try:

@@ -21,7 +21,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.base_node import DiagnosticsPublisher, run_node, unrecorded
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import (
     IMAGES,
@@ -68,7 +68,6 @@ _MATCH_CHECK = 0.02
 _IDLE = 0.01
 _TURNS_PER_LOOK = 5
 _CENTRELINE_SPACING = 0.001
-_RECORDER = "recorder"
 
 
 class SimRigNode(Node):
@@ -337,14 +336,7 @@ class SimRigNode(Node):
         ]
         if not missing and self._settings.wait_for_recorder:
             publishers += [self._truth, *self._measurements]
-            missing += [
-                f"recorder of {publisher.topic_name}"
-                for publisher in publishers
-                if all(
-                    info.node_name != _RECORDER
-                    for info in self.get_subscriptions_info_by_topic(publisher.topic_name)
-                )
-            ]
+            missing += unrecorded(self, publishers)
         return missing
 
     def _why_not_ready(self) -> str:
