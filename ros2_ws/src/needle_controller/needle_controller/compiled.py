@@ -24,7 +24,9 @@ def compiled(function: Function) -> Function:
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = _CACHE
     try:
-        result = numba.njit(cache=bool(_CACHE), error_model="numpy")(function)
+        result = numba.njit(cache=bool(_CACHE), error_model="numpy", fastmath={"contract"})(
+            function
+        )
     finally:
         numba.config.CACHE_DIR = before
     return cast(Function, result)

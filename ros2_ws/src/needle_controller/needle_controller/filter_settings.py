@@ -15,25 +15,24 @@ from needle_controller.hypotheses import (
 from needle_controller.hypothesis_bank import Limits
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.0, 0.40),
+    TorsionHypothesis(0.0, 0.0, 0.0, 0.36),
     TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.15),
-    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.15),
+    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.22),
     TorsionHypothesis(0.0, 0.004, 0.002, 0.10),
-    TorsionHypothesis(0.0, 0.008, 0.002, 0.15),
+    TorsionHypothesis(0.0, 0.008, 0.002, 0.17),
 )
 """None, play and lag of two sizes each."""
 ROLL_HYPOTHESES = tuple(
-    RollHypothesis(math.radians(roll), math.radians(30.0), weight)
+    RollHypothesis(math.radians(roll), math.radians(16.0), weight)
     for roll, weight in (
-        (0.0, 0.6),
-        (60.0, 0.08),
-        (-60.0, 0.08),
-        (120.0, 0.08),
-        (-120.0, 0.08),
-        (180.0, 0.08),
+        (0.0, 0.19),
+        (30.0, 0.17),
+        (-30.0, 0.17),
+        *((float(roll), 0.052) for roll in (60, -60, 90, -90, 120, -120, 150, -150, 180)),
     )
 )
-"""As the base puts it, most likely; else anywhere."""
+"""Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
+linear in the roll knows less than it thinks when its roll is wide."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,10 +53,16 @@ class FilterSettings:
         Largest error of a measured coordinate where a tip comes without covariance [m].
     tip_noise_softness : float
         Standard deviation by which that bound is blurred [m].
+    surprise : float
+        Probability of a measured coordinate that a hypothesis does not explain: a single tip is no
+        proof against it, for its distribution is not as Gaussian as it is taken to be.
     initial_angle_std : float
         How well pitch and yaw at the entry are known [rad].
     orientation_drift : float
         Growth of the orientation's standard deviation over a metre [rad/sqrt(m)].
+    play_drift, lag_drift : float
+        Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
+        metre, where they are estimated: what keeps them open for what the model does not know.
     gate : float
         A tip is refused whose squared Mahalanobis distance is above this for every hypothesis.
     tips_until_reacceptance : int
@@ -77,17 +82,20 @@ class FilterSettings:
     """
 
     curvature: float = bounded(1.0 / 0.122, 0.1, 100.0, "1/m")
-    curvature_spread: float = bounded(0.15, 0.0, 1.0, "-")
+    curvature_spread: float = bounded(0.22, 0.0, 1.0, "-")
     curvature_range: tuple[float, float] = (0.5, 1.6)
     curvature_drift: float = bounded(0.02 * math.sqrt(1000.0), 0.0, 100.0, "1/sqrt(m)")
     tip_noise_bound: float = bounded(0.001, 1e-6, 0.1, "m")
     tip_noise_softness: float = bounded(0.0001, 0.0, 0.1, "m")
-    initial_angle_std: float = bounded(math.radians(8.0), 1e-6, math.pi, "rad")
+    surprise: float = bounded(0.05, 1e-9, 1.0, "-")
+    initial_angle_std: float = bounded(math.radians(10.0), 1e-6, math.pi, "rad")
     orientation_drift: float = bounded(math.sqrt(0.001), 0.0, 100.0, "rad/sqrt(m)")
+    play_drift: float = bounded(0.2, 0.0, 100.0, "rad/sqrt(m)")
+    lag_drift: float = bounded(0.003, 0.0, 1.0, "sqrt(m)")
     gate: float = bounded(30.0, 1.0, 1e9, "-")
     tips_until_reacceptance: int = bounded(4, 1, 1000, "-")
-    prune_ratio: float = bounded(math.exp(8.0), 1.0, 1e30, "-")
-    merge_angle: float = bounded(0.3, 0.0, math.pi, "rad")
+    prune_ratio: float = bounded(math.exp(4.0), 1.0, 1e30, "-")
+    merge_angle: float = bounded(0.35, 0.0, math.pi, "rad")
     longest_step: float = bounded(0.002, 1e-5, 1.0, "m")
     play_limit: float = bounded(1.0, 0.0, math.pi, "rad")
     lag_range: tuple[float, float] = (0.001, 0.016)
@@ -117,6 +125,8 @@ class FilterSettings:
         return Limits(
             orientation_noise=self.orientation_drift**2,
             curvature_noise=(self.curvature_drift * self.curvature) ** 2,
+            play_noise=self.play_drift**2,
+            lag_noise=self.lag_drift**2,
             smallest_curvature=self.curvature_range[0] * self.curvature,
             largest_curvature=self.curvature_range[1] * self.curvature,
             largest_play=self.play_limit,
@@ -126,4 +136,5 @@ class FilterSettings:
             merge_angle=self.merge_angle,
             gate=self.gate,
             tips_until_reacceptance=self.tips_until_reacceptance,
+            surprise=self.surprise,
         )

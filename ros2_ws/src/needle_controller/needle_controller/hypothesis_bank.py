@@ -20,8 +20,9 @@ from needle_controller.tip_motion import CURVATURE, ERROR, TORSION, move, propag
 from needle_controller.tip_update import bounded_update, gaussian_update, squared_distance
 from needle_controller.torsion_model import turn_tip
 
-PLAY, LAG, TIP_ANGLE, BEHIND_PLAY, PER_TORSION = range(5)
+PLAY, LAG, TIP_ANGLE, BEHIND_PLAY, PER_TORSION, KIND = range(6)
 """Columns of `Bank.torsion`."""
+_SAME_LAG = 0.001
 OK, MISSING, REFUSED = range(3)
 """What became of a measured tip."""
 
@@ -41,9 +42,10 @@ class Bank(NamedTuple):
         Covariance of the error as `tip_motion` orders it.
     curvature : ndarray, shape (N, H)
         kappa [1/m].
-    torsion : ndarray, shape (N, H, 5)
+    torsion : ndarray, shape (N, H, 6)
         Play [rad], lag length [m], angles of the tip and of the shaft behind the play [rad],
-        derivative of the tip's angle with respect to the torsion's size.
+        derivative of the tip's angle with respect to the torsion's size, number of the torsion
+        hypothesis.
     log_weight : ndarray, shape (N, H)
         Log weights, the needle's largest being 0.
     base : ndarray, shape (N,)
@@ -65,6 +67,8 @@ class Limits(NamedTuple):
 
     orientation_noise: float
     curvature_noise: float
+    play_noise: float
+    lag_noise: float
     smallest_curvature: float
     largest_curvature: float
     largest_play: float
@@ -74,6 +78,7 @@ class Limits(NamedTuple):
     merge_angle: float
     gate: float
     tips_until_reacceptance: int
+    surprise: float
 
 
 @compiled
@@ -125,6 +130,10 @@ def advance_bank(
                     limits.orientation_noise * step,
                     limits.curvature_noise * step,
                 )
+                covariance = bank.covariance[n, h]
+                if covariance[TORSION, TORSION] > 0.0:
+                    noise = limits.lag_noise if torsion[LAG] > 0.0 else limits.play_noise
+                    covariance[TORSION, TORSION] += noise * step
             torsion[TIP_ANGLE] = tip
             torsion[BEHIND_PLAY] = behind
             torsion[PER_TORSION] = per_torsion
@@ -182,7 +191,14 @@ def correct_bank(
             position, rotation = bank.position[n, h], bank.rotation[n, h]
             if bound > 0.0:
                 likelihood = bounded_update(
-                    position, rotation, bank.covariance[n, h], tip[n], bound, softness, change
+                    position,
+                    rotation,
+                    bank.covariance[n, h],
+                    tip[n],
+                    bound,
+                    softness,
+                    limits.surprise,
+                    change,
                 )
                 if likelihood == 0.0:
                     continue
@@ -242,13 +258,9 @@ def _merge(bank: Bank, n: int, angle: float, rolls: Array) -> None:
     while first < bank.alive[n]:
         second = first + 1
         while second < bank.alive[n]:
-            a, b = bank.torsion[n, first], bank.torsion[n, second]
-            roll = abs(rolls[first] - rolls[second])
-            roll = min(roll, 2.0 * math.pi - roll)
-            pitch = abs(bank.rotation[n, first, 0, 2] - bank.rotation[n, second, 0, 2])
-            same_kind = (a[LAG] > 0.0) == (b[LAG] > 0.0)
-            near_size = abs(a[PLAY] - b[PLAY]) < 0.5 * angle and abs(a[LAG] - b[LAG]) < 0.001
-            if same_kind and near_size and roll < angle and pitch < 0.25 * angle:
+            if bank.torsion[n, first, KIND] == bank.torsion[n, second, KIND] and _same(
+                bank, n, first, second, abs(rolls[first] - rolls[second]), angle
+            ):
                 heavy, light = bank.log_weight[n, first], bank.log_weight[n, second]
                 if light > heavy:
                     _copy(bank, n, second, first)
@@ -260,6 +272,19 @@ def _merge(bank: Bank, n: int, angle: float, rolls: Array) -> None:
             else:
                 second += 1
         first += 1
+
+
+@compiled
+def _same(bank: Bank, n: int, first: int, second: int, roll: float, angle: float) -> bool:
+    """Return whether two hypotheses are one: rolls, pitches and sizes of the torsion are near."""
+    a, b = bank.torsion[n, first], bank.torsion[n, second]
+    pitch = abs(bank.rotation[n, first, 0, 2] - bank.rotation[n, second, 0, 2])
+    return (
+        min(roll, 2.0 * math.pi - roll) < angle
+        and pitch < 0.25 * angle
+        and abs(a[PLAY] - b[PLAY]) < 0.5 * angle
+        and abs(a[LAG] - b[LAG]) < _SAME_LAG
+    )
 
 
 @compiled
@@ -280,7 +305,7 @@ def _copy(bank: Bank, n: int, source: int, target: int) -> None:
     for i in range(ERROR):
         for j in range(ERROR):
             bank.covariance[n, target, i, j] = bank.covariance[n, source, i, j]
-    for i in range(5):
+    for i in range(6):
         bank.torsion[n, target, i] = bank.torsion[n, source, i]
     bank.curvature[n, target] = bank.curvature[n, source]
     bank.log_weight[n, target] = bank.log_weight[n, source]

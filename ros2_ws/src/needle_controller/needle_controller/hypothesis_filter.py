@@ -14,6 +14,7 @@ import numpy.typing as npt
 from needle_controller.arrays import Array
 from needle_controller.filter_settings import FilterSettings
 from needle_controller.hypothesis_bank import (
+    KIND,
     LAG,
     PLAY,
     Bank,
@@ -197,9 +198,10 @@ class HypothesisFilter:
             settings.curvature_spread * settings.curvature
         ) ** 2
         covariance[..., TORSION, TORSION] = [t.size_std**2 for t, _ in pairs]
-        torsion = np.zeros((needles, count, 5))
+        torsion = np.zeros((needles, count, 6))
         torsion[..., PLAY] = [t.play for t, _ in pairs]
         torsion[..., LAG] = [t.lag_length for t, _ in pairs]
+        torsion[..., KIND] = np.arange(count) // len(settings.roll_hypotheses)
         weights = np.log([t.weight * r.weight for t, r in pairs])
         start = np.where(found[:, None], tip, 0.0)[:, None, :]
         return Bank(

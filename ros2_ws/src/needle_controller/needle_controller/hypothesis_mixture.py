@@ -12,7 +12,7 @@ import numpy as np
 from needle_controller.arrays import Array
 from needle_controller.compiled import compiled
 from needle_controller.estimator import Estimate
-from needle_controller.hypothesis_bank import BEHIND_PLAY, LAG, PLAY, TIP_ANGLE, Bank
+from needle_controller.hypothesis_bank import BEHIND_PLAY, KIND, LAG, PLAY, TIP_ANGLE, Bank
 from needle_controller.kinematics import angle_axes, rotation_from_angles
 
 (
@@ -25,10 +25,12 @@ from needle_controller.kinematics import angle_axes, rotation_from_angles
     T_PLAY,
     T_LAG,
     T_WEIGHT,
-) = range(9)
+    T_KIND,
+) = range(10)
 """Columns of `Hypotheses.table`: x [m], sin(pitch), roll [rad], curvature [1/m], angles of the tip
-and of the shaft behind the play since the start [rad], play [rad], lag length [m], weight."""
-COLUMNS = 9
+and of the shaft behind the play since the start [rad], play [rad], lag length [m], weight, number
+of the torsion hypothesis."""
+COLUMNS = 10
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
@@ -39,7 +41,7 @@ class Hypotheses:
 
     Attributes
     ----------
-    table : ndarray, shape (..., H, 9)
+    table : ndarray, shape (..., H, 10)
         One row for each hypothesis, see the `T_...` columns; weight 0 where there is none.
     base : ndarray, shape (...)
         Rotation of the base since the start [rad]; the table's angles count from there too.
@@ -93,7 +95,7 @@ def mixture(
         Mean curvature [1/m].
     ambiguous : ndarray, shape (N,), written
         Weight of the hypotheses whose roll is more than 60 deg from the likeliest one's.
-    table : ndarray, shape (N, H, 9), written
+    table : ndarray, shape (N, H, 10), written
         See `Hypotheses`; likewise `uncertainty`, shape (N, 3).
     """
     axis, side = np.empty(3), np.empty(3)
@@ -150,6 +152,7 @@ def _fill_table(bank: Bank, n: int, table: Array) -> int:
         row[T_BEHIND_PLAY] = torsion[BEHIND_PLAY]
         row[T_PLAY] = torsion[PLAY]
         row[T_LAG] = torsion[LAG]
+        row[T_KIND] = torsion[KIND]
         row[T_WEIGHT] /= total
     for h in range(bank.alive[n], table.shape[0]):
         table[h] = 0.0

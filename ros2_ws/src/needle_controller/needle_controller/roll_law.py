@@ -26,6 +26,7 @@ from needle_controller.hypothesis_mixture import (
     COLUMNS,
     T_BEHIND_PLAY,
     T_CURVATURE,
+    T_KIND,
     T_LAG,
     T_PLAY,
     T_ROLL,
@@ -40,6 +41,9 @@ from needle_controller.kinematics import PITCH, ROLL, X
 from needle_controller.law import Command
 
 _SMALLEST_LAG = 1e-6
+_USUAL_LAG = 0.008
+_FULL_DOUBT = 4.0
+_USUAL_PLAY = math.radians(40.0)
 
 
 class RollLawNumbers(NamedTuple):
@@ -55,7 +59,10 @@ class RollLawNumbers(NamedTuple):
     braking_from: float
     braking_over: float
     lag_caution: float
+    braking_caution: float
     doubt: float
+    doubt_dead_band: float
+    scatter_dead_band: float
     near: float
     near_dead_band: float
     far_dead_band: float
@@ -88,10 +95,17 @@ class RollLawSettings:
         Distance at which that begins, and over which it grows to the whole [m].
     lag_caution : float
         Share by which both gains are lowered at a lag of 8 mm.
+    braking_caution : float
+        Share by which the braking share is lowered at a lag of 8 mm or a play of 40 deg.
     doubt : float
         How much the demand on s3 shrinks with the uncertainty of what it is made of: by 1 /
-        (1 + (doubt std(s3 demand) / curvature)^4)^(1/4). Without it, a needle whose pitch is hardly
+        sqrt(1 + (doubt std(s3 demand) / curvature)^2). Without it, a needle whose pitch is hardly
         known is spun to and fro, which hides its roll.
+    doubt_dead_band : float
+        What is added to the dead band while the doubt is large, in proportion to it [rad].
+    scatter_dead_band : float
+        What is added to it where the hypotheses' rolls point everywhere, in proportion to how
+        little they agree: a needle that is left alone shows its roll soonest [rad].
     near : float
         Distance from the plane within which `near_dead_band` holds [m].
     near_dead_band, far_dead_band : float
@@ -110,17 +124,20 @@ class RollLawSettings:
     plane_gain: float = bounded(120.0, 0.0, 1e5, "1/m")
     pitch_gain: float = bounded(250.0, 0.0, 1e5, "1/m")
     braking_share: float = bounded(0.5, 0.01, 2.0, "-")
-    braking_share_added: float = bounded(0.4, 0.0, 2.0, "-")
-    braking_from: float = bounded(0.004, 0.0, 1.0, "m")
+    braking_share_added: float = bounded(0.5, 0.0, 2.0, "-")
+    braking_from: float = bounded(0.0025, 0.0, 1.0, "m")
     braking_over: float = bounded(0.003, 1e-6, 1.0, "m")
     lag_caution: float = bounded(0.45, 0.0, 1.0, "-")
+    braking_caution: float = bounded(0.5, 0.0, 1.0, "-")
     doubt: float = bounded(1.0, 0.0, 10.0, "-")
+    doubt_dead_band: float = bounded(0.0, 0.0, math.pi, "rad")
+    scatter_dead_band: float = bounded(0.8, 0.0, math.pi, "rad")
     near: float = bounded(0.0005, 0.0, 1.0, "m")
-    near_dead_band: float = bounded(0.4, 0.0, math.pi, "rad")
-    far_dead_band: float = bounded(0.25, 0.0, math.pi, "rad")
+    near_dead_band: float = bounded(0.25, 0.0, math.pi, "rad")
+    far_dead_band: float = bounded(0.15, 0.0, math.pi, "rad")
     largest_turn: float = bounded(2.0, 0.01, 100.0, "rad")
     smallest_weight: float = bounded(0.02, 0.0, 1.0, "-")
-    weight_exponent: float = bounded(1.2, 0.1, 10.0, "-")
+    weight_exponent: float = bounded(1.0, 0.1, 10.0, "-")
 
     def __post_init__(self) -> None:
         """Check every field; raises UserError with the value and the bound."""
@@ -216,7 +233,7 @@ def roll_turns(
 
     Parameters
     ----------
-    table : ndarray, shape (N, H, 9)
+    table : ndarray, shape (N, H, 10)
         See `Hypotheses`; likewise `base` and `wound`, shape (N,).
     bend_sign : ndarray, shape (N,)
         Wanted sign of cos(roll); 0 is either.
@@ -227,6 +244,7 @@ def roll_turns(
     turn, wanted : ndarray, shape (N,), written
         The results.
     """
+    means = np.empty((int(np.max(table[:, :, T_KIND])) + 1, 3))
     for n in range(table.shape[0]):
         x = pitch = heaviest = 0.0
         for h in range(table.shape[1]):
@@ -234,17 +252,21 @@ def roll_turns(
             x += weight * table[n, h, T_X]
             pitch += weight * table[n, h, T_SIN_PITCH]
             heaviest = max(heaviest, weight)
+        mean_rolls(table[n], numbers.smallest_weight * heaviest, means)
         turns = weights = s3_mean = 0.0
         for h in range(table.shape[1]):
             row = table[n, h]
             if row[T_WEIGHT] < numbers.smallest_weight * heaviest or row[T_WEIGHT] == 0.0:
                 continue
             weight = (row[T_WEIGHT] / heaviest) ** numbers.weight_exponent
-            s3, sine = wanted_bend(x, pitch, uncertainty[n], row, numbers)
-            tip_turn = nearest_turn(row[T_ROLL], sine, bend_sign[n], wound[n], numbers.max_winding)
+            s3, sine, doubt = wanted_bend(x, pitch, uncertainty[n], row, numbers)
+            roll, agreement = means[int(row[T_KIND]), 0], means[int(row[T_KIND]), 1]
+            tip_turn = nearest_turn(roll, sine, bend_sign[n], wound[n], numbers.max_winding)
             dead_band = numbers.near_dead_band
             if abs(x) > numbers.near:
                 dead_band = numbers.far_dead_band
+            dead_band += numbers.scatter_dead_band * (1.0 - agreement)
+            dead_band += numbers.doubt_dead_band * min(doubt / _FULL_DOUBT, 1.0)
             if abs(tip_turn) < dead_band:
                 tip_turn = 0.0
             asked = base_turn(row, tip_turn, base[n], numbers.step_length)
@@ -257,10 +279,40 @@ def roll_turns(
 
 
 @compiled
+def mean_rolls(table: Array, smallest_weight: float, means: Array) -> None:
+    """Write every torsion hypothesis's mean direction of roll [rad] and how its rolls agree: 0..1.
+
+    Parameters
+    ----------
+    table : ndarray, shape (H, 10)
+        One needle's hypotheses.
+    smallest_weight : float
+        What weighs less is left out.
+    means : ndarray, shape (K, 3), written
+        Roll, agreement, scratch.
+    """
+    means[:] = 0.0
+    for h in range(table.shape[0]):
+        weight = table[h, T_WEIGHT]
+        if weight > 0.0 and weight >= smallest_weight:
+            kind = int(table[h, T_KIND])
+            means[kind, 0] += weight * math.cos(table[h, T_ROLL])
+            means[kind, 1] += weight * math.sin(table[h, T_ROLL])
+            means[kind, 2] += weight
+    for kind in range(means.shape[0]):
+        if means[kind, 2] > 0.0:
+            along, across = means[kind, 0], means[kind, 1]
+            means[kind, 0] = math.atan2(across, along)
+            means[kind, 1] = math.sqrt(along * along + across * across) / means[kind, 2]
+
+
+@compiled
 def wanted_bend(
     x: float, sin_pitch: float, uncertainty: Array, row: Array, numbers: RollLawNumbers
-) -> tuple[float, float]:
-    """Return the wanted s3 [1/m] and the sine of the roll that has it.
+) -> tuple[float, float, float]:
+    """Return the wanted s3 [1/m], the sine of the roll that has it, and the doubt about it.
+
+    The doubt is the standard deviation of the demand as a share of what steering can do.
 
     Parameters
     ----------
@@ -268,16 +320,18 @@ def wanted_bend(
         Distance from the plane [m] and sine of the pitch, over all hypotheses.
     uncertainty : ndarray, shape (3,)
         Of both, see `Hypotheses`.
-    row : ndarray, shape (9,)
+    row : ndarray, shape (10,)
         A hypothesis, see `Hypotheses`.
     numbers : RollLawNumbers
         The settings.
     """
     curvature = row[T_CURVATURE]
-    caution = 1.0 - numbers.lag_caution * min(row[T_LAG] / 0.008, 1.0)
+    lag = min(row[T_LAG] / _USUAL_LAG, 1.0)
+    caution = 1.0 - numbers.lag_caution * lag
     distance = abs(x)
     far = min(max((distance - numbers.braking_from) / numbers.braking_over, 0.0), 1.0)
     share = numbers.braking_share + numbers.braking_share_added * far
+    share *= 1.0 - numbers.braking_caution * min(lag + row[T_PLAY] / _USUAL_PLAY, 1.0)
     # Level out on an arc of curvature share kappa: sin(pitch)^2 = 2 share kappa distance.
     steepest = math.sqrt(2.0 * share * curvature * distance)
     slope = numbers.plane_gain * caution
@@ -289,11 +343,11 @@ def wanted_bend(
     steerable = curvature * math.sqrt(max(1e-6, 1.0 - row[T_SIN_PITCH] ** 2))
     gain = numbers.pitch_gain * caution
     variance = uncertainty[2] + slope * (2.0 * uncertainty[1] + slope * uncertainty[0])
-    doubt = numbers.doubt * gain / steerable * math.sqrt(max(variance, 0.0))
-    gain /= math.sqrt(math.sqrt(1.0 + doubt**4))
+    doubt = gain / steerable * math.sqrt(max(variance, 0.0))
+    gain /= math.sqrt(1.0 + (numbers.doubt * doubt) ** 2)
     s3 = gain * (wanted_pitch - sin_pitch)
     s3 = min(max(s3, -steerable), steerable)
-    return s3, min(max(s3 / steerable, -1.0), 1.0)
+    return s3, min(max(s3 / steerable, -1.0), 1.0), doubt
 
 
 @compiled
@@ -342,7 +396,7 @@ def base_turn(row: Array, tip_turn: float, base: float, length: float) -> float:
 
     Parameters
     ----------
-    row : ndarray, shape (9,)
+    row : ndarray, shape (10,)
         A hypothesis, see `Hypotheses`.
     tip_turn : float
         Wanted turn of the tip [rad]; 0 asks for no motion of it.

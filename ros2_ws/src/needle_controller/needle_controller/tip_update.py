@@ -66,6 +66,7 @@ def bounded_update(
     tip: Array,
     bound: float,
     softness: float,
+    surprise: float,
     change: Array,
 ) -> float:
     """Take a tip whose coordinates are each within a bound of the truth.
@@ -80,6 +81,9 @@ def bounded_update(
         Half the box's edge [m].
     softness : float
         Variance by which the box's edges are blurred [m^2].
+    surprise : float
+        Probability, for each coordinate, of a tip that the estimate does not explain: no single tip
+        is taken as proof against it.
     change : ndarray, shape (8,), written
         What was added to the estimate; position and rotation have theirs already.
 
@@ -91,7 +95,6 @@ def bounded_update(
     p = covariance
     change[:] = 0.0
     likelihood = 0.0
-    column = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for axis in range(3):
         variance = p[axis, axis] + softness
         deviation = math.sqrt(variance)
@@ -101,24 +104,14 @@ def bounded_update(
             continue
         mass, mean, share = truncated_moments(lower, upper)
         if mass < SMALLEST_MASS:
-            likelihood += math.log(SMALLEST_MASS)
+            likelihood += math.log(surprise)
             shift = innovation - bound if innovation > 0.0 else innovation + bound
             share = _EDGE_SHARE
         else:
-            likelihood += math.log(mass)
+            likelihood += math.log(mass + surprise * (1.0 - mass))
             shift = deviation * mean
             share = min(max(share, _SMALLEST_SHARE), 1.0)
-        column = (
-            p[0, axis], p[1, axis], p[2, axis], p[3, axis],
-            p[4, axis], p[5, axis], p[6, axis], p[7, axis],
-        )  # fmt: skip
-        scale = shift / variance
-        for i in range(ERROR):
-            change[i] += column[i] * scale
-        scale = (1.0 - share) / variance
-        for i in range(ERROR):
-            for j in range(ERROR):
-                p[i, j] -= column[i] * column[j] * scale
+        _narrow(p, axis, shift / variance, (1.0 - share) / variance, change)
     _apply(position, rotation, change)
     return likelihood
 
@@ -194,6 +187,31 @@ def squared_distance(position: Array, covariance: Array, tip: Array, noise: Arra
         innovation = tip[axis] - position[axis]
         total += innovation * innovation / (covariance[axis, axis] + noise[axis, axis])
     return total
+
+
+@compiled
+def _narrow(p: Array, axis: int, shift: float, narrowing: float, change: Array) -> None:
+    """Shift by a column of the covariance, and take its square off; numbers stay in registers."""
+    c0, c1, c2, c3 = p[0, axis], p[1, axis], p[2, axis], p[3, axis]
+    c4, c5, c6, c7 = p[4, axis], p[5, axis], p[6, axis], p[7, axis]
+    change[0] += c0 * shift
+    change[1] += c1 * shift
+    change[2] += c2 * shift
+    change[3] += c3 * shift
+    change[4] += c4 * shift
+    change[5] += c5 * shift
+    change[6] += c6 * shift
+    change[7] += c7 * shift
+    for i in range(ERROR):
+        scaled = p[i, axis] * narrowing
+        p[i, 0] -= scaled * c0
+        p[i, 1] -= scaled * c1
+        p[i, 2] -= scaled * c2
+        p[i, 3] -= scaled * c3
+        p[i, 4] -= scaled * c4
+        p[i, 5] -= scaled * c5
+        p[i, 6] -= scaled * c6
+        p[i, 7] -= scaled * c7
 
 
 @compiled

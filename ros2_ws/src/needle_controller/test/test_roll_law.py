@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -10,7 +12,19 @@ from needle_common.errors import OutOfBoundsError
 from needle_controller.arrays import Array
 from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import linearized_from_reduced
-from needle_controller.hypothesis_mixture import COLUMNS, T_BEHIND_PLAY, T_LAG, T_PLAY, T_TIP_ANGLE
+from needle_controller.hypothesis_mixture import (
+    COLUMNS,
+    T_BEHIND_PLAY,
+    T_CURVATURE,
+    T_KIND,
+    T_LAG,
+    T_PLAY,
+    T_ROLL,
+    T_TIP_ANGLE,
+    T_WEIGHT,
+    Hypotheses,
+    MixtureEstimate,
+)
 from needle_controller.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
 
 CURVATURE = 1.0 / 0.122
@@ -99,6 +113,37 @@ def test_small_errors_of_the_roll_are_left_alone() -> None:
     inside, outside = 0.9 * settings.near_dead_band, 1.1 * settings.near_dead_band
     assert law()(estimate(roll=inside)).rotation_rate == 0.0
     assert law()(estimate(roll=outside)).rotation_rate < 0.0
+
+
+def test_rolls_that_disagree_leave_the_needle_alone() -> None:
+    """Two hypotheses of one torsion, a right angle apart: less is turned than for one roll."""
+    steer = law(near_dead_band=0.1, scatter_dead_band=1.0)
+    table = np.zeros((2, COLUMNS))
+    table[:, T_CURVATURE], table[:, T_WEIGHT] = CURVATURE, 0.5
+    table[:, T_ROLL] = 0.2 + np.array([0.0, 0.0])
+    assert turned(steer, table) == pytest.approx(-0.2)
+    table[:, T_ROLL] = 0.2 + np.array([-0.25, 0.25]) * np.pi
+    assert turned(steer, table) == 0.0
+
+
+def test_a_torsion_hypothesis_turns_by_its_mean_roll() -> None:
+    steer = law(near_dead_band=0.1, scatter_dead_band=0.0)
+    table = np.zeros((2, COLUMNS))
+    table[:, T_CURVATURE], table[:, T_WEIGHT] = CURVATURE, 0.5
+    table[:, T_ROLL] = [0.1, 0.5]
+    assert turned(steer, table) == pytest.approx(-0.3)
+    # As two torsions: the one within the dead band asks for nothing, the other for its own turn.
+    table[:, T_KIND] = [0.0, 1.0]
+    table[0, T_ROLL] = 0.05
+    assert turned(steer, table) == pytest.approx(-0.25)
+
+
+def turned(steer: RollLaw, table: Array) -> float:
+    plain = estimate()
+    fields = {f.name: getattr(plain, f.name) for f in dataclasses.fields(Estimate)}
+    hypotheses = Hypotheses(table, np.zeros(()), np.zeros(()), np.zeros(3))
+    command = steer(MixtureEstimate(**fields, hypotheses=hypotheses))
+    return float(command.rotation_rate) * steer.settings.step_length
 
 
 def test_doubt_makes_the_demand_small() -> None:

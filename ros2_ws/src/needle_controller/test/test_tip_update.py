@@ -65,7 +65,7 @@ def test_bounded_update_has_the_posteriors_moments() -> None:
     tip, bound = np.array([0.0012, 0.0, 0.0]), 0.001
     kept = samples[np.abs(samples[:, 0] - tip[0]) <= bound]
     change = np.empty(8)
-    likelihood = bounded_update(position, rotation, covariance, tip, bound, 0.0, change)
+    likelihood = bounded_update(position, rotation, covariance, tip, bound, 0.0, 1e-9, change)
     assert np.exp(likelihood) == pytest.approx(len(kept) / len(samples), rel=0.02)
     deviation = np.sqrt(np.diag(np.cov(kept.T)))
     used = [0, 4, 6]
@@ -84,9 +84,10 @@ def test_a_tip_that_surprises_nobody_changes_nothing() -> None:
     covariance *= 0.01
     before = position.copy(), rotation.copy(), covariance.copy()
     change = np.empty(8)
-    assert (
-        bounded_update(position, rotation, covariance, position + 1e-4, 0.001, 0.0, change) == 0.0
+    likelihood = bounded_update(
+        position, rotation, covariance, position + 1e-4, 0.001, 0.0, 0.05, change
     )
+    assert likelihood == 0.0
     for now, then in zip((position, rotation, covariance), before, strict=True):
         np.testing.assert_array_equal(now, then)
 
@@ -95,7 +96,7 @@ def test_a_tip_that_surprises_nobody_changes_nothing() -> None:
 def test_a_prior_outside_the_box_is_taken_to_its_edge(offset: float) -> None:
     position, rotation, covariance = np.zeros(3), np.eye(3), np.eye(8) * 1e-10
     bounded_update(
-        position, rotation, covariance, np.array([offset, 0.0, 0.0]), 0.001, 0.0, np.empty(8)
+        position, rotation, covariance, np.array([offset, 0.0, 0.0]), 0.001, 0.0, 0.05, np.empty(8)
     )
     assert position[0] == pytest.approx(offset - np.copysign(0.001, offset))
     assert 0.0 < covariance[0, 0] < 1e-10
@@ -130,3 +131,21 @@ def test_squared_distance_adds_the_coordinates() -> None:
     covariance = np.diag([1.0, 2.0, 3.0, 0, 0, 0, 0, 0])
     distance = squared_distance(np.zeros(3), covariance, np.array([2.0, 2.0, 2.0]), np.eye(3))
     assert distance == pytest.approx(4 / 2 + 4 / 3 + 4 / 4)
+
+
+def test_no_single_tip_is_proof() -> None:
+    """However far off: each coordinate costs at most the logarithm of `surprise`."""
+    likelihoods = [
+        bounded_update(
+            np.zeros(3),
+            np.eye(3),
+            np.eye(8) * 1e-10,
+            np.array([offset, 0.0, 0.0]),
+            0.001,
+            0.0,
+            0.05,
+            np.empty(8),
+        )
+        for offset in (0.00102, 0.0011, 0.005)
+    ]
+    assert likelihoods[0] > likelihoods[1] >= likelihoods[2] == pytest.approx(np.log(0.05))
