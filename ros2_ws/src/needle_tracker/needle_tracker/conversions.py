@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import array
 import dataclasses
+import math
 
 import numpy as np
-from geometry_msgs.msg import Point, PointStamped, PoseWithCovarianceStamped, Quaternion
+import numpy.typing as npt
+from geometry_msgs.msg import Point, PointStamped, Pose, PoseWithCovarianceStamped, Quaternion
 from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from needle_common.conversions import to_stamp
-from needle_tracker.calibration import Camera
+from needle_tracker.calibration import Camera, rotation_matrix
 from needle_tracker.orientation import orientation, rotation_covariance
 from needle_tracker.triangulation import SpatialTip
 
@@ -95,6 +98,31 @@ def to_tip_pose(tip: SpatialTip | None, stamp: int) -> PoseWithCovarianceStamped
         covariance[:3, :3] = tip.covariance
         covariance[3:, 3:] = rotation_covariance(tip.direction, tip.direction_covariance)
     message.pose.covariance = covariance.reshape(-1)
+    return message
+
+
+def rotation_of(pose: Pose) -> NDArray[np.float64] | None:
+    """Return the axes of a pose's frame as columns, (3, 3); None where it has no orientation."""
+    q = pose.orientation
+    quaternion = np.array([q.x, q.y, q.z, q.w])
+    norm = float(np.linalg.norm(quaternion))
+    return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
+
+
+def roll_sigma_of(covariance: npt.ArrayLike, axis: NDArray[np.float64]) -> float:
+    """Return the standard deviation of the rotation about an axis, from a pose's covariance."""
+    rotations = np.reshape(np.asarray(covariance, dtype=np.float64), (6, 6))[3:, 3:]
+    variance = float(axis @ rotations @ axis)
+    return math.sqrt(variance) if variance >= 0.0 else math.inf
+
+
+def to_image(pixels: NDArray[np.uint8], stamp: int) -> Image:
+    """Return the message of an RGB picture of what was exposed at `stamp` [ns]."""
+    message = Image()
+    message.header.stamp = to_stamp(stamp)
+    message.height, message.width = pixels.shape[:2]
+    message.encoding, message.step = "rgb8", 3 * pixels.shape[1]
+    message.data = array.array("B", pixels.tobytes())
     return message
 
 

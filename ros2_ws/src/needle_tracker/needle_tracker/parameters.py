@@ -131,6 +131,28 @@ class StereoTrackerParameters:
         upper=0.8,
         read_only=True,
     )
+    lean: float = parameter(
+        0.0977,
+        unit="rad",
+        description="Angle between heading and visible end; taken off with heading_from_estimate.",
+        lower=0.0,
+        upper=0.7,
+        read_only=True,
+    )
+    heading_from_estimate: bool = parameter(
+        False,
+        unit="-",
+        description="Publish the heading (lean taken off) where needle/estimate knows the roll.",
+        read_only=True,
+    )
+    annotated_rate: float = parameter(
+        2.0,
+        unit="Hz",
+        description="Most annotated images per second, while someone subscribes; 0: none.",
+        lower=0.0,
+        upper=100.0,
+        read_only=True,
+    )
     insertion_margin: float = parameter(
         2.0e-3,
         unit="m",

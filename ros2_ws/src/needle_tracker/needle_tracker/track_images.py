@@ -80,8 +80,10 @@ def _run(words: Sequence[str]) -> int:
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
     settings = dataclasses.replace(default_settings(calibration.phantom), needle_width=width)
+    tracker = StereoTracker(calibration, settings)
+    tracker.warm_up()
     begin = time.perf_counter()
-    tracked = track_sequence(pairs, StereoTracker(calibration, settings), calibration, insertions)
+    tracked = track_sequence(pairs, tracker, calibration, insertions)
     write_rows(output, tracked.rows)
     found = sum(row[1] == "1" for row in tracked.rows)
     result: dict[str, JsonValue] = {

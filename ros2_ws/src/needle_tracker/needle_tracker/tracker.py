@@ -126,6 +126,8 @@ class Measurement:
         What was found in the left and the right image, believed or not.
     contested : SpatialTip or None
         The tip that is not believed.
+    regions : pair of (Expected or None)
+        Where in the left and the right image was searched; None: everywhere, or not at all.
     """
 
     tip: SpatialTip | None
@@ -133,6 +135,7 @@ class Measurement:
     reason: str
     image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
     contested: SpatialTip | None = None
+    regions: tuple[Expected | None, Expected | None] = (None, None)
 
 
 class StereoTracker:
@@ -162,6 +165,21 @@ class StereoTracker:
         self.track = Track(settings.gates)
         self._last: tuple[ImageTip, ImageTip] | None = None
 
+    def warm_up(self) -> None:
+        """Compile, or load, all that is compiled: the first pair must not wait for it."""
+        tips = []
+        for i, view in enumerate(self.views):
+            image = np.full(self._shapes[i], 128, np.uint8)
+            point = view.project(np.array([0.0, 0.0, 0.5 * self.settings.gates.reach.length]))
+            direction = np.array([1.0, 0.0])
+            expected = Expected(point, direction, 100.0, 6, 0.0)
+            for search in (0, 6):
+                where = dataclasses.replace(expected, search=search)
+                fit_expected(image, where, False, self._detection[i])
+            find_paths(image, self.grids[i], self._detection[i])
+            tips.append(ImageTip(point, direction, 0.1, 0.1, 0.1, 50.0))
+        triangulate(self.views, (tips[0], tips[1]))
+
     def reset(self) -> None:
         """Forget the track."""
         self.track.reset()
@@ -187,7 +205,8 @@ class StereoTracker:
         ValueError
             An image of another size than the calibration's.
         """
-        images = (left, right)
+        # One memory layout: compiled code is compiled for each.
+        images = (_plain(left), _plain(right))
         for side, image, shape in zip(SIDES, images, self._shapes, strict=True):
             if image.shape != shape or image.dtype != np.uint8:
                 raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
@@ -236,6 +255,7 @@ class StereoTracker:
         known = predicted.known
         loose = 0.1 * abs(predicted.ahead)
         tips: list[ImageTip] = []
+        regions: list[Expected] = []
         for i in range(2):
             point = np.empty(2)
             project_point(self.views[i].packed, predicted.motion.position, point)
@@ -260,11 +280,15 @@ class StereoTracker:
             if tip is None:
                 return None
             tips.append(tip)
+            regions.append(expected)
         found = (tips[0], tips[1])
         if not (found[0].clear or found[1].clear):
-            return Measurement(None, self.track.state, HIDDEN, found)
-        measured = self._judged(found, insertion)
-        return measured if measured.tip is not None else None
+            measured = Measurement(None, self.track.state, HIDDEN, found)
+        else:
+            measured = self._judged(found, insertion)
+            if measured.tip is None:
+                return None
+        return dataclasses.replace(measured, regions=(regions[0], regions[1]))
 
     def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
         """Look everywhere that can be reached (with this insertion, where known)."""
@@ -386,3 +410,7 @@ class StereoTracker:
             min_contrast=settings.min_contrast,
             noise_factor=settings.noise_factor,
         )
+
+
+def _plain(image: Image) -> Image:
+    return np.require(image, requirements=["C", "W"])

@@ -1,0 +1,47 @@
+"""The picture for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from needle_tracker.annotation import annotate, describe
+from needle_tracker.calibration import StereoCalibration
+from needle_tracker.tracker import StereoTracker, TrackerSettings
+
+
+def test_tip_region_and_state_are_drawn_where_they_are(
+    calibration: StereoCalibration,
+    settings: TrackerSettings,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    for _ in range(2):
+        measured = tracker.process(left, right, 0.05)
+    assert measured.regions[0] is not None
+    picture = annotate(left, right, measured)
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] == 1024 + 4
+    coloured = np.ptp(picture[:384].astype(int), axis=2) > 60
+    tips = measured.image_tips
+    for side, tip in enumerate(tips):
+        assert tip is not None
+        v, u = np.nonzero(coloured[:, side * 514 : side * 514 + 512])
+        middle = np.array([u.mean(), v.mean()])
+        assert np.linalg.norm(middle - tip.point / 2) < 20.0
+    assert describe(measured).startswith("TRACKING: x ")
+    assert picture[390:].any()
+
+
+def test_without_a_tip_the_reason_is_given(
+    calibration: StereoCalibration, settings: TrackerSettings
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    dark = np.zeros((768, 1024), np.uint8)
+    measured = tracker.process(dark, dark, 0.05)
+    assert describe(measured) == "SEARCHING: left image is black"
+    picture = annotate(dark, dark, measured)
+    assert not np.ptp(picture[:384].astype(int), axis=2).any()
