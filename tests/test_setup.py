@@ -185,6 +185,8 @@ class Commands:
             name = "venv" if "venv" in words else "pip"
         else:
             name = "colcon" if "colcon_core" in words[2] else "import"
+        if words[0] == "bash":
+            name = "compile"
         self.names.append(name)
         if name in self.fail:
             self._module.LOG.write_text(self.output)
@@ -219,7 +221,8 @@ def commands(workspace: Workspace, monkeypatch: pytest.MonkeyPatch) -> Commands:
     return commands
 
 
-FIRST = ["venv", "pip", "pip", "import", "colcon"]
+BUILD = ["colcon", "compile"]
+FIRST = ["venv", "pip", "pip", "import", *BUILD]
 
 
 def test_a_second_set_up_does_nothing(workspace: Workspace, commands: Commands) -> None:
@@ -237,7 +240,7 @@ def test_a_renewed_lock_is_installed_into_the_environment(
     commands.names.clear()
     workspace.LOCKS["wheels"].write_text("setuptools==2 \\\n    --hash=sha256:0\n")
     assert workspace.main() == 0
-    assert commands.names == ["pip", "pip", "import", "colcon"]
+    assert commands.names == ["pip", "pip", "import", *BUILD]
 
 
 @pytest.mark.parametrize("path", ["setup.py", "config/new.yaml", "launch/rig.launch.py"])
@@ -250,7 +253,18 @@ def test_a_new_executable_or_file_is_only_built(
     file.parent.mkdir(exist_ok=True)
     file.write_text("new")
     assert workspace.main() == 0
-    assert commands.names == ["colcon"]
+    assert commands.names == BUILD
+
+
+def test_what_cannot_be_compiled_ahead_is_left_to_the_nodes(
+    workspace: Workspace, commands: Commands
+) -> None:
+    commands.fail["compile"] = workspace.CommandFailedError(1, "no compiler")
+    assert workspace.main() == 0
+    assert commands.names == FIRST
+    commands.names.clear()
+    assert workspace.main() == 0
+    assert commands.names == []
 
 
 def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands) -> None:
@@ -265,9 +279,7 @@ def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands)
     assert commands.names == []
 
 
-@pytest.mark.parametrize(
-    ("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", ["colcon"])]
-)
+@pytest.mark.parametrize(("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", BUILD)])
 def test_the_next_set_up_repairs_an_interrupted_one(
     workspace: Workspace, commands: Commands, stage: str, again: list[str]
 ) -> None:

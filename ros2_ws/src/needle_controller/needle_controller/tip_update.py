@@ -14,8 +14,8 @@ from __future__ import annotations
 
 import math
 
+from needle_common.compiled import compiled
 from needle_controller.arrays import Array
-from needle_controller.compiled import compiled
 from needle_controller.tip_motion import ERROR, rotate
 
 SMALLEST_MASS = 1e-7

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from needle_controller.compiled import compiled
+from needle_common.compiled import compiled
 
 
 @compiled

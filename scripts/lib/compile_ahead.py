@@ -1,0 +1,62 @@
+"""Compile what the nodes and studies run compiled, so that a first run does not wait for it.
+
+`scripts/setup` runs this after a build, one process for each part. Nodes that find nothing compiled
+(other sources, another machine) do it themselves when they start.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from needle_controller.control_settings import PRESETS, ControlSettings
+from needle_controller.plane_control import PlaneControl
+from needle_controller.target_plane import offset_plane
+from needle_sim.disturbances import Disturbances
+from needle_sim.insertions import render_insertion
+from needle_sim.scenarios import CLEAN
+from needle_sim.stereo_rig import load_stereo_rig
+from needle_sim.study import StudySettings, run_study
+from needle_sim.study_controllers import controller_factory
+from needle_tracker.calibration import load_calibration
+from needle_tracker.parameters import StereoTrackerParameters
+from needle_tracker.tracker import StereoTracker
+
+CALIBRATION = (
+    Path(__file__).resolve().parents[2] / "ros2_ws/src/needle_tracker/config/calibration.yaml"
+)
+
+
+def controllers() -> None:
+    """Each preset as the node has it, and in a study."""
+    for preset in PRESETS:
+        PlaneControl(ControlSettings(preset=preset), offset_plane(0.003))
+        settings = StudySettings(
+            curvature=ControlSettings.curvature,
+            depth=0.003,
+            step_length=ControlSettings.step_length,
+            disturbances=Disturbances(),
+            seed=0,
+        )
+        run_study(np.zeros((2, 3)), controller_factory(preset, 0.001), settings)
+
+
+def tracker() -> None:
+    """Acquisition and tracking of a needle."""
+    calibration = load_calibration(CALIBRATION)
+    settings = StereoTrackerParameters().tracker_settings(calibration.phantom)
+    rig = load_stereo_rig(CALIBRATION)
+    for known in (True, False):
+        stereo = StereoTracker(calibration, settings)
+        stereo.warm_up()
+        for pair in render_insertion(rig, CLEAN, seed=1, frames=14):
+            stereo.process(*pair.images, pair.insertion if known else None)
+
+
+PARTS: dict[str, Callable[[], None]] = {"controllers": controllers, "tracker": tracker}
+
+if __name__ == "__main__":
+    PARTS[sys.argv[1]]()
