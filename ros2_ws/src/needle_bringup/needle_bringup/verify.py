@@ -12,13 +12,14 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from needle_bringup import verify_step_a, verify_step_c
+from needle_bringup import verify_step_a, verify_step_b, verify_step_c
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.errors import UserError
 
 STEPS: Mapping[str, tuple[Check, ...]] = {
     "A": verify_step_a.CHECKS,
+    "B": verify_step_b.CHECKS,
     "C": verify_step_c.CHECKS,
 }
 
