@@ -67,6 +67,9 @@ class FilterSettings:
         A tip is refused whose squared Mahalanobis distance is above this for every hypothesis.
     tips_until_reacceptance : int
         After so many refused tips in a row the next one is taken all the same.
+    lost_below : float
+        When the running mean of the tips' log likelihood falls below this, no hypothesis is right
+        and all of them start over.
     prune_ratio : float
         A hypothesis ends when it is less likely than the likeliest one by this factor.
     merge_angle : float
@@ -94,7 +97,8 @@ class FilterSettings:
     lag_drift: float = bounded(0.003, 0.0, 1.0, "sqrt(m)")
     gate: float = bounded(30.0, 1.0, 1e9, "-")
     tips_until_reacceptance: int = bounded(4, 1, 1000, "-")
-    prune_ratio: float = bounded(math.exp(4.0), 1.0, 1e30, "-")
+    lost_below: float = bounded(-1.5, -1e9, -0.1, "-")
+    prune_ratio: float = bounded(math.exp(6.0), 1.0, 1e30, "-")
     merge_angle: float = bounded(0.35, 0.0, math.pi, "rad")
     longest_step: float = bounded(0.002, 1e-5, 1.0, "m")
     play_limit: float = bounded(1.0, 0.0, math.pi, "rad")

@@ -23,8 +23,8 @@ from needle_controller.torsion_model import turn_tip
 PLAY, LAG, TIP_ANGLE, BEHIND_PLAY, PER_TORSION, KIND = range(6)
 """Columns of `Bank.torsion`."""
 _SAME_LAG = 0.001
-OK, MISSING, REFUSED = range(3)
-"""What became of a measured tip."""
+EVIDENCE_SHARE = 0.15
+"""Of the newest tip in the running mean of the evidence."""
 
 
 class Bank(NamedTuple):
@@ -149,7 +149,7 @@ def correct_bank(
     softness: float,
     limits: Limits,
     refused_in_row: npt.NDArray[np.int64],
-    outcome: npt.NDArray[np.int64],
+    evidence: Array,
 ) -> None:
     """Take one measured tip of every needle.
 
@@ -167,14 +167,13 @@ def correct_bank(
         Gate, bounds of the estimates, pruning and merging.
     refused_in_row : ndarray of int, shape (N,), changed
         Tips refused since the last one taken.
-    outcome : ndarray of int, shape (N,), written
-        OK, MISSING or REFUSED.
+    evidence : ndarray, shape (N,), changed
+        Running mean of how well all hypotheses together explain the tips, as a log likelihood.
     """
     change, gain = np.empty(ERROR), np.empty((ERROR, 3))
     rolls = np.empty(bank.position.shape[1])
     for n in range(bank.alive.size):
         if not np.isfinite(tip[n, 0] + tip[n, 1] + tip[n, 2]):
-            outcome[n] = MISSING
             continue
         spread = noise[min(n, noise.shape[0] - 1)]
         nearest = np.inf
@@ -183,10 +182,11 @@ def correct_bank(
             nearest = min(nearest, distance)
         if nearest > limits.gate and refused_in_row[n] < limits.tips_until_reacceptance:
             refused_in_row[n] += 1
-            outcome[n] = REFUSED
             continue
         refused_in_row[n] = 0
-        outcome[n] = OK
+        # A tip as good as its noise is evidence 0.
+        offset = 0.0 if bound > 0.0 else 1.5 + 0.5 * math.log(_determinant(spread))
+        before = after = 0.0
         for h in range(bank.alive[n]):
             position, rotation = bank.position[n, h], bank.rotation[n, h]
             if bound > 0.0:
@@ -200,21 +200,33 @@ def correct_bank(
                     limits.surprise,
                     change,
                 )
-                if likelihood == 0.0:
-                    continue
             else:
                 likelihood = gaussian_update(
                     position, rotation, bank.covariance[n, h], tip[n], spread, change, gain
                 )
+                likelihood += offset
+            before += math.exp(bank.log_weight[n, h])
             bank.log_weight[n, h] += likelihood
+            after += math.exp(bank.log_weight[n, h])
+            if likelihood == 0.0:
+                continue
             curvature = bank.curvature[n, h] + change[CURVATURE]
             bank.curvature[n, h] = min(
                 max(curvature, limits.smallest_curvature), limits.largest_curvature
             )
             _resize_torsion(bank.torsion[n, h], change[TORSION], limits)
+        evidence[n] += EVIDENCE_SHARE * (math.log(after / before) - evidence[n])
         _prune(bank, n, limits.prune_below)
         if bank.alive[n] > 1 and limits.merge_angle > 0.0:
             _merge(bank, n, limits.merge_angle, rolls)
+
+
+@compiled
+def _determinant(m: Array) -> float:
+    first = m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+    second = m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+    third = m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+    return float(first - second + third)
 
 
 @compiled

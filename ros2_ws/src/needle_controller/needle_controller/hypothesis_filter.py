@@ -14,9 +14,11 @@ import numpy.typing as npt
 from needle_controller.arrays import Array
 from needle_controller.filter_settings import FilterSettings
 from needle_controller.hypothesis_bank import (
+    BEHIND_PLAY,
     KIND,
     LAG,
     PLAY,
+    TIP_ANGLE,
     Bank,
     advance_bank,
     correct_bank,
@@ -75,6 +77,8 @@ class HypothesisFilter:
         self._queue: list[tuple[Array, Array]] = []
         self._refused_in_row = np.zeros(needles, dtype=np.int64)
         self._too_late = np.zeros(needles, dtype=bool)
+        self._evidence = np.zeros(needles)
+        self._started_over = np.zeros(needles, dtype=bool)
         self._version = 0
 
     def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
@@ -122,8 +126,11 @@ class HypothesisFilter:
             settings.tip_noise_softness**2,
             settings.limits(),
             self._refused_in_row,
-            np.empty(len(position), dtype=np.int64),
+            self._evidence,
         )
+        lost = np.nonzero(self._evidence < settings.lost_below)[0]
+        if lost.size:
+            self._start_over(lost)
 
     def estimate(self) -> MixtureEstimate:
         """Return what is known now; see `Estimator.estimate`.
@@ -215,6 +222,25 @@ class HypothesisFilter:
             base=np.zeros(needles),
         )
 
+    def _start_over(self, lost: npt.NDArray[np.int64]) -> None:
+        """Give needles that nothing explains every hypothesis again, from where they were seen."""
+        settings = self.settings
+        bank = self._bank = _widened(
+            self._bank, len(settings.torsion_hypotheses) * len(settings.roll_hypotheses)
+        )
+        best = np.array([int(np.argmax(bank.log_weight[n, : bank.alive[n]])) for n in lost])
+        fresh = self._start(bank.position[lost, best], bank.rotation[lost, best])
+        torsion = fresh.torsion
+        torsion[..., TIP_ANGLE] = torsion[..., BEHIND_PLAY] = bank.base[lost, None]
+        # Nothing is known of the roll any more, not even what the base says of it.
+        weights = np.log([t.weight for t in settings.torsion_hypotheses])
+        fresh.log_weight[:] = np.repeat(weights - np.max(weights), len(settings.roll_hypotheses))
+        bank.alive[lost] = fresh.alive
+        for name in ("position", "rotation", "covariance", "curvature", "torsion", "log_weight"):
+            getattr(bank, name)[lost, : fresh.position.shape[1]] = getattr(fresh, name)
+        self._evidence[lost] = 0.0
+        self._started_over[lost] = True
+
     def _move(self, length: Array, turn: Array) -> None:
         """Carry the bank over an advance."""
         _advance(self._bank, length, turn, self.settings, with_covariance=True)
@@ -271,6 +297,8 @@ class HypothesisFilter:
             warnings.append(
                 f"tip refused as an outlier, {int(np.max(self._refused_in_row))} in a row"
             )
+        if np.any(self._started_over):
+            warnings.append("nothing explained the tips any more: the roll was looked for anew")
         if np.any(self._too_late):
             warnings.append("tip dropped: it is older than the last one used")
         if np.any((curvature <= least) | (curvature >= most)):
@@ -295,3 +323,18 @@ def _advance(
     parts = max(1, int(np.ceil(float(np.max(length)) / settings.longest_step - 1e-9)))
     for _ in range(parts):
         advance_bank(bank, length / parts, turn / parts, settings.limits(), with_covariance)
+
+
+def _widened(bank: Bank, count: int) -> Bank:
+    """Return a bank with room for so many hypotheses: itself where it has it."""
+    more = count - bank.position.shape[1]
+    if more <= 0:
+        return bank
+    names = ("position", "rotation", "covariance", "curvature", "torsion", "log_weight")
+    arrays = {name: getattr(bank, name) for name in names}
+    return bank._replace(
+        **{
+            name: np.pad(array, [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2))
+            for name, array in arrays.items()
+        }
+    )

@@ -334,3 +334,21 @@ def test_hypotheses_out_of_bounds_are_refused() -> None:
         TorsionHypothesis(-0.1, 0.0, 0.1, 1.0)
     with pytest.raises(OutOfBoundsError, match="std"):
         RollHypothesis(0.0, 0.0, 1.0)
+
+
+def test_starts_over_when_nothing_explains_the_tips() -> None:
+    """All hypotheses but a wrong one are taken away; the roll is found again, and it says so."""
+    turns = turns_for(100)
+    poses = path(turns, roll=np.deg2rad(170.0))
+    tips = noisy(poses)
+    wrong = FilterSettings(torsion_hypotheses=RIGID, roll_hypotheses=ROLL_AS_SET)
+    estimator = HypothesisFilter(wrong)
+    drive(estimator, turns[:15], tips[:16])
+    estimator.settings = FilterSettings()
+    seen: set[str] = set()
+    for turn, tip in zip(turns[15:], tips[16:], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip)
+        seen.update(estimator.estimate().warnings)
+    assert rotation_error(estimator.estimate(), poses[-1]) < 25.0
+    assert any("anew" in warning for warning in seen)
