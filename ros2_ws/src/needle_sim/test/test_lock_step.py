@@ -1,4 +1,4 @@
-"""When time goes on and when an exposure is due, rule by rule (docs/plan.md)."""
+"""When time goes on and when an exposure is due, rule by rule (docs/architecture.md)."""
 
 from __future__ import annotations
 
