@@ -253,7 +253,22 @@ def test_a_new_executable_or_file_is_only_built(
     file.parent.mkdir(exist_ok=True)
     file.write_text("new")
     assert workspace.main() == 0
-    assert commands.names == BUILD
+    assert commands.names == ["colcon"]
+
+
+def test_changed_compiled_code_is_compiled_and_not_built(
+    workspace: Workspace, commands: Commands
+) -> None:
+    workspace.main()
+    commands.names.clear()
+    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / "fast.py"
+    module.parent.mkdir()
+    module.write_text("from x import compiled\n\n@compiled\ndef f(): ...\n")
+    assert workspace.main() == 0
+    assert commands.names == ["compile"]
+    commands.names.clear()
+    assert workspace.main() == 0
+    assert commands.names == []
 
 
 def test_what_cannot_be_compiled_ahead_is_left_to_the_nodes(
@@ -401,6 +416,7 @@ def test_of_two_set_ups_at_a_time_the_second_waits_and_finds_all_done(
     assert commands.names == []
     workspace.install("wheels", first)
     workspace.build("wheels", first)
+    workspace.compile_ahead("wheels", first)
     commands.names.clear()
     os.close(first)
     second.join(timeout=30)

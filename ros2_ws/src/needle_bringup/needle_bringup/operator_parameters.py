@@ -27,7 +27,7 @@ class OperatorParameters:
         description="Rate of device/hold; the device wants 10 Hz or more.",
     )
     wait_timeout: float = parameter(
-        30.0,
+        90.0,
         unit="s",
         lower=0.1,
         upper=3600.0,

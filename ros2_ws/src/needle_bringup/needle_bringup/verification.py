@@ -160,6 +160,8 @@ class StartedRun:
             if time.monotonic() >= deadline:
                 return
             time.sleep(0.01)
+        if text not in self.output and self.process.poll() not in (None, 0):
+            raise UserError(f"ended before it said {text!r}: {self.output.strip()[-500:]}")
 
     def interrupt(self, number: signal.Signals) -> None:
         """Send a signal as a terminal does: to the command's process group."""
