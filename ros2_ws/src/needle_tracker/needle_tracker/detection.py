@@ -8,12 +8,11 @@ of its own: which one is the needle, two views decide together.
 """
 
 # Compiled functions take plain numbers, one by one.
-# ruff: noqa: PLR0917
+# ruff: noqa: PLR0912, PLR0917
 
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import cv2
 import numpy as np
@@ -30,8 +29,11 @@ Rows = NDArray[np.int64]
 _SLOPE = 1.0  # largest sideways step along a path, per step outwards (45 deg from the radius)
 _IMPOSSIBLE = np.float32(-1e6)
 _CUT_ROWS = 6
+_STRENGTH = 0.3  # a clear line counts for more than a faint one
+_SHADOW_SHARE, _WHOLE = 0.65, 0.7
 _NOISE_PITCH = 5
-_APART = math.radians(3.0)  # paths that end closer to each other are one
+_OWN_ROWS = 24  # near its end a path has its cells for itself, ...
+_OWN_WIDTH = 0.7e-3  # ... so far to either side [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,6 +122,23 @@ def distinct(paths: list[Path]) -> list[Path]:
     return kept
 
 
+def without_shadows(paths: list[Path]) -> list[Path]:
+    """Return the paths without those that are much fainter than another one as whole as they are.
+
+    A needle's shadow takes a share of the light only; the needle itself stands out more.
+    """
+    return [
+        path
+        for path in paths
+        if not any(
+            path.contrast < _SHADOW_SHARE * other.contrast
+            and path.bright is other.bright
+            and other.coverage >= max(_WHOLE, path.coverage - 0.1)
+            for other in paths
+        )
+    ]
+
+
 def _alike(one: Path, other: Path) -> bool:
     return (
         one.bright is other.bright
@@ -135,7 +154,7 @@ def find_paths(
     settings: DetectionSettings,
     *,
     ends: tuple[int, int] | None = None,
-    count: int = 4,
+    count: int = 3,
 ) -> list[Path]:
     """Return paths that may be the needle.
 
@@ -170,13 +189,13 @@ def find_paths(
     steps = np.maximum(
         1, np.ceil(_SLOPE * grid.row_pitch / (grid.distances[:rows] * grid.angle_pitch))
     ).astype(np.int64)
-    apart = max(round(_APART / grid.angle_pitch), 1)
+    widths = np.ceil(_OWN_WIDTH / (grid.distances[:rows] * grid.angle_pitch)).astype(np.int64)
     least = max(int(settings.min_length / grid.row_pitch), 2)
     found = []
     for bright in (False, True) if settings.bright is None else (settings.bright,):
         sign = np.float32(1.0 if bright else -1.0)
         cells, lengths, sums = _best_paths(
-            ridge, reachable, steps, sign, np.float32(threshold), first_end, count, apart
+            ridge, reachable, steps, widths, sign, np.float32(threshold), first_end, count
         )
         for path_columns, end_row, evidence in zip(cells, lengths, sums, strict=True):
             if end_row + 1 < least:
@@ -239,52 +258,67 @@ def _noise(ridge: Ridge) -> float:
 
 
 @compiled
-def _best_paths(
-    ridge: Ridge,
-    reachable: NDArray[np.bool_],
-    steps: Rows,
-    sign: np.float32,
-    threshold: np.float32,
-    first_end: int,
-    count: int,
-    apart: int,
-) -> tuple[Rows, Rows, Array]:
-    """Return columns (count, rows), end rows and sums of the paths with the most evidence.
-
-    A path starts in the first row, ends in `first_end` or later and moves at most `steps[row]`
-    columns sideways from a row to the next. Ends are more than `apart` columns from each other.
-    """
-    rows, columns = ridge.shape
-    total = np.empty((rows, columns), np.float32)
-    best_end = np.full(columns, _IMPOSSIBLE, np.float32)
-    end_row = np.zeros(columns, np.int64)
-    for i in range(rows):
+def _accumulate(evidence: Ridge, steps: Rows, total: Ridge, first: int) -> None:
+    """Fill `total` from a row on with the largest sums of evidence of paths to each cell."""
+    rows, columns = evidence.shape
+    for i in range(first, rows):
         step = steps[i]
         for j in range(columns):
-            value = -threshold
-            if reachable[i, j]:
-                value = min(max(sign * ridge[i, j] - threshold, -threshold), 2.0 * threshold)
+            best = np.float32(0.0)
             if i:
                 best = _IMPOSSIBLE
                 for k in range(max(j - step, 0), min(j + step, columns - 1) + 1):
                     best = max(best, total[i - 1, k])
-                value += best
-            total[i, j] = value
-            if i >= first_end and value > best_end[j]:
-                best_end[j] = value
-                end_row[j] = i
+            total[i, j] = evidence[i, j] + best
+
+
+@compiled
+def _best_paths(
+    ridge: Ridge,
+    reachable: NDArray[np.bool_],
+    steps: Rows,
+    widths: Rows,
+    sign: np.float32,
+    threshold: np.float32,
+    first_end: int,
+    count: int,
+) -> tuple[Rows, Rows, Array]:
+    """Return columns (count, rows), end rows and sums of the paths with the most evidence.
+
+    A path starts in the first row, ends in `first_end` or later and moves at most `steps[row]`
+    columns sideways from a row to the next. What one path has used near its end is worth nothing
+    to the next: where two lines cross, both are followed.
+    """
+    rows, columns = ridge.shape
+    evidence = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            value = -threshold
+            if reachable[i, j]:
+                over = sign * ridge[i, j] - threshold
+                value = min(max(over, -threshold), 2.0 * threshold)
+                value += _STRENGTH * min(max(over - 2.0 * threshold, 0.0), 8.0 * threshold)
+            evidence[i, j] = value
+    total = np.empty((rows, columns), np.float32)
+    _accumulate(evidence, steps, total, 0)
+    fresh = max(first_end - _OWN_ROWS, 1)
     cells = np.zeros((count, rows), np.int64)
     lengths = np.zeros(count, np.int64)
     sums = np.zeros(count)
     for n in range(count):
-        column = int(np.argmax(best_end))
-        if not best_end[column] > 0.0:
+        if n:
+            _accumulate(evidence, steps, total, fresh)
+        end, column, largest = 0, 0, np.float32(0.0)
+        for i in range(first_end, rows):
+            for j in range(columns):
+                if total[i, j] > largest:
+                    end, column, largest = i, j, total[i, j]
+        if not largest > 0.0:
             break
-        sums[n] = best_end[column] / threshold
-        lengths[n] = end_row[column]
-        best_end[max(column - apart, 0) : column + apart + 1] = _IMPOSSIBLE
-        cells[n, lengths[n]] = column
-        for i in range(lengths[n], 0, -1):
+        sums[n] = largest / threshold
+        lengths[n] = end
+        cells[n, end] = column
+        for i in range(end, 0, -1):
             # Of equals the straightest: a flat stretch must not pull the path to one side.
             chosen, best = column, total[i - 1, column]
             for away in range(1, steps[i] + 1):
@@ -293,4 +327,7 @@ def _best_paths(
                         chosen, best = k, total[i - 1, k]
             column = chosen
             cells[n, i - 1] = column
+        for i in range(fresh, end + 1):
+            place = cells[n, i]
+            evidence[i, max(place - widths[i], 0) : place + widths[i] + 1] = -threshold
     return cells, lengths, sums

@@ -253,7 +253,7 @@ class StereoTrackerParameters:
             free_step=self.free_step,
             max_disagreement=self.max_disagreement,
             max_miss_px=1.0,
-            max_depth_sigma=1e-3,
+            max_depth_sigma=0.5e-3,
             confirm_pairs=self.confirm_pairs,
             lost_after=self.lost_after,
             forget_after=self.forget_after,

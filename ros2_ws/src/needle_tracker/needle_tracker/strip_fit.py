@@ -35,6 +35,8 @@ _AGREE_PX = 0.7  # what agrees with a line [px]
 _VOTE_STEP_PX = 0.3
 _SHIFTS, _TILTS = 9, 8
 _ROWS_ALIKE = 3.0
+_NEEDLE_MASS = 0.62  # what a shadow on the floor does not have
+_FAINT_DOUBT = 0.3
 
 
 @compiled
@@ -60,7 +62,8 @@ def find_end(
     along : float
         The end [px from the middle]; NaN where there is none.
     before, after : float
-        Mean mass just inside and just outside the end: 1 and 0 for a clear end.
+        Mean mass just inside and just outside the end: 1 and 0 for a clear end. What is faint and
+        even beyond the end counts for little.
     """
     rows = len(mass)
     nothing = (np.nan, 0.0, 0.0)
@@ -73,12 +76,12 @@ def find_end(
         smooth[i] = total / (last - first + 1)
     best, largest, votes = -1, -1e30, 0.0
     for i in range(rows - 1):
-        votes += min(max(smooth[i] - 0.5, -0.5), 0.5)
+        votes += min(max(smooth[i] - _NEEDLE_MASS, -0.5), 0.5)
         value = votes
         if prior_sigma > 0.0:
             far = (i + 0.5 - behind - prior) / prior_sigma
             value -= 0.5 * far * far
-        if value > largest and smooth[i] >= 0.5 > smooth[i + 1]:
+        if value > largest and smooth[i] >= _NEEDLE_MASS > smooth[i + 1]:
             best, largest = i, value
     if best < LEAST_ROWS - 2:
         return nothing
@@ -87,7 +90,10 @@ def find_end(
     level = part[len(part) // 2]
     if not 0.75 < level < 1.35:
         level = 1.0
-    half = 0.5 * level
+    # Beyond the end there may be something fainter, such as the needle's own shadow.
+    part = np.sort(mass[min(best + 4, rows - 4) : min(best + 11, rows)])
+    beyond = part[len(part) // 2]
+    half = 0.5 * (level + min(max(beyond, 0.0), _NEEDLE_MASS))
     i = best
     while i > 0 and smooth[i] < half:
         i -= 1
@@ -101,6 +107,8 @@ def find_end(
     for k in range(size):
         before += mass[max(i - 2 - k, 0)] / level / size
         after += mass[min(i + 4 + k, rows - 1)] / level / size
+    if 0.0 < beyond < _NEEDLE_MASS:
+        after = max(abs(after - beyond / level), _FAINT_DOUBT * beyond / level)
     return along, before, after
 
 

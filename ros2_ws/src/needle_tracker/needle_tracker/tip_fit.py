@@ -23,6 +23,7 @@ _HIDDEN_FACTOR = 3.0  # what hides the end is beside the line too
 _CLEAR_BEFORE = (0.65, 1.45)
 _CLEAR_AFTER = 0.3
 _PATH_SEARCH_PX = 6
+_SURE_PX = 0.15
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,12 +107,18 @@ def fit_tip(
     """
     point, direction = _coarse_line(path.pixels, LINE_WIDTHS * settings.needle_width_px)
     room = float(np.linalg.norm(path.pixels[0] - point)) + 2.0
-    expected = Expected(point, direction, room, _PATH_SEARCH_PX, sigma_along)
-    tip = fit_expected(image, expected, path.bright, settings)
-    if tip is None:
-        on_line = dataclasses.replace(expected, search=0)
-        tip = fit_expected(image, on_line, path.bright, settings)
-    return tip
+    best: ImageTip | None = None
+    # On the path itself first: a line beside the needle, such as its shadow, then hardly matters.
+    for search in (0, _PATH_SEARCH_PX):
+        expected = Expected(point, direction, room, search, sigma_along)
+        tip = fit_expected(image, expected, path.bright, settings)
+        if tip is None:
+            continue
+        if tip.clear and tip.sigma_across < _SURE_PX:
+            return tip
+        if best is None or (tip.clear, -tip.sigma_across) > (best.clear, -best.sigma_across):
+            best = tip
+    return best
 
 
 def fit_expected(

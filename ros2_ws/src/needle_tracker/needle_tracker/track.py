@@ -20,10 +20,14 @@ from needle_tracker.triangulation import SpatialTip
 Array = NDArray[np.float64]
 
 DISAGREE_ALONG = "views disagree along the needle"
+UNCERTAIN = "too uncertain"
 TOO_FAR = "too far from the last tip"
 _HEADING_TOLERANCE = 0.12  # [rad]
 _HIDDEN_PER_LOST = 4
-_RIVALS = 2
+_CERTAIN = 0.5e-3  # [m]
+_CONFIRM_KNOWN = 2
+_RIVALS_TRACKING = 2
+_NO_SURPRISE = 9.0
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
@@ -134,7 +138,7 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
     checks = [
         (tip.disagreement > settings.max_disagreement, DISAGREE_ALONG),
         (tip.disagreement_across > settings.max_miss_px, "views disagree across the needle"),
-        (largest_sigma > settings.max_depth_sigma, "too uncertain"),
+        (largest_sigma > settings.max_depth_sigma, UNCERTAIN),
         (tip.position[0] > settings.surface_height, "above the surface"),
         (distance < settings.least_distance, "too close to the entry"),
         (distance > reach.length + margin, "beyond the longest insertion"),
@@ -220,7 +224,12 @@ class Track:
         return reason
 
     def accept(
-        self, tip: SpatialTip, insertion: float | None, *, anew: bool = False
+        self,
+        tip: SpatialTip,
+        insertion: float | None,
+        *,
+        anew: bool = False,
+        certain: bool = True,
     ) -> SpatialTip | None:
         """Take a tip that passed `judge`.
 
@@ -232,6 +241,8 @@ class Track:
             Length of needle in the phantom at the exposure [m].
         anew : bool
             Whether what was known before was wrong.
+        certain : bool
+            Whether one such tip is enough to begin with, if the insertion is known.
 
         Returns
         -------
@@ -242,9 +253,10 @@ class Track:
         """
         predicted = self.predict(insertion)
         if self.state is not TrackState.TRACKING:
-            known = insertion is not None
             self._agreeing = self._agreeing + 1 if self.state is TrackState.CONFIRMING else 1
-            wanted = 1 if known else self._settings.confirm_pairs
+            wanted = self._settings.confirm_pairs
+            if insertion is not None:
+                wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
             confirmed = self._agreeing >= wanted
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
         self._misses = self._hidden = self._rivals = 0
@@ -258,20 +270,36 @@ class Track:
         self.anchor = Anchor(motion, insertion)
         return tip if self.state is TrackState.TRACKING else None
 
-    def contest(self, tip: SpatialTip, insertion: float | None) -> bool:
-        """Note a tip that only the last one speaks against; return whether it has won.
+    def is_certain(self, insertion: float | None) -> bool:
+        """Return whether the tip's place is known so well that half a sight of it is enough."""
+        predicted = self.predict(insertion)
+        if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
+            return False
+        variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
+        return variance < _CERTAIN**2
+
+    def fits(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Return whether a tip is where it must be, by a prediction that is certain."""
+        predicted = self.predict(insertion)
+        certain = predicted is not None and self.is_certain(insertion)
+        return certain and predicted is not None and predicted.motion.surprise(tip) < _NO_SURPRISE
+
+    def contest(self, tip: SpatialTip, insertion: float | None, wanted: int) -> bool:
+        """Note a tip that the track does not bear out; return whether it has won.
 
         Parameters
         ----------
         tip : SpatialTip
-            One that passed all gates but `TOO_FAR`, its whole shaft included.
+            One that passed all other gates, its whole shaft included.
         insertion : float or None
             Length of needle in the phantom at the exposure [m].
+        wanted : int
+            How many in a row win where the track is lost; more are wanted where it is not.
 
         Returns
         -------
         bool
-            Whether the track is lost and enough such tips in a row agree: then the track was wrong.
+            Whether enough such tips in a row agree: then the track was wrong.
         """
         rival = self._rival
         agrees = False
@@ -282,7 +310,9 @@ class Track:
             agrees = miss <= self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
         self._rivals = self._rivals + 1 if agrees else 1
         self._rival = Anchor(TipMotion.start(tip), insertion)
-        return self.state is TrackState.LOST and self._rivals >= _RIVALS
+        if self.state is TrackState.TRACKING:
+            wanted += _RIVALS_TRACKING
+        return self._rivals >= wanted
 
     def miss(self) -> None:
         """Note a pair without a believed tip."""

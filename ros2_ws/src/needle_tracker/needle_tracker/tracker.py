@@ -15,7 +15,15 @@ import numpy as np
 
 from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
 from needle_tracker.compiled_projection import project_point
-from needle_tracker.detection import DetectionSettings, Image, Path, cut_path, distinct, find_paths
+from needle_tracker.detection import (
+    DetectionSettings,
+    Image,
+    Path,
+    cut_path,
+    distinct,
+    find_paths,
+    without_shadows,
+)
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach, SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
@@ -23,6 +31,7 @@ from needle_tracker.tip_fit import Expected, ImageTip, fit_expected, fit_tip, hi
 from needle_tracker.track import (
     DISAGREE_ALONG,
     TOO_FAR,
+    UNCERTAIN,
     GateSettings,
     Track,
     TrackState,
@@ -30,12 +39,20 @@ from needle_tracker.track import (
 )
 from needle_tracker.triangulation import SpatialTip, triangulate
 
+UNCLEAR = "not clear enough to begin with"
 HIDDEN = "the end is hidden in both images"
 _SIDEWAYS = 0.9e-3  # the strip reaches so far beside the prediction [m] ...
 _ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma) [m]
+# What both ends must keep to begin a track, and to begin it with the first pair [px].
+_SOUND_PX, _SOUND_ALONG_PX = 0.3, 1.0
+_CERTAIN_PX, _CERTAIN_ALONG_PX = 0.15, 0.6
+_CONTRAST_RATIO = 2.2
+# So many in a row that agree win against the track, or without one that is good.
+_SOUND_RIVALS, _UNSOUND_RIVALS = 2, 3
 _FOLLOW_DIRECTLY = 6e-3  # up to here the prediction is as good as the strip is wide [m]
 _FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
+_GRID_AHEAD = 1.5e-3
 _GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
 
 
@@ -94,7 +111,7 @@ def default_settings(phantom: Phantom) -> TrackerSettings:
         free_step=5.0e-3,
         max_disagreement=1.5e-3,
         max_miss_px=1.0,
-        max_depth_sigma=1e-3,
+        max_depth_sigma=0.5e-3,
         confirm_pairs=3,
         lost_after=6,
         forget_after=30,
@@ -136,6 +153,27 @@ class Measurement:
     image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
     contested: SpatialTip | None = None
     regions: tuple[Expected | None, Expected | None] = (None, None)
+
+
+def is_sound(
+    found: tuple[ImageTip | None, ImageTip | None], across_px: float, along_px: float
+) -> bool:
+    """Return whether both views show the same needle's end well.
+
+    Parameters
+    ----------
+    found : pair of (ImageTip or None)
+        What the left and the right image show.
+    across_px, along_px : float
+        Largest standard deviations of the end [px].
+    """
+    left, right = found
+    if left is None or right is None or not (left.clear and right.clear):
+        return False
+    contrasts = sorted((left.contrast, right.contrast))
+    return contrasts[1] <= _CONTRAST_RATIO * contrasts[0] and all(
+        tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
+    )
 
 
 class StereoTracker:
@@ -226,7 +264,7 @@ class StereoTracker:
         if measured is None:
             measured = self._acquire(images, insertion)
         if measured.tip is None:
-            if measured.reason == HIDDEN:
+            if measured.reason in (HIDDEN, UNCERTAIN):
                 self.track.hide()
             else:
                 self.track.miss()
@@ -234,7 +272,8 @@ class StereoTracker:
                 self._last = None
             return dataclasses.replace(measured, state=self.track.state)
         anew = measured.contested is not None
-        believed = self.track.accept(measured.tip, insertion, anew=anew)
+        beyond_doubt = is_sound(measured.image_tips, _CERTAIN_PX, _CERTAIN_ALONG_PX)
+        believed = self.track.accept(measured.tip, insertion, anew=anew, certain=beyond_doubt)
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:
             self._last = (left_tip, right_tip)
@@ -251,6 +290,8 @@ class StereoTracker:
         predicted = self.track.predict(insertion)
         last = self._last
         if predicted is None or last is None or abs(predicted.ahead) > _FOLLOW_AHEAD:
+            return None
+        if predicted.known and not self.track.is_certain(insertion):
             return None
         known = predicted.known
         loose = 0.1 * abs(predicted.ahead)
@@ -286,7 +327,7 @@ class StereoTracker:
             measured = Measurement(None, self.track.state, HIDDEN, found)
         else:
             measured = self._judged(found, insertion)
-            if measured.tip is None:
+            if measured.tip is None and measured.reason != UNCERTAIN:
                 return None
         return dataclasses.replace(measured, regions=(regions[0], regions[1]))
 
@@ -298,6 +339,7 @@ class StereoTracker:
             paths.append(self._paths(images[i], i, insertion))
             if not paths[i]:
                 return Measurement(None, state, f"no needle in the {side} image")
+        paths = _of_one_polarity(paths)
         # Fitted as they are needed: the first pair is mostly the right one.
         fitted: tuple[dict[int, ImageTip | None], dict[int, ImageTip | None]] = ({}, {})
         pairs = [
@@ -336,26 +378,39 @@ class StereoTracker:
         measured = self._judged(found, insertion)
         if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
             measured = self._one_sided(found, insertion) or measured
-        contested = measured.reason == TOO_FAR and found[0].clear and found[1].clear
-        tip = measured.contested if contested else measured.tip
+        sound = is_sound(found, _SOUND_PX, _SOUND_ALONG_PX)
+        if measured.reason == TOO_FAR and sound:
+            wanted = _SOUND_RIVALS
+        elif (
+            measured.tip is not None and not sound and not self.track.fits(measured.tip, insertion)
+        ):
+            if self.track.anchor is None:
+                return dataclasses.replace(measured, tip=None, reason=UNCLEAR)
+            wanted = _UNSOUND_RIVALS
+        else:
+            wanted = 0
+        tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured
         problem = self._shaft_problem(paths, tip, insertion)
         if problem is not None:
             return dataclasses.replace(measured, tip=None, reason=problem)
-        if contested and self.track.contest(tip, insertion):
-            return dataclasses.replace(measured, tip=tip, reason="")
-        return measured
+        if not wanted:
+            return measured
+        if self.track.contest(tip, insertion, wanted):
+            return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
+        return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
 
     def _paths(self, image: Image, i: int, insertion: float | None) -> list[Path]:
         """Return what may be the needle in an image, as long as the insertion says."""
         look, grid = self._detection[i], self.grids[i]
-        if self._last is not None and look.bright is None:
+        following = self._last is not None and self.track.state is TrackState.TRACKING
+        if self._last is not None and following and look.bright is None:
             look = dataclasses.replace(look, bright=self._last[i].bright)
         paths = find_paths(image, grid, look, ends=self._ends(i, insertion))
         if insertion is not None:
             paths = [cut_path(path, grid, insertion) for path in paths]
-        return distinct(paths)
+        return without_shadows(distinct(paths))
 
     def _scale(self, i: int) -> float:
         """Return the pixels per metre of one camera."""
@@ -393,7 +448,7 @@ class StereoTracker:
         gates, grid = self.settings.gates, self.grids[i]
         room = gates.insertion_margin + _GRID_MARGIN
         shortest = gates.reach.shortest_chord(insertion)
-        return grid.row_of(shortest - room), grid.row_of(insertion + room)
+        return grid.row_of(shortest - room), grid.row_of(insertion + _GRID_AHEAD)
 
     def _grid(self, view: RefractedCamera) -> SearchGrid:
         return make_search_grid(
@@ -414,3 +469,15 @@ class StereoTracker:
 
 def _plain(image: Image) -> Image:
     return np.require(image, requirements=["C", "W"])
+
+
+def _of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
+    """Return the dark paths of both views, or the bright ones: those that stand out more.
+
+    Beside a dark line there are bright ones, such as the gap between needle and shadow.
+    """
+    best = [
+        sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
+        for bright in (False, True)
+    ]
+    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]
