@@ -378,7 +378,7 @@ class StereoTracker:
         measured = self._judged(found, insertion)
         if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
             measured = self._one_sided(found, insertion) or measured
-        sound = is_sound(found, _SOUND_PX, _SOUND_ALONG_PX)
+        sound = is_sound(measured.image_tips, _SOUND_PX, _SOUND_ALONG_PX)
         if measured.reason == TOO_FAR and sound:
             wanted = _SOUND_RIVALS
         elif (

@@ -1,0 +1,62 @@
+"""The filter over the insertion."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import chi2
+
+from needle_tracker.tip_motion import TipMotion
+from needle_tracker.triangulation import SpatialTip
+
+CURVATURE = 8.0
+
+
+def measured(position: np.ndarray, sigma: np.ndarray, direction: np.ndarray) -> SpatialTip:
+    return SpatialTip(position, np.diag(sigma**2), direction, np.eye(3) * 1e-4, 0.0, 0.0)
+
+
+def way(mm: float) -> tuple[np.ndarray, np.ndarray]:
+    turn = CURVATURE * mm * 1e-3
+    place = np.array([(1 - np.cos(turn)) / CURVATURE, 0.0, np.sin(turn) / CURVATURE])
+    return place, np.array([np.sin(turn), 0.0, np.cos(turn)])
+
+
+def test_a_bent_way_is_predicted_within_its_covariance() -> None:
+    rng = np.random.default_rng(5)
+    sigma = np.array([0.05e-3, 0.01e-3, 0.01e-3])
+    surprises = []
+    for _ in range(60):
+        # The visible end leans off the heading.
+        lean = np.array([0.08, 0.05, 0.0])
+        motion = None
+        for mm in range(20, 50):
+            place, heading = way(mm)
+            seen = (heading + lean) / np.linalg.norm(heading + lean)
+            tip = measured(place + rng.normal(0.0, sigma), sigma, seen)
+            if motion is None:
+                motion = TipMotion.start(tip)
+                continue
+            motion = motion.advanced(1e-3, CURVATURE)
+            surprises.append(motion.surprise(tip))
+            motion = motion.updated(tip)
+        assert motion is not None
+        np.testing.assert_allclose(motion.heading, way(49)[1], atol=0.05)
+    assert np.mean(np.array(surprises) < chi2.ppf(0.95, 3)) > 0.93
+
+
+def test_a_spoilt_view_moves_the_tip_less_than_a_clear_one() -> None:
+    start = measured(np.zeros(3), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
+    motion = TipMotion.start(start).advanced(1e-3, CURVATURE)
+    off = np.array([0.4e-3, 0.0, 1e-3])
+    moved = [
+        motion.updated(measured(off, np.array([sigma, 1e-5, 1e-5]), start.direction)).position[0]
+        for sigma in (1e-5, 1e-3)
+    ]
+    assert moved[0] > 0.35e-3
+    assert moved[1] < 0.1e-3
+
+
+def test_drawn_back_it_goes_back() -> None:
+    start = measured(np.array([0.0, 0.0, 0.05]), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
+    back = TipMotion.start(start).advanced(-2e-3, CURVATURE)
+    np.testing.assert_allclose(back.position, [0.0, 0.0, 0.048])
