@@ -16,6 +16,7 @@ from typing import NoReturn
 import numpy as np
 
 import reference_loop
+import tracker_benchmark
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
 from needle_controller.control_settings import ControlSettings
@@ -192,10 +193,36 @@ def memory() -> Iterator[Row]:
         )
 
 
+def tracker() -> Iterator[Row]:
+    """From a stereo pair to a tip: time and 95 % error beside the plain OpenCV ways."""
+    ways = {way.key: way for way in tracker_benchmark.ways()}
+    for key in ("full", "region"):
+        way = ways[key]
+        for plain_key in ("plain", "plain_corrected"):
+            plain = ways[plain_key]
+            yield Row(
+                f"tracker_{way.key}_pair",
+                f"{way.what}, a pair ({way.pairs_per_s:.0f}/s)",
+                "ms",
+                1e3 / way.pairs_per_s,
+                plain.what,
+                1e3 / plain.pairs_per_s,
+            )
+            yield Row(
+                f"tracker_{way.key}_error",
+                f"{way.what}, 95 % error",
+                "mm",
+                way.distance_p95_mm,
+                plain.what,
+                plain.distance_p95_mm,
+            )
+
+
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": studies,
     "updates": updates,
     "memory": memory,
+    "tracker": tracker,
 }
 
 
