@@ -194,7 +194,7 @@ class StereoTrackerParameters:
         read_only=True,
     )
     lost_after: int = parameter(
-        6,
+        10,
         unit="-",
         description="Pairs in a row without a tip after which the track is lost.",
         lower=1,

@@ -113,7 +113,7 @@ def default_settings(phantom: Phantom) -> TrackerSettings:
         max_miss_px=1.0,
         max_depth_sigma=0.5e-3,
         confirm_pairs=3,
-        lost_after=6,
+        lost_after=10,
         forget_after=30,
     )
     return TrackerSettings(
