@@ -23,7 +23,8 @@ from needle_tracker.calibration import SIDES, StereoCalibration, load_calibratio
 from needle_tracker.calibration_check import check
 from needle_tracker.calibration_session import Session, load_session
 from needle_tracker.check_options import CheckOptions, figures, parse, report
-from needle_tracker.conversions import Frame, to_frame
+from needle_tracker.conversions import to_frame
+from needle_tracker.pair_answers import Frame
 from needle_tracker.pairing import PairMatcher
 from needle_tracker.rig_model import BoardView
 

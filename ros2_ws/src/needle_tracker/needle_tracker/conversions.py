@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import array
-import dataclasses
 import math
 
 import numpy as np
@@ -15,19 +14,12 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 from needle_common.conversions import to_stamp
 from needle_tracker.calibration import Camera, rotation_matrix
 from needle_tracker.orientation import orientation, rotation_covariance
+from needle_tracker.pair_answers import Frame
 from needle_tracker.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 INSERTION_JOINT = "insertion_joint"
 _ENCODINGS = ("mono8", "8UC1")
-
-
-@dataclasses.dataclass(frozen=True)
-class Frame:
-    """An image as it came: `pixels` (shared with the message), or what is wrong with it."""
-
-    pixels: NDArray[np.uint8] | None
-    problem: str = ""
 
 
 def to_frame(message: Image, side: str, camera: Camera) -> Frame:

@@ -51,6 +51,11 @@ class Health:
             self._first_image = now
         self._last_image[side] = now
 
+    def pair_refused(self, reason: str, now: float) -> None:
+        """Note a pair that was not looked at."""
+        self.refused[reason] += 1
+        self.last_refusal = (now, reason)
+
     def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
         """Note an answered pair, completed at `arrival` and answered at `now`."""
         self._done.append((now, now - arrival))

@@ -7,6 +7,7 @@ import dataclasses
 from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_tracker.calibration import Phantom
+from needle_tracker.pair_answers import AnsweringSettings
 from needle_tracker.search_grid import Reach
 from needle_tracker.track import GateSettings
 from needle_tracker.tracker import TrackerSettings
@@ -223,10 +224,13 @@ class StereoTrackerParameters:
                 f"lost_after = {self.lost_after} is above forget_after = {self.forget_after}"
             )
 
-    @property
-    def pair_tolerance_ns(self) -> int:
-        """The pair tolerance in whole nanoseconds."""
-        return round(self.pair_tolerance * 1e9)
+    def answering_settings(self) -> AnsweringSettings:
+        """Return how pairs are made and answered."""
+        return AnsweringSettings(
+            pair_tolerance_ns=round(self.pair_tolerance * 1e9),
+            joint_timeout=self.joint_timeout,
+            lean=self.lean,
+        )
 
     def tracker_settings(self, phantom: Phantom) -> TrackerSettings:
         """Return the settings of the tracker behind the node.
