@@ -39,7 +39,9 @@ OLDEST_GLIBC = (2, 28)
 LONGEST_SHEBANG = 127
 
 COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
-IMPORT_CHECK = "import cv2, matplotlib, mcap, numpy, rclpy, rosbags, scipy, sensor_msgs.msg, yaml"
+IMPORT_CHECK = (
+    "import canopen, cv2, matplotlib, mcap, numpy, rclpy, rosbags, scipy, sensor_msgs.msg, yaml"
+)
 
 
 class SetupError(Exception):
