@@ -180,7 +180,7 @@ class Run:
         """
         wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
         names = {f"{self.namespace}stereo/{side}/image_raw": side for side in SIDES}
-        for topic, _, message in _messages(self.path, lambda name: name in names):
+        for topic, _, message in read_messages(self.path, lambda name: name in names):
             index = wanted.get(_nanoseconds(message.header.stamp))
             if index is not None and message.encoding == "mono8":
                 rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
@@ -200,12 +200,12 @@ def read_run(path: Path) -> Run:
     UserError
         If there is no bag, it is broken or incomplete, or it holds no needle run.
     """
-    topics, custom = _contents(path)
+    topics, custom = read_contents(path)
     namespace = _namespace(path, topics)
     collected = _Collector()
     takers = {namespace + name: taker for name, taker in collected.takers().items()}
     takers["/diagnostics"] = collected.take_diagnostics
-    for topic, log_time, message in _messages(path, lambda name: name in takers):
+    for topic, log_time, message in read_messages(path, lambda name: name in takers):
         try:
             takers[topic](log_time, message)
         except (AttributeError, TypeError) as error:
@@ -307,8 +307,14 @@ class _Collector:
             self._last_health[status.name] = now
 
 
-def _contents(path: Path) -> tuple[dict[str, int], dict[str, str]]:
-    """Return messages by topic and the bag's custom data."""
+def read_contents(path: Path) -> tuple[dict[str, int], dict[str, str]]:
+    """Return messages by topic and the bag's custom data.
+
+    Raises
+    ------
+    UserError
+        If there is no bag, or it is broken or incomplete.
+    """
     if not path.is_dir():
         raise UserError(f"{path}: no such bag directory")
     if not (path / METADATA_FILE).is_file():
@@ -334,8 +340,14 @@ def _namespace(path: Path, topics: dict[str, int]) -> str:
     return found[0].removesuffix(_LANDMARK)
 
 
-def _messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
-    """Yield (topic, log time, message) in order of log time."""
+def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (topic, log time [ns], message) of the wanted topics, in order of log time.
+
+    Raises
+    ------
+    UserError
+        If the bag is broken.
+    """
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
             connections = [c for c in reader.connections if wanted(c.topic)]
