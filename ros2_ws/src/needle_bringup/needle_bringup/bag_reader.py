@@ -23,7 +23,6 @@ Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
 _LANDMARK = "needle/controller_status"
-SIDES = ("left", "right")
 
 
 class _HasStamp(Protocol):
@@ -41,10 +40,13 @@ class Series:
         Time of exposure or sampling, ROS clock [ns].
     values : (N, K) float64
         One row for each stamp, SI.
+    received : (N,) int64
+        When each was received, system clock [ns].
     """
 
     stamps: Stamps
     values: Floats
+    received: Stamps
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -75,7 +77,7 @@ class Result:
 
 @dataclasses.dataclass(frozen=True)
 class HealthEvent:
-    """A part of a node that was not well: one line of /diagnostics above OK, on change."""
+    """A part of a node that is not well, or is again (level 0): /diagnostics, on change."""
 
     log_time: int
     part: str
@@ -85,7 +87,7 @@ class HealthEvent:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """All that a bag says about one run, images apart (`images_near`).
+    """All that a bag says about one run, images apart (`bag_images`).
 
     Attributes
     ----------
@@ -99,20 +101,26 @@ class Run:
         Ground truth in `rig`: position and quaternion x y z w, (N, 7).
     estimate : Series
         Estimate in `target_plane`: position and quaternion, (N, 7).
+    estimate_covariances : Series
+        Its covariance as the message has it, (N, 36): position, rotation about fixed axes.
     reduced_state : Series
         r = (x, beta, gamma) in `target_plane`, (N, 3) [m, rad, rad].
     joints : Series
         Insertion [m] and rotation [rad], (N, 2).
     control_input : Series
         v, u [rad/m] and accumulated rotation [rad], (N, 3).
+    commands : Series
+        Commanded insertion [m] and rotation [rad], (N, 2), stamped with the tip that caused them.
+    exposures : Series
+        Exposures of the left camera, (N, 0).
+    holds : Series
+        The hold pressed (0 or 1) and its speed scale, (N, 2).
     controller_status, device_status : list of Status
         In order of arrival.
     results : list of Result
         In order of arrival.
     health : list of HealthEvent
-        What was not well, in order of arrival.
-    first_command : int or None
-        When the first step was commanded, system clock [ns].
+        What was not well, and when it was again, in order of arrival.
     topics : dict of str to int
         Messages for each topic.
     parameters : dict
@@ -128,14 +136,17 @@ class Run:
     tip_covariances: Series
     truth: Series
     estimate: Series
+    estimate_covariances: Series
     reduced_state: Series
     joints: Series
     control_input: Series
+    commands: Series
+    exposures: Series
+    holds: Series
     controller_status: list[Status]
     device_status: list[Status]
     results: list[Result]
     health: list[HealthEvent]
-    first_command: int | None
     topics: dict[str, int]
     parameters: dict[str, dict[str, Any]]
     run_info: dict[str, Any]
@@ -143,6 +154,11 @@ class Run:
     calibration: str
     commit: str
     namespace: str
+
+    @property
+    def first_command(self) -> int | None:
+        """When the first step was commanded, system clock [ns]."""
+        return int(self.commands.received.min()) if len(self.commands) else None
 
     def insertion_at(self, stamps: Stamps) -> Floats:
         """Return the insertion [m], (N,), at ROS times [ns]; NaN where no joints were recorded."""
@@ -169,22 +185,6 @@ class Run:
             if full_name.rsplit("/", maxsplit=1)[-1] == node:
                 return values.get(name)
         return None
-
-    def images_near(self, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[np.uint8]]]:
-        """Yield (index into `stamps`, side, mono image (H, W)) of images of exactly these stamps.
-
-        Raises
-        ------
-        UserError
-            If the bag cannot be read.
-        """
-        wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
-        names = {f"{self.namespace}stereo/{side}/image_raw": side for side in SIDES}
-        for topic, _, message in read_messages(self.path, lambda name: name in names):
-            index = wanted.get(_nanoseconds(message.header.stamp))
-            if index is not None and message.encoding == "mono8":
-                rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-                yield index, names[topic], rows[:, : message.width]
 
 
 def read_run(path: Path) -> Run:
@@ -216,14 +216,17 @@ def read_run(path: Path) -> Run:
         tip_covariances=collected.series("tip_covariances", 9),
         truth=collected.series("truth", 7),
         estimate=collected.series("estimate", 7),
+        estimate_covariances=collected.series("estimate_covariances", 36),
         reduced_state=collected.series("reduced_state", 3),
         joints=collected.series("joints", 2),
         control_input=collected.series("control_input", 3),
+        commands=collected.series("commands", 2),
+        exposures=collected.series("exposures", 0),
+        holds=collected.series("holds", 2),
         controller_status=collected.controller_status,
         device_status=collected.device_status,
         results=collected.results,
         health=collected.health,
-        first_command=collected.first_command,
         topics=topics,
         parameters=_parameters(custom.get("parameters", "")),
         run_info=_mapping(custom.get("run_info", "")),
@@ -238,31 +241,29 @@ class _Collector:
     """Turns messages into rows, topic by topic."""
 
     def __init__(self) -> None:
-        self._rows: dict[str, list[tuple[int, tuple[float, ...]]]] = {}
+        self._rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = {}
         self.controller_status: list[Status] = []
         self.device_status: list[Status] = []
         self.results: list[Result] = []
         self.health: list[HealthEvent] = []
-        self.first_command: int | None = None
         self._last_health: dict[str, tuple[int, str]] = {}
 
     def takers(self) -> dict[str, Callable[[int, Any], None]]:
         """Return relative topic name to what takes its messages."""
         return {
-            "needle/tip": lambda _, m: self._add("tips", m.header, _xyz(m.point)),
-            "needle/tip_pose": lambda _, m: self._add(
+            "needle/tip": lambda t, m: self._add("tips", t, m, _xyz(m.point)),
+            "needle/tip_pose": lambda t, m: self._add(
                 "tip_covariances",
-                m.header,
+                t,
+                m,
                 tuple(np.reshape(m.pose.covariance, (6, 6))[:3, :3].ravel()),
             ),
-            "sim/tip_pose": lambda _, m: self._add("truth", m.header, _pose(m.pose)),
-            "needle/estimate": lambda _, m: self._add("estimate", m.header, _pose(m.pose.pose)),
-            "needle/reduced_state": lambda _, m: self._add(
-                "reduced_state", m.header, _xyz(m.vector)
-            ),
-            "needle/control_input": lambda _, m: self._add(
-                "control_input", m.header, _xyz(m.vector)
-            ),
+            "sim/tip_pose": lambda t, m: self._add("truth", t, m, _pose(m.pose)),
+            "needle/estimate": self._take_estimate,
+            "needle/reduced_state": lambda t, m: self._add("reduced_state", t, m, _xyz(m.vector)),
+            "needle/control_input": lambda t, m: self._add("control_input", t, m, _xyz(m.vector)),
+            "stereo/left/camera_info": lambda t, m: self._add("exposures", t, m, ()),
+            "device/hold": self._take_hold,
             "joint_states": self._take_joints,
             "device/joint_trajectory": self._take_command,
             "device/result": self._take_result,
@@ -277,32 +278,49 @@ class _Collector:
     def series(self, name: str, width: int) -> Series:
         """Return one topic's rows in order of their stamps, the first of equal ones."""
         rows = self._rows.get(name, [])
-        stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
-        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, width)
+        stamps = np.array([stamp for stamp, _, _ in rows], dtype=np.int64)
+        received = np.array([log_time for _, log_time, _ in rows], dtype=np.int64)
+        values = np.array([row for _, _, row in rows], dtype=np.float64).reshape(len(rows), width)
         unique, first = np.unique(stamps, return_index=True)
-        return Series(unique, values[first])
+        return Series(unique, values[first], received[first])
 
-    def _add(self, name: str, header: Any, row: tuple[float, ...]) -> None:
-        self._rows.setdefault(name, []).append((_nanoseconds(header.stamp), row))
+    def _add(self, name: str, log_time: int, message: Any, row: tuple[float, ...]) -> None:
+        rows = self._rows.setdefault(name, [])
+        rows.append((nanoseconds(message.header.stamp), log_time, row))
 
-    def _take_joints(self, _: int, message: Any) -> None:
+    def _take_estimate(self, log_time: int, message: Any) -> None:
+        self._add("estimate", log_time, message, _pose(message.pose.pose))
+        covariance = tuple(float(value) for value in message.pose.covariance)
+        self._add("estimate_covariances", log_time, message, covariance)
+
+    def _take_hold(self, log_time: int, message: Any) -> None:
+        pressed = float(message.buttons[0]) if len(message.buttons) else 0.0
+        scale = float(message.axes[0]) if len(message.axes) else 0.0
+        self._add("holds", log_time, message, (pressed, scale))
+
+    def _take_joints(self, log_time: int, message: Any) -> None:
         position = dict(zip(message.name, message.position, strict=False))
         if "insertion_joint" in position and "rotation_joint" in position:
             row = (float(position["insertion_joint"]), float(position["rotation_joint"]))
-            self._add("joints", message.header, row)
+            self._add("joints", log_time, message, row)
 
-    def _take_command(self, log_time: int, _: Any) -> None:
-        if self.first_command is None:
-            self.first_command = log_time
+    def _take_command(self, log_time: int, message: Any) -> None:
+        insertion = rotation = np.nan
+        if len(message.points) == 1:
+            positions = dict(zip(message.joint_names, message.points[0].positions, strict=False))
+            insertion = float(positions.get("insertion_joint", np.nan))
+            rotation = float(positions.get("rotation_joint", np.nan))
+        self._add("commands", log_time, message, (insertion, rotation))
 
     def _take_result(self, log_time: int, message: Any) -> None:
-        self.results.append(Result(log_time, _nanoseconds(message.stamp), message.frame_id))
+        self.results.append(Result(log_time, nanoseconds(message.stamp), message.frame_id))
 
     def take_diagnostics(self, log_time: int, message: Any) -> None:
-        """Take what is not well, where it changed."""
+        """Take what is not well, and what is again, where it changed."""
         for status in message.status:
             now = (int(status.level), str(status.message))
-            if self._last_health.get(status.name) != now and now[0] > 0:
+            before = self._last_health.get(status.name, (0, ""))
+            if before != now and (now[0] or before[0]):
                 self.health.append(HealthEvent(log_time, status.name, *now))
             self._last_health[status.name] = now
 
@@ -384,7 +402,8 @@ def _mapping(text: str) -> dict[str, Any]:
     return value if isinstance(value, dict) else {"text": str(value)}
 
 
-def _nanoseconds(stamp: _HasStamp) -> int:
+def nanoseconds(stamp: _HasStamp) -> int:
+    """Return a message's stamp in ns since the clock's epoch."""
     return int(stamp.sec) * _NANOSECONDS + int(stamp.nanosec)
 
 

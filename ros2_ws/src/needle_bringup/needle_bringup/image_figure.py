@@ -10,7 +10,8 @@ import numpy.typing as npt
 import yaml
 from matplotlib.figure import Figure
 
-from needle_bringup.bag_reader import SIDES, Run
+from needle_bringup.bag_images import SIDES, images_at
+from needle_bringup.bag_reader import Run
 from needle_common.errors import UserError
 from needle_tracker.calibration import parse_calibration
 from needle_tracker.refraction import RefractedCamera
@@ -28,7 +29,7 @@ def images_figure(run: Run) -> Figure | None:
     through the calibration in the bag, the cross is the truth.
     """
     chosen = _choose_exposures(run)
-    pictures = {(index, side): image for index, side, image in run.images_near(chosen)}
+    pictures = {(index, side): image for index, side, image in images_at(run, chosen)}
     if not pictures:
         return None
     cameras = _cameras(run)

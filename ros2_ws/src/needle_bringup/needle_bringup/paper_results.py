@@ -150,11 +150,12 @@ def read_trial(run: Run) -> Trial:
     stamps = run.reduced_state.stamps
     for series in (run.tips, run.truth, run.control_input):
         stamps = np.intersect1d(stamps, series.stamps)
+    truth = Series(stamps, _rows(run.truth, stamps), stamps)
     return Trial(
         insertion_mm=run.insertion_at(stamps) * 1e3,
         measured_mm=(_rows(run.tips, stamps)[:, 0] - offset) * 1e3,
         estimate=_readable(_rows(run.reduced_state, stamps)),
-        truth=_readable(reduced_states(Series(stamps, _rows(run.truth, stamps)), offset)),
+        truth=_readable(reduced_states(truth, offset)),
         rotation_deg=np.rad2deg(_rows(run.control_input, stamps)[:, 2]),
     )
 

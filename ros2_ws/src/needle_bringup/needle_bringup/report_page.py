@@ -168,13 +168,14 @@ def _figure(name: str, data: bytes) -> str:
 
 
 def _health(run: Run) -> str:
-    if not run.health:
+    events = [event for event in run.health if event.level]
+    if not events:
         return "<h2>Warnings and faults</h2><p class=note>None were reported.</p>"
-    start = run.first_command or run.health[0].log_time
+    start = run.first_command or events[0].log_time
     level_names = {1: "warning", 2: "ERROR", 3: "stale"}
     rows = [
         ((event.log_time - start) * 1e-9, level_names.get(event.level, "?"), event)
-        for event in run.health
+        for event in events
     ]
     lines = "".join(
         f"<tr><th>{seconds:+.1f} s</th><td>{level}</td><td>{html.escape(event.part)}</td>"

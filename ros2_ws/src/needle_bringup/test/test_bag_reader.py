@@ -65,7 +65,7 @@ def test_reduced_states_undo_the_rotation() -> None:
     angles = rng.uniform(-1.2, 1.2, (50, 3))
     rotation = Rotation.from_euler("XYZ", angles)
     poses = np.hstack([rng.normal(size=(50, 3)), rotation.as_quat()])
-    states = reduced_states(Series(np.arange(50), poses), 0.5)
+    states = reduced_states(Series(np.arange(50), poses, np.arange(50)), 0.5)
     np.testing.assert_allclose(states[:, 0], poses[:, 0] - 0.5)
     np.testing.assert_allclose(states[:, 1:], angles[:, 1:], atol=1e-12)
 
