@@ -39,7 +39,7 @@ def generate_launch_description() -> LaunchDescription:
                 "real_time_factor", default_value="1.0", description="0.0: lock step"
             ),
             DeclareLaunchArgument(
-                "controller", default_value="paper", description="paper or open_loop"
+                "controller", default_value="best", description="best, paper or open_loop"
             ),
             DeclareLaunchArgument(
                 "operator", default_value="false", description="let the stand-in keep the hold"

@@ -31,6 +31,7 @@ OPTIONS = {
     "torsion_lag": "--lag-mm",
     "real_time_factor": "--real-time-factor",
     "tip_noise": "--noise-mm",
+    "tip_covariance": "--noise-mm",
     "tip_noise_bound": "--noise-mm",
     "measurement_std": "--noise-mm",
     "bag": "--bag",
@@ -129,6 +130,7 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     if options.noise_mm is not None:
         # The sensor's own data sheet: the controllers know how far off a tip can be.
         bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
+        parameters["plane_controller"]["tip_covariance"] = "configured"
         parameters["plane_controller"]["tip_noise"] = "bounded"
         parameters["plane_controller"]["tip_noise_bound"] = bound
         parameters["plane_controller"]["measurement_std"] = bound / math.sqrt(3.0)

@@ -24,8 +24,10 @@ from needle_controller.estimator import Estimate
 from needle_controller.joint_history import JointSample
 from needle_controller.kinematics import angle_axes
 from needle_controller.plane_control import ControlUpdate
-from needle_controller.steering import DeviceStatus, SendStep, State, Steering
+from needle_controller.steering import Steering
+from needle_controller.steering_types import DeviceStatus, SendStep, State
 from needle_controller.target_plane import TargetPlane, plane_from_pose
+from needle_controller.tip_covariance import TipCovariance
 from needle_controller.tip_gate import TipMeasurement
 
 TARGET_PLANE = "target_plane"
@@ -58,6 +60,15 @@ def to_tip(message: PointStamped) -> TipMeasurement:
         to_nanoseconds(message.header.stamp),
         message.header.frame_id,
         np.array([point.x, point.y, point.z]),
+    )
+
+
+def to_tip_covariance(message: PoseWithCovarianceStamped) -> TipCovariance:
+    """Return the covariance of a measured tip's position as it came, nothing checked."""
+    return TipCovariance(
+        to_nanoseconds(message.header.stamp),
+        message.header.frame_id,
+        np.array(message.pose.covariance).reshape(6, 6)[:3, :3],
     )
 
 
@@ -133,15 +144,18 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         "target_offset_m": repr(steering.control.plane.offset),
         "reachable": reachable,
         "reachable_depth_m": reachable_depth,
-        "reason": steering.reason,
+        "reason": steering.silence or steering.reason,
         "awaiting": steering.awaiting.value,
         "tip_after_ns": str(steering.tip_after_ns),
         "tips_rejected": str(steering.tips_rejected),
+        "tips_rejected_for": ", ".join(
+            f"{fault.value} {count}" for fault, count in steering.intake.refused.items()
+        ),
         "watchdog_trips": str(steering.watchdog_trips),
         "preset": preset,
         "depth_m": repr(steering.settings.depth),
     }
     level = _LEVELS.get(steering.state, Level.OK)
-    if steering.rejection:
+    if steering.rejection or steering.silence:
         level = max(level, Level.WARN)
-    return Diagnostic(level, steering.reason or steering.state.value, values)
+    return Diagnostic(level, values["reason"] or steering.state.value, values)

@@ -11,7 +11,7 @@ from needle_common.parameter_fields import check_fields, parameter
 from needle_controller.control_settings import PRESETS, TIP_NOISES, ControlSettings
 from needle_controller.flip_plan import FlipPlan
 from needle_controller.presets import make_controller
-from needle_controller.steering import SteeringSettings
+from needle_controller.steering_types import TIP_COVARIANCES, SteeringSettings
 from needle_controller.target_plane import check_within_reach, offset_plane
 
 
@@ -81,6 +81,21 @@ class PlaneControllerParameters:
         lower=0.01,
         upper=60.0,
     )
+    tip_covariance: str = parameter(
+        "configured",
+        unit="-",
+        description="configured = every tip has the noise of tip_noise; from_tip_pose = a tip has "
+        "the covariance of the needle/tip_pose with its stamp plus measurement_std squared, and is "
+        "refused without one.",
+        choices=TIP_COVARIANCES,
+    )
+    result_timeout: float = parameter(
+        10.0,
+        unit="s",
+        description="Time without device/result (steady clock) until FAULT, the device at rest.",
+        lower=0.1,
+        upper=600.0,
+    )
     tip_margin: float = parameter(
         0.004,
         unit="m",
@@ -105,7 +120,8 @@ class PlaneControllerParameters:
     tip_noise: str = parameter(
         ControlSettings.tip_noise,
         unit="-",
-        description="best: a measured coordinate is off by up to tip_noise_bound (bounded), or "
+        description="Where tip_covariance is configured: a coordinate is off by up to "
+        "tip_noise_bound (bounded, used as such by best), or "
         "with standard deviation measurement_std (normal).",
         choices=TIP_NOISES,
     )
@@ -150,7 +166,8 @@ class PlaneControllerParameters:
     measurement_std: float = parameter(
         ControlSettings.measurement_std,
         unit="m",
-        description="Standard deviation of one measured tip coordinate.",
+        description="Standard deviation of one measured tip coordinate; with tip_covariance "
+        "from_tip_pose of what its covariance leaves out.",
         lower=1e-7,
         upper=0.1,
     )

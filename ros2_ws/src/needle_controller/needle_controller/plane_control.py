@@ -100,7 +100,9 @@ class PlaneControl:
         start = self._plane.T_plane_rig[:3, :3] @ rotation_from_angles([0.0, 0.0, rotation])
         return float(np.arctan2(-start[0, 1], start[0, 0]))
 
-    def update(self, tip: Array, joints: JointSample) -> ControlUpdate:
+    def update(
+        self, tip: Array, joints: JointSample, covariance: Array | None = None
+    ) -> ControlUpdate:
         """Take a tip.
 
         Parameters
@@ -109,6 +111,10 @@ class PlaneControl:
             The tip in `rig` [m].
         joints : JointSample
             The joints at its exposure.
+        covariance : ndarray, shape (3, 3), optional
+            Of the tip, in `rig` [m^2]; the configured noise if none is given. `measurement_std`
+            squared is added: no source knows what repeats from tip to tip, nor what the needle's
+            model leaves out, and a filter that believes in micrometres holds on to the wrong roll.
 
         Returns
         -------
@@ -116,6 +122,11 @@ class PlaneControl:
             The estimate and what to do next.
         """
         position = self._plane.from_rig(tip)
+        if covariance is None:
+            covariance = self._settings.tip_covariance()
+        else:
+            turn = self._plane.T_plane_rig[:3, :3]
+            covariance = turn @ covariance @ turn.T + np.eye(3) * self._settings.measurement_std**2
         if self._joints is None or self._first_joints is None:
             self._first_joints = joints
             self._estimator.reset(position, np.array([joints.insertion, joints.rotation]))
@@ -123,7 +134,7 @@ class PlaneControl:
             # An encoder at rest may read a count less; drawing out is the protocol's business.
             inserted = max(joints.insertion - self._joints.insertion, 0.0)
             self._estimator.advance(inserted, joints.rotation - self._joints.rotation)
-            self._estimator.correct(position, self._settings.tip_covariance())
+            self._estimator.correct(position, covariance)
         self._joints = joints
         estimate = self._estimator.estimate()
         turned = joints.rotation - self._first_joints.rotation

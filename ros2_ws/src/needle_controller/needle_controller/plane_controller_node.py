@@ -35,13 +35,15 @@ from needle_common.parameters import NodeParameters
 from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.plane_control import PlaneControl
-from needle_controller.steering import Action, Log, PublishUpdate, SendStep, Steering
+from needle_controller.steering import Steering
+from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep
 from needle_controller.target_plane import check_within_reach, offset_plane
 
 HELP = """
 plane_controller: steers the needle into the target plane, one insertion step per measured tip.
 
-Subscribes  needle/tip, target_plane, joint_states, device/result, device/status
+Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, joint_states, device/result,
+            device/status
 Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, needle/linearized_state,
             needle/control_input, needle/controller_status, /diagnostics
 Services    ~/start, ~/stop
@@ -102,6 +104,9 @@ class PlaneControllerNode(Node):
         self.create_subscription(Header, "device/result", self._on_result, RELIABLE)
         self.create_subscription(PoseStamped, "target_plane", self._on_plane, LATCHED)
         self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE)
+        self.create_subscription(
+            PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip_pose, RELIABLE
+        )
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
@@ -152,6 +157,9 @@ class PlaneControllerNode(Node):
 
     def _on_tip(self, message: PointStamped) -> None:
         self._do(self._steering.on_tip(conversions.to_tip(message)))
+
+    def _on_tip_pose(self, message: PoseWithCovarianceStamped) -> None:
+        self._do(self._steering.on_tip_pose(conversions.to_tip_covariance(message)))
 
     def _on_result(self, message: Header) -> None:
         self._do(self._steering.on_result(to_nanoseconds(message.stamp), message.frame_id))

@@ -7,141 +7,35 @@ happened to arrive.
 
 from __future__ import annotations
 
-import dataclasses
-import enum
-
-from needle_controller.joint_history import JointHistory, JointSample
-from needle_controller.plane_control import LARGEST_START_ROLL, ControlUpdate, PlaneControl
+from needle_controller.joint_history import JointSample
+from needle_controller.plane_control import PlaneControl
 from needle_controller.reachability import Reachability, reachability
-from needle_controller.tip_gate import (
-    AcceptedTip,
-    TipMeasurement,
-    refuse_message,
-    refuse_position,
+from needle_controller.retraction import RetractionWatch
+from needle_controller.start_conditions import DEPTH_TOLERANCE, Situation, is_out, obstacle
+from needle_controller.steering_types import (
+    Action,
+    Awaiting,
+    DeviceStatus,
+    Log,
+    PublishUpdate,
+    Reply,
+    SendStep,
+    State,
+    SteeringSettings,
 )
+from needle_controller.tip_covariance import TipCovariance
+from needle_controller.tip_gate import STAMP_AHEAD_NS, AcceptedTip, Refusal, TipMeasurement
+from needle_controller.tip_intake import TipIntake
 
 PLANE_TOLERANCE = 1e-3
 """Distance from the plane at which the needle counts as in it, [KC09] IV-A [m]."""
-DEPTH_TOLERANCE = 1e-6
-"""Insertion short of the depth that counts as there [m]."""
 REST_INSERTION = 2e-6
 REST_ROTATION = 1e-4
 """What a joint at rest may change by [m], [rad]."""
-STAMP_AHEAD_NS = 1_000_000_000
-"""A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
 MOST_REFUSALS = 10
 """Commands in a row that may end without motion before the controller gives up."""
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
 _DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
-
-
-class State(enum.Enum):
-    """The controller's states."""
-
-    IDLE = "IDLE"
-    STEERING = "STEERING"
-    WAITING_FOR_TIP = "WAITING_FOR_TIP"
-    DONE = "DONE"
-    FAULT = "FAULT"
-
-
-class Awaiting(enum.Enum):
-    """What the next action needs."""
-
-    NOTHING = "nothing"
-    HOLD = "hold"
-    TIP = "tip"
-    DEVICE = "device"
-    RESULT = "result"
-
-
-@dataclasses.dataclass(frozen=True)
-class SteeringSettings:
-    """The protocol's numbers.
-
-    Attributes
-    ----------
-    step_length : float
-        Insertion of one step [m].
-    nominal_speed : float
-        Insertion speed at speed scale 1 [m/s].
-    depth : float
-        Insertion at which steering ends [m].
-    tip_timeout : float
-        Time without a good tip after which the state is WAITING_FOR_TIP [s], steady clock.
-    tip_margin : float
-        What noise may add to a tip's place [m].
-    needle_out_insertion : float
-        Insertion below which the needle counts as out [m].
-    retraction_tolerance : float
-        Backward motion that counts as a retraction [m].
-    """
-
-    step_length: float
-    nominal_speed: float
-    depth: float
-    tip_timeout: float
-    tip_margin: float
-    needle_out_insertion: float
-    retraction_tolerance: float
-
-
-@dataclasses.dataclass(frozen=True)
-class DeviceStatus:
-    """What the driver says of itself."""
-
-    state: str
-    homed: bool
-    hold_owner: str
-    reason: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class SendStep:
-    """Send one trajectory point.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the tip that caused it [ns].
-    insertion, rotation : float
-        Wanted joints, absolute [m], [rad].
-    duration : float
-        Time from start [s].
-    """
-
-    stamp_ns: int
-    insertion: float
-    rotation: float
-    duration: float
-
-
-@dataclasses.dataclass(frozen=True)
-class PublishUpdate:
-    """Publish estimate and control input, stamped with the tip's exposure."""
-
-    stamp_ns: int
-    update: ControlUpdate
-
-
-@dataclasses.dataclass(frozen=True)
-class Log:
-    """Say something; `severity` is info, warning or error, `kind` throttles repetitions."""
-
-    severity: str
-    text: str
-    kind: str = ""
-
-
-Action = SendStep | PublishUpdate | Log
-
-
-@dataclasses.dataclass(frozen=True)
-class Reply:
-    """Answer to a service call."""
-
-    success: bool
-    message: str
 
 
 class Steering:
@@ -153,6 +47,29 @@ class Steering:
         The protocol's numbers; may be replaced while it runs.
     control : PlaneControl
         Estimator and law.
+
+    Attributes
+    ----------
+    state, awaiting : State, Awaiting
+        Where the protocol is, and what it needs to go on.
+    reason : str
+        Why it is there, or what is amiss.
+    step : int
+        Steps done.
+    tip_after_ns : int
+        A tip exposed after this is wanted [ns].
+    rejection : str
+        Why the last tip was refused; empty once one was used.
+    silence : str
+        What of the device has not been heard for long; empty when all is well.
+    watchdog_trips : int
+        How often the steady clock, not data, decided.
+    insertion : float
+        At the last used tip [m].
+    reach : Reachability or None
+        Of the plane, at the last used tip.
+    intake : TipIntake
+        Tips and joints.
     """
 
     def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
@@ -163,36 +80,42 @@ class Steering:
         self.reason = "not started"
         self.step = 0
         self.tip_after_ns = 0
-        self.tips_rejected = 0
+        self.rejection = ""
+        self.silence = ""
         self.watchdog_trips = 0
         self.insertion = 0.0
-        self.rejection = ""
         self.reach: Reachability | None = None
-        self.joints = JointHistory()
+        self.intake = TipIntake()
+        self._retraction = RetractionWatch()
         self._device: DeviceStatus | None = None
-        self._retracted = False
-        self._deepest = 0.0
-        self._last: AcceptedTip | None = None
-        self._newest_tip_ns: int | None = None
-        self._pending: TipMeasurement | None = None
         self._ready_step: SendStep | None = None
         self._sent: SendStep | None = None
         self._refusals = 0
         self._awaited_since: float | None = None
+        self._heard_since: float | None = None
+
+    @property
+    def tips_rejected(self) -> int:
+        """Tips that were refused."""
+        return self.intake.refused.total()
 
     # What a person asks for
 
     def on_start(self) -> tuple[Reply, list[Action]]:
         """Begin steering, or say why not."""
-        obstacle = self._obstacle()
-        if obstacle is not None:
-            return Reply(False, obstacle), [Log("warning", f"not started: {obstacle}")]
-        joints = self.joints.latest
-        if joints is not None and self._is_out(joints):
+        joints = self.intake.joints.latest
+        why = obstacle(
+            Situation(self._steering, self._device, joints, self._retraction.retracted),
+            self.control,
+            self.settings,
+        )
+        if why:
+            return Reply(False, why), [Log("warning", f"not started: {why}")]
+        if joints is not None and is_out(joints, self.settings):
             self.control.restart()
-            self._last = None
+            self.intake.last = None
             self.step = 0
-            self._deepest = joints.insertion
+            self._retraction.begin(joints.insertion)
         self.state, self.reason, self._refusals = State.STEERING, "", 0
         return Reply(True, "steering"), [Log("info", "steering"), *self._ask()]
 
@@ -206,23 +129,25 @@ class Steering:
 
     def on_joints(self, sample: JointSample) -> list[Action]:
         """Take a sample of the joints."""
-        if not self.joints.add(sample):
+        if not self.intake.joints.add(sample):
             return []
-        actions = self._watch_retraction(sample)
-        return actions + self._use_pending()
+        actions = self._heard()
+        out = is_out(sample, self.settings)
+        tolerance = self.settings.retraction_tolerance
+        if self._retraction.watch(sample.insertion, is_out=out, tolerance=tolerance):
+            actions += self._end_by_retraction(sample)
+        return actions + self._use_tip()
 
     def on_tip(self, tip: TipMeasurement) -> list[Action]:
-        """Take a measured tip: used, kept until the joints bracket it, skipped or refused."""
-        why = refuse_message(tip, self._last)
-        if why is not None:
-            return self._refuse(tip, why)
-        newest = self._newest_tip_ns
-        self._newest_tip_ns = tip.stamp_ns if newest is None else max(newest, tip.stamp_ns)
-        wanted = self._steering and self.awaiting is Awaiting.TIP and self._pending is None
-        if not wanted or tip.stamp_ns <= self.tip_after_ns:
-            return []
-        self._pending = tip
-        return self._use_pending()
+        """Take a measured tip: used, kept until all that belongs to it has come, or refused."""
+        wanted = self._steering and self.awaiting is Awaiting.TIP
+        refusal = self.intake.offer(tip, self.tip_after_ns if wanted else None)
+        return self._refuse(refusal) if refusal is not None else self._use_tip()
+
+    def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
+        """Take what a tip's source says of how well it knows the tip of the same stamp."""
+        self.intake.covariances.add(covariance)
+        return self._use_tip()
 
     def on_result(self, stamp_ns: int, text: str) -> list[Action]:
         """Take the driver's answer to a command; answers to other commands are not ours."""
@@ -246,18 +171,19 @@ class Steering:
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
         self._device = status
+        actions = self._heard()
         if not self._steering:
-            return []
+            return actions
         if status.state in _STOPPED_DEVICE:
             why = f"device is {status.state}: {status.reason}"
-            return self._leave(State.FAULT, why, "error")
+            return actions + self._leave(State.FAULT, why, "error")
         if status.state in _DISABLED_DEVICE:
-            return self._leave(State.IDLE, f"device is {status.state}", "warning")
+            return actions + self._leave(State.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
-            return self._ask()
-        if self.awaiting is Awaiting.DEVICE:
-            return self._send()
-        return []
+            actions += self._ask()
+        elif self.awaiting is Awaiting.DEVICE:
+            actions += self._send()
+        return actions
 
     def on_time(self, steady: float) -> list[Action]:
         """Watch the age of what is awaited.
@@ -267,133 +193,103 @@ class Steering:
         steady : float
             Now, on the steady clock [s].
         """
-        if not (self._steering and self.awaiting is Awaiting.TIP):
-            self._awaited_since = None
+        if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
+            self._awaited_since = self._heard_since = None
             return []
-        if self._awaited_since is None:
+        moving = self._device is not None and self._device.state == "MOVING"
+        if self._awaited_since is None or (self.awaiting is Awaiting.RESULT and moving):
             self._awaited_since = steady
         waited = steady - self._awaited_since
-        if waited < self.settings.tip_timeout or self.state is State.WAITING_FOR_TIP:
-            return []
-        self.state = State.WAITING_FOR_TIP
-        self.watchdog_trips += 1
-        self.reason = f"no good tip for {self.settings.tip_timeout:g} s"
-        if self.rejection:
-            self.reason += f"; the last one was refused: {self.rejection}"
-        actions: list[Action] = []
-        if self._pending is not None:
-            # Joints that never came: the next tip gets its chance.
-            tip, self._pending = self._pending, None
-            actions = self._refuse(tip, "no joint_states around the tip's stamp")
-        return [*actions, Log("warning", f"WAITING_FOR_TIP: {self.reason}")]
+        if self.awaiting is Awaiting.RESULT:
+            return self._watch_result(waited, steady)
+        return self._watch_tip(waited, steady)
 
     # What follows
 
     @property
     def _steering(self) -> bool:
-        return self.state in (State.STEERING, State.WAITING_FOR_TIP)
+        return self.state in {State.STEERING, State.WAITING_FOR_TIP}
 
-    def _is_out(self, joints: JointSample) -> bool:
-        return joints.insertion <= self.settings.needle_out_insertion
+    def _watch_tip(self, waited: float, steady: float) -> list[Action]:
+        actions: list[Action] = []
+        refusal = self.intake.watch(steady, self.settings.tip_timeout)
+        if refusal is not None:
+            self.watchdog_trips += 1
+            actions = self._refuse(refusal)
+        if waited < self.settings.tip_timeout or self.state is State.WAITING_FOR_TIP:
+            return actions
+        self.state = State.WAITING_FOR_TIP
+        self.watchdog_trips += 1
+        self.reason = f"no good tip for {self.settings.tip_timeout:g} s"
+        if self.rejection:
+            self.reason += f"; the last one was refused: {self.rejection}"
+        return [*actions, Log("warning", f"WAITING_FOR_TIP: {self.reason}")]
 
-    def _obstacle(self) -> str | None:
-        """Return why steering cannot begin, None if it can."""
-        device, joints = self._device, self.joints.latest
-        obstacles = (
-            (self._steering, "already steering"),
-            (device is None, "no device/status has come"),
-            (joints is None, "no joint_states have come"),
-            (device is not None and not device.homed, "the device is not homed"),
-            (
-                device is not None and device.state not in ("HOLDING", "MOVING"),
-                f"the device is not enabled ({device.state if device else ''})",
-            ),
-            (self._retracted, "the needle was retracted: draw it out first"),
-        )
-        for stands, text in obstacles:
-            if stands:
-                return text
-        return None if joints is None else self._needle_obstacle(joints)
-
-    def _needle_obstacle(self, joints: JointSample) -> str | None:
-        settings = self.settings
-        if joints.insertion >= settings.depth - DEPTH_TOLERANCE:
-            return f"insertion {joints.insertion:g} m is at the depth {settings.depth:g} m"
-        if not self._is_out(joints):
-            if self.control.started:
-                return None
-            return (
-                f"the needle is {joints.insertion:g} m in and was not followed there: "
-                f"draw it out first (<= {settings.needle_out_insertion:g} m)"
+    def _watch_result(self, waited: float, steady: float) -> list[Action]:
+        """Give up on an answer that is lost; say so when the device says nothing at all."""
+        timeout = self.settings.result_timeout
+        if waited >= timeout:
+            self.watchdog_trips += 1
+            why = (
+                f"no device/result for step {self.step + 1} in {timeout:g} s, and the device does "
+                "not move: the command or its answer is lost"
             )
-        roll = self.control.start_roll(joints.rotation)
-        if abs(roll) > LARGEST_START_ROLL:
-            return (
-                f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
-                f"{joints.rotation:.4g} rad), wants within {LARGEST_START_ROLL:.3g} rad"
-            )
-        return None
+            return self._leave(State.FAULT, why, "error")
+        if self._heard_since is None:
+            self._heard_since = steady
+        if steady - self._heard_since < timeout or self.silence:
+            return []
+        # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
+        self.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        return [Log("warning", self.silence)]
+
+    def _heard(self) -> list[Action]:
+        self._heard_since = None
+        if not self.silence:
+            return []
+        self.silence = ""
+        return [Log("info", "the device is heard again")]
 
     def _ask(self) -> list[Action]:
         """Ask for a tip of the needle at rest, or for the hold that must come first."""
-        self._pending = self._ready_step = None
+        intake = self.intake
+        intake.forget_pending()
+        self._ready_step = None
         if self._device is None or not self._device.hold_owner:
             self.awaiting = Awaiting.HOLD
             return []
-        rest = self.joints.motion_end_ns(REST_INSERTION, REST_ROTATION)
-        stamps = [self.tip_after_ns, rest or 0, self._last.tip.stamp_ns if self._last else 0]
-        idle = self.awaiting in (Awaiting.HOLD, Awaiting.NOTHING)
-        if idle and self._newest_tip_ns is not None:
+        rest = intake.joints.motion_end_ns(REST_INSERTION, REST_ROTATION)
+        stamps = [self.tip_after_ns, rest or 0, intake.last.tip.stamp_ns if intake.last else 0]
+        idle = self.awaiting in {Awaiting.HOLD, Awaiting.NOTHING}
+        if idle and intake.newest_ns is not None:
             # The needle stood and nobody held it: the driver wants a younger tip than those.
-            stamps.append(self._newest_tip_ns)
+            stamps.append(intake.newest_ns)
         self.tip_after_ns = max(stamps)
         self.awaiting = Awaiting.TIP
         self._awaited_since = None
         return []
 
-    def _refuse(self, tip: TipMeasurement, why: str) -> list[Action]:
-        self.tips_rejected += 1
-        self.rejection = why
+    def _refuse(self, refusal: Refusal) -> list[Action]:
+        self.rejection = refusal.text
         if self._steering:
-            self.reason = f"tip refused: {why}"
-        latest = self.joints.latest
+            self.reason = f"tip refused: {refusal.text}"
+        stamp_ns, latest = refusal.tip.stamp_ns, self.intake.joints.latest
         horizon = latest.stamp_ns + STAMP_AHEAD_NS if latest is not None else 0
-        if self._steering and self.awaiting is Awaiting.TIP and tip.stamp_ns <= horizon:
-            self.tip_after_ns = max(self.tip_after_ns, tip.stamp_ns)
-        return [Log("warning", f"tip refused: {why}", "tip")]
+        if self._steering and self.awaiting is Awaiting.TIP and stamp_ns <= horizon:
+            self.tip_after_ns = max(self.tip_after_ns, stamp_ns)
+        return [Log("warning", f"tip refused: {refusal.text}", f"tip {refusal.fault.value}")]
 
-    def _use_pending(self) -> list[Action]:
-        tip = self._pending
-        if tip is None:
+    def _use_tip(self) -> list[Action]:
+        taken = self.intake.take(self.settings)
+        if taken is None:
             return []
-        joints, oldest, latest = (
-            self.joints.at(tip.stamp_ns),
-            self.joints.oldest,
-            self.joints.latest,
-        )
-        if joints is None:
-            why = None
-            if oldest is not None and tip.stamp_ns < oldest.stamp_ns:
-                why = "tip is older than any joint_states kept"
-            elif latest is not None and tip.stamp_ns > latest.stamp_ns + STAMP_AHEAD_NS:
-                ahead = (tip.stamp_ns - latest.stamp_ns) * 1e-9
-                why = f"tip's stamp is {ahead:.4g} s ahead of joint_states"
-        else:
-            why = refuse_position(tip, joints, self._last, self.settings.tip_margin)
-        if why is not None:
-            self._pending = None
-            return self._refuse(tip, why)
-        if joints is None:
-            return []
-        self._pending = None
-        return self._take(AcceptedTip(tip, joints))
+        return self._refuse(taken) if isinstance(taken, Refusal) else self._step_from(taken)
 
-    def _take(self, accepted: AcceptedTip) -> list[Action]:
+    def _step_from(self, accepted: AcceptedTip) -> list[Action]:
         tip, joints, settings = accepted.tip, accepted.joints, self.settings
-        self._last = accepted
         self.rejection = ""
         self.insertion = joints.insertion
-        update = self.control.update(tip.position, joints)
+        update = self.control.update(tip.position, joints, accepted.covariance)
         self.reach = reachability(
             update.estimate.reduced,
             update.estimate.curvature,
@@ -434,29 +330,20 @@ class Steering:
             return []
         self._ready_step, self._sent = None, step
         self.awaiting = Awaiting.RESULT
+        self._awaited_since = self._heard_since = None
         return [step]
 
     def _moved_since_command(self) -> bool:
-        latest = self.joints.latest
+        latest, last = self.intake.joints.latest, self.intake.last
         return (
             latest is not None
-            and self._last is not None
-            and abs(latest.insertion - self._last.joints.insertion) > REST_INSERTION
+            and last is not None
+            and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
         )
 
-    def _watch_retraction(self, sample: JointSample) -> list[Action]:
-        if self._is_out(sample):
-            self._retracted = False
-            retracted = self._deepest - sample.insertion > self.settings.retraction_tolerance
-            self._deepest = sample.insertion if retracted else max(self._deepest, sample.insertion)
-        else:
-            self._deepest = max(self._deepest, sample.insertion)
-            retracted = self._deepest - sample.insertion > self.settings.retraction_tolerance
-            self._retracted = self._retracted or retracted
-        if not retracted:
-            return []
+    def _end_by_retraction(self, sample: JointSample) -> list[Action]:
         self.control.restart()
-        self._last = None
+        self.intake.last = None
         if not self._steering:
             return []
         why = f"needle retracted to {sample.insertion:.4g} m: draw it out before steering again"
@@ -465,5 +352,7 @@ class Steering:
     def _leave(self, state: State, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason
         self.awaiting = Awaiting.NOTHING
-        self._pending = self._ready_step = self._sent = None
+        self.silence = ""
+        self.intake.forget_pending()
+        self._ready_step = self._sent = None
         return [Log(severity, f"{state.value}: {reason}" if reason else state.value)]

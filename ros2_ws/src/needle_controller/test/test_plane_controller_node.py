@@ -142,7 +142,9 @@ class Bench:
         self.device()
         self.joints()
         steering = self.node._steering
-        self.until(lambda: steering.joints.latest is not None and steering._device is not None)
+        self.until(
+            lambda: steering.intake.joints.latest is not None and steering._device is not None
+        )
         response = self.call("start")
         assert response.success, response.message
         self.until(lambda: self.status["awaiting"] == "tip")
@@ -250,6 +252,47 @@ def test_a_bad_tip_is_named_and_moves_nothing(
     bench.until(lambda: bench.health("steering")[0] == Level.OK)
 
 
+def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None:
+    bench = Bench(context, target_offset=0.003, tip_covariance="from_tip_pose")
+    poses = bench.outside.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
+    bench.until(lambda: poses.get_subscription_count() > 0)
+    bench.start()
+    stamps = [bench.tip([0.0, 0.0, 0.0])]
+    intake = bench.node._steering.intake
+    bench.until(lambda: intake.newest_ns == stamps[0] and intake.joints.latest is not None)
+    assert not bench.commands
+    # That of another tip says that this one's will not come.
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id = "rig"
+    pose.pose.covariance[0] = pose.pose.covariance[7] = pose.pose.covariance[14] = 1e-8
+    pose.header.stamp = to_stamp(stamps[0] + 1)
+    poses.publish(pose)
+    bench.until(lambda: bench.status["tips_rejected_for"] == "no_covariance 1")
+    assert "needle/tip_pose" in bench.status["reason"]
+    stamps.append(bench.tip([0.0, 0.0, 0.0]))
+    pose.header.stamp = to_stamp(stamps[1])
+    poses.publish(pose)
+    bench.until(lambda: len(bench.commands) == 1)
+    assert to_nanoseconds(bench.commands[0].header.stamp) == stamps[1]
+    bench.close()
+
+
+def test_every_reason_to_refuse_a_tip_is_logged(
+    bench: Bench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Within one period of the log: a kind of its own for each reason, repetitions kept back."""
+    bench.start()
+    for position, frame in (
+        ([float("nan")] * 3, "rig"), ([0.0] * 3, "map"), ([1.0] * 3, "rig"), ([1.0] * 3, "rig")
+    ):  # fmt: skip
+        bench.tip(position, frame)
+    bench.until(lambda: bench.status["tips_rejected"] == "4")
+    assert bench.status["tips_rejected_for"] == "not_finite 1, frame 1, too_far 2"
+    said = capfd.readouterr().err
+    for reason in ("not finite", "frame 'map'", "from the entry point"):
+        assert said.count(reason) == 1
+
+
 def test_start_says_why_not(bench: Bench) -> None:
     response = bench.call("start")
     assert (response.success, response.message) == (False, "no device/status has come")
@@ -273,7 +316,7 @@ def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
     bench._joints.publish(JointState(name=["insertion_joint"], position=[0.0]))
     bench.until(lambda: bench.health("joint_states")[0] == Level.WARN)
     assert "rotation_joint" in bench.health("joint_states")[1]
-    assert bench.node._steering.joints.latest is None
+    assert bench.node._steering.intake.joints.latest is None
 
 
 def test_parameters_change_as_valid_wholes_only(bench: Bench) -> None:

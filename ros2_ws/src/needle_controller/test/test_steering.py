@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
+from typing import Any
+
 import numpy as np
 import pytest
 
 from needle_controller.joint_history import JointSample
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.plane_control import PlaneControl
-from needle_controller.steering import (
-    MOST_REFUSALS,
+from needle_controller.steering import MOST_REFUSALS, Steering
+from needle_controller.steering_types import (
     Action,
     Awaiting,
     DeviceStatus,
@@ -17,10 +20,10 @@ from needle_controller.steering import (
     PublishUpdate,
     SendStep,
     State,
-    Steering,
 )
-from needle_controller.target_plane import offset_plane
-from needle_controller.tip_gate import TipMeasurement
+from needle_controller.target_plane import offset_plane, plane_from_pose
+from needle_controller.tip_covariance import TipCovariance
+from needle_controller.tip_gate import Fault, TipMeasurement
 
 TICK = 20_000_000
 HELD = DeviceStatus("HOLDING", True, "operator")
@@ -31,8 +34,17 @@ FREE = DeviceStatus("HOLDING", True, "")
 class Rig:
     """The other side of the protocol: joints, tips and answers, on its own clock."""
 
-    def __init__(self, *, depth: float = 0.12, started: bool = True, held: bool = True) -> None:
-        parameters = PlaneControllerParameters(depth=depth, target_offset=0.003)
+    def __init__(
+        self,
+        *,
+        depth: float = 0.12,
+        started: bool = True,
+        held: bool = True,
+        tip_covariance: str = "configured",
+    ) -> None:
+        parameters = PlaneControllerParameters(
+            depth=depth, target_offset=0.003, tip_covariance=tip_covariance
+        )
         control = PlaneControl(parameters.control(), offset_plane(0.003))
         self.steering = Steering(parameters.steering(), control)
         self.now = TICK
@@ -379,8 +391,10 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
     assert rig.steering.on_time(1e6) == []
     rig.steering.on_device(HELD)
     step = sent(rig.expose())
+    rig.steering.on_device(MOVING)
     rig.steering.on_time(1e6)
-    assert rig.steering.on_time(2e6) == []
+    rig.joints()
+    assert "nothing heard" in logged(rig.steering.on_time(2e6))
     rig.run(step)
     assert rig.steering.on_time(3e6) == []
     assert rig.steering.state is State.STEERING
@@ -388,11 +402,200 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
 
 def test_a_tip_whose_joints_never_come_is_given_up() -> None:
     rig = Rig()
-    rig.steering.on_time(0.0)
-    rig.steering.on_tip(TipMeasurement(rig.now + TICK, "rig", np.zeros(3)))
-    assert "no joint_states" in logged(rig.steering.on_time(10.0))
-    rig.now += 2 * TICK
+    # Also while waiting for one already.
+    for start in (0.0, 100.0):
+        rig.steering.on_tip(TipMeasurement(rig.now + TICK, "rig", np.zeros(3)))
+        rig.steering.on_time(start)
+        assert "no joint_states" in logged(rig.steering.on_time(start + 2.0))
+        rig.now += 2 * TICK
+    assert rig.steering.intake.refused == {Fault.NO_JOINTS: 2}
+    assert rig.steering.watchdog_trips == 3
     sent(rig.expose())
+
+
+# Tips with a covariance of their own
+
+
+def told(rig: Rig, std: float = 1e-4, stamp: int | None = None) -> TipCovariance:
+    """What a source says of the tip exposed now."""
+    return TipCovariance(rig.now if stamp is None else stamp, "rig", np.eye(3) * std**2)
+
+
+def test_a_tip_waits_for_its_covariance_in_whatever_order_they_come() -> None:
+    steps = []
+    for order in itertools.permutations(range(3)):
+        rig = Rig(tip_covariance="from_tip_pose")
+        rig.now += TICK
+        tip, covariance = rig.measured(0.0004), told(rig)
+        actions: list[Action] = []
+        for number, topic in enumerate(order):
+            assert none_sent(actions), order[:number]
+            actions += (
+                rig.joints,
+                lambda rig=rig, tip=tip: rig.steering.on_tip(tip),
+                lambda rig=rig, c=covariance: rig.steering.on_tip_pose(c),
+            )[topic]()
+        steps.append(sent(actions))
+    assert len(set(steps)) == 1
+
+
+def test_the_covariance_decides_what_a_tip_is_worth() -> None:
+    """A tip 2 mm off the axis: believed if it is known to 0.1 mm, hardly if only to 2 mm."""
+    seen = []
+    for std in (1e-4, 2e-3):
+        rig = Rig(tip_covariance="from_tip_pose")
+        rig.expose()
+        for _ in range(4):
+            rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+            rig.expose()
+        rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+        rig.expose(TipMeasurement(rig.now + TICK, "rig", np.array([0.0005, 0.0, rig.insertion])))
+        (update,) = (
+            a for a in rig.steering.on_tip_pose(told(rig, std)) if isinstance(a, PublishUpdate)
+        )
+        seen.append(update.update.estimate.position[0] + 0.003)
+    assert seen[0] > 3 * seen[1] > 0.0
+
+
+def test_the_covariance_turns_with_the_plane(monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    # x of this plane is y of rig.
+    rig.steering.control.plane = plane_from_pose(
+        "rig", [0.0, 0.003, 0.0], [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]
+    )
+    taken: list[Any] = []
+    estimator = rig.steering.control._estimator
+    correct = estimator.correct
+
+    def spy(tip: Any, covariance: Any) -> None:
+        taken.append(covariance)
+        correct(tip, covariance)
+
+    monkeypatch.setattr(estimator, "correct", spy)
+    rig.expose()
+    rig.run(sent(rig.steering.on_tip_pose(told(rig))))
+    rig.expose()
+    matrix = np.diag([1.0, 4.0, 9.0]) * 1e-8
+    matrix[0, 2] = matrix[2, 0] = 1e-8
+    sent(rig.steering.on_tip_pose(TipCovariance(rig.now, "rig", matrix)))
+    wanted = [[4.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, 9.0]]
+    left_out = rig.steering.control._settings.measurement_std**2 * np.eye(3)
+    np.testing.assert_allclose(taken[0], np.array(wanted) * 1e-8 + left_out, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "frame", "said"),
+    [
+        (np.full((3, 3), np.nan), "rig", "not a number"),
+        (np.diag([np.inf] * 3), "rig", "no tip was found"),
+        (np.zeros((3, 3)), "rig", "not positive definite"),
+        (-np.eye(3), "rig", "not positive definite"),
+        (np.eye(3) + np.eye(3, k=1), "rig", "not symmetric"),
+        (np.eye(3) * 1e-8, "map", "frame 'map'"),
+    ],
+)
+def test_a_tip_with_a_bad_covariance_is_refused(matrix: np.ndarray, frame: str, said: str) -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    actions = rig.steering.on_tip_pose(TipCovariance(rig.now, frame, matrix))
+    assert none_sent(actions)
+    assert said in logged(actions)
+    assert rig.steering.intake.refused == {Fault.BAD_COVARIANCE: 1}
+    rig.expose()
+    sent(rig.steering.on_tip_pose(told(rig)))
+
+
+def test_a_covariance_of_a_later_tip_says_that_the_tips_own_is_lost() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    assert rig.steering.on_tip_pose(told(rig, stamp=rig.now - TICK)) == []
+    actions = rig.steering.on_tip_pose(told(rig, stamp=rig.now + TICK))
+    assert "no needle/tip_pose" in logged(actions)
+    assert "configured" in logged(actions)
+    assert rig.steering.watchdog_trips == 0
+    assert rig.steering.tip_after_ns == rig.now
+    # The tip of that one is there for the next step.
+    sent(rig.expose())
+
+
+def test_a_source_of_tips_alone_is_told_what_to_set() -> None:
+    rig = Rig(tip_covariance="from_tip_pose")
+    rig.expose()
+    rig.steering.on_time(0.0)
+    assert rig.steering.on_time(1.9) == []
+    rig.steering.on_time(2.0)
+    assert rig.steering.state is State.WAITING_FOR_TIP
+    assert "set it to configured" in rig.steering.reason
+    assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
+
+
+def test_configured_noise_asks_for_no_covariance_and_uses_none() -> None:
+    steps = []
+    for bad in (False, True):
+        rig = Rig()
+        for _ in range(3):
+            if bad:
+                rig.steering.on_tip_pose(TipCovariance(rig.now + TICK, "rig", np.zeros((3, 3))))
+            steps.append(sent(rig.expose()))
+            rig.run(steps[-1])
+    assert steps[:3] == steps[3:]
+
+
+# A lost answer
+
+
+def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    timeout = rig.steering.settings.result_timeout
+    # It moves for as long as it likes; the time runs from when it stands again.
+    rig.steering.on_device(MOVING)
+    for second in range(100):
+        rig.now += TICK
+        rig.joints()
+        assert rig.steering.on_time(float(second)) == []
+    rig.steering.on_device(HELD)
+    assert rig.steering.on_time(99.0 + 0.9 * timeout) == []
+    actions = rig.steering.on_time(99.0 + timeout)
+    assert none_sent(actions)
+    assert "no device/result for step 1" in logged(actions)
+    assert where(rig) == (State.FAULT, Awaiting.NOTHING)
+    assert rig.steering.watchdog_trips == 1
+    assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
+    assert rig.expose() == []
+    # A person starts it again from where the needle really is.
+    rig.insertion = 0.0006
+    rig.now += TICK
+    rig.joints()
+    assert rig.steering.on_start()[0].success
+    assert sent(rig.expose()).insertion == pytest.approx(0.0016)
+
+
+def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    rig.steering.on_device(MOVING)
+    rig.steering.on_time(0.0)
+    said = logged(rig.steering.on_time(rig.steering.settings.result_timeout))
+    assert "nothing heard of the device" in said
+    assert rig.steering.silence
+    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert rig.steering.on_time(1e3) == []
+    rig.run(step)
+    assert not rig.steering.silence
+    rig.steering.on_device(HELD)
+    sent(rig.expose())
+
+
+def test_each_reason_to_refuse_a_tip_is_told_for_itself() -> None:
+    rig = Rig()
+    kinds = set()
+    for position, frame in ((np.full(3, np.nan), "rig"), (np.zeros(3), "map"), (np.ones(3), "rig")):
+        (log,) = rig.expose(TipMeasurement(rig.now + TICK, frame, position))
+        assert isinstance(log, Log)
+        kinds.add(log.kind)
+    assert len(kinds) == 3
+    assert rig.steering.tips_rejected == 3
 
 
 # Retraction, and what the device says

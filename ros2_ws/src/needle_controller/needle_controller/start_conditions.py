@@ -1,0 +1,91 @@
+"""What must hold before steering begins."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_controller.joint_history import JointSample
+from needle_controller.plane_control import LARGEST_START_ROLL, PlaneControl
+from needle_controller.steering_types import DeviceStatus, SteeringSettings
+
+DEPTH_TOLERANCE = 1e-6
+"""Insertion short of the depth that counts as there [m]."""
+_ENABLED_DEVICE = ("HOLDING", "MOVING")
+
+
+@dataclasses.dataclass(frozen=True)
+class Situation:
+    """What is known when somebody asks to start.
+
+    Attributes
+    ----------
+    steering : bool
+        Whether it is steering already.
+    device : DeviceStatus or None
+        What the driver last said.
+    joints : JointSample or None
+        Where the joints are.
+    retracted : bool
+        Whether the needle was drawn back and is not out yet.
+    """
+
+    steering: bool
+    device: DeviceStatus | None
+    joints: JointSample | None
+    retracted: bool
+
+
+def is_out(joints: JointSample, settings: SteeringSettings) -> bool:
+    """Return whether the needle counts as out."""
+    return joints.insertion <= settings.needle_out_insertion
+
+
+def obstacle(situation: Situation, control: PlaneControl, settings: SteeringSettings) -> str:
+    """Return why steering cannot begin, empty if it can.
+
+    Parameters
+    ----------
+    situation : Situation
+        What is known of the rig.
+    control : PlaneControl
+        Estimator and law, for how the needle would enter the target plane.
+    settings : SteeringSettings
+        The protocol's numbers.
+    """
+    device, joints = situation.device, situation.joints
+    if situation.steering:
+        return "already steering"
+    if device is None or not device.homed or device.state not in _ENABLED_DEVICE:
+        return _device_obstacle(device)
+    if joints is None:
+        return "no joint_states have come"
+    if situation.retracted:
+        return "the needle was retracted: draw it out first"
+    return _needle_obstacle(joints, control, settings)
+
+
+def _device_obstacle(device: DeviceStatus | None) -> str:
+    if device is None:
+        return "no device/status has come"
+    if not device.homed:
+        return "the device is not homed"
+    return f"the device is not enabled ({device.state})"
+
+
+def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: SteeringSettings) -> str:
+    if joints.insertion >= settings.depth - DEPTH_TOLERANCE:
+        return f"insertion {joints.insertion:g} m is at the depth {settings.depth:g} m"
+    if not is_out(joints, settings):
+        if control.started:
+            return ""
+        return (
+            f"the needle is {joints.insertion:g} m in and was not followed there: "
+            f"draw it out first (<= {settings.needle_out_insertion:g} m)"
+        )
+    roll = control.start_roll(joints.rotation)
+    if abs(roll) > LARGEST_START_ROLL:
+        return (
+            f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
+            f"{joints.rotation:.4g} rad), wants within {LARGEST_START_ROLL:.3g} rad"
+        )
+    return ""
