@@ -7,6 +7,7 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from needle_bringup.shared_memory import remove_dead_ports
 from needle_common.errors import UserError
 
 # Above 101 the ports reach into the range that Linux gives out to outgoing connections; 0 is where
@@ -24,6 +25,7 @@ def own_domain() -> Iterator[int]:
 
     Two holders never get the same: each binds a socket name for its domain, which the kernel frees
     whatever becomes of the holder. A domain where a foreign node listens is passed over.
+    Shared-memory ports that killed processes left in it are taken away before and after.
 
     Raises
     ------
@@ -35,7 +37,11 @@ def own_domain() -> Iterator[int]:
     for domain in candidates:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
             if _binds(lock, f"\0needle_ros_domain_{domain}") and _is_silent(domain):
-                yield domain
+                remove_dead_ports(ports_of(domain))
+                try:
+                    yield domain
+                finally:
+                    remove_dead_ports(ports_of(domain))
                 return
     raise UserError("no free ROS_DOMAIN_ID on this machine: is anything left running?")
 

@@ -20,11 +20,11 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bringup.ros_domain import ports_of
+from needle_bringup.shared_memory import ports_left
 from needle_common.errors import UserError
 
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
-SHARED_MEMORY = Path("/dev/shm")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,8 +71,6 @@ class Run:
         The folder that was asked for.
     left_over : list of str
         Processes that outlived the command.
-    memory_before : frozenset of str
-        Shared memory that was there before it (a killed process leaves some for good).
     """
 
     code: int
@@ -80,7 +78,6 @@ class Run:
     output: str
     bag: Path
     left_over: list[str]
-    memory_before: frozenset[str]
 
     @property
     def summary(self) -> Mapping[str, Any]:
@@ -99,7 +96,7 @@ class Run:
         domain = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
         if domain is None:
             return []
-        return [name for name in shared_memory_of(int(domain[1])) if name not in self.memory_before]
+        return ports_left(ports_of(int(domain[1])))
 
     @property
     def last_line(self) -> str:
@@ -122,7 +119,6 @@ class StartedRun:
         self._mark = uuid.uuid4().hex
         self._bag = bag
         self._output = bag.with_name(bag.name + ".output")
-        self._memory_before = frozenset(path.name for path in SHARED_MEMORY.iterdir())
         self._begin = time.monotonic()
         with self._output.open("wb") as output:
             self.process = subprocess.Popen(
@@ -153,15 +149,22 @@ class StartedRun:
             raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
         return int(found[1])
 
-    def wait_until_said(self, text: str, timeout: float = 60.0) -> None:
-        """Wait until the run has written `text`, or has ended, or the time [s] has."""
+    def wait_until_said(self, pattern: str, timeout: float = 60.0) -> None:
+        """Wait until the run has written something that this regular expression matches.
+
+        Raises
+        ------
+        UserError
+            If the run, or the time [s], ends before that.
+        """
         deadline = time.monotonic() + timeout
-        while text not in self.output and self.process.poll() is None:
-            if time.monotonic() >= deadline:
-                return
+        while not re.search(pattern, self.output):
+            ended = self.process.poll() is not None
+            # what it wrote last may have come between the two looks
+            if (ended or time.monotonic() >= deadline) and not re.search(pattern, self.output):
+                how = "ended before it" if ended else f"has run {timeout:g} s and not yet"
+                raise UserError(f"{how} said {pattern!r}: {self.output.strip()[-500:]}")
             time.sleep(0.01)
-        if text not in self.output and self.process.poll() not in (None, 0):
-            raise UserError(f"ended before it said {text!r}: {self.output.strip()[-500:]}")
 
     def interrupt(self, number: signal.Signals) -> None:
         """Send a signal as a terminal does: to the command's process group."""
@@ -184,7 +187,7 @@ class StartedRun:
         for pid, _ in left_over:
             os.kill(pid, signal.SIGKILL)
         names = [f"{pid} {name}" for pid, name in left_over]
-        return Run(code, wall, self.output, self._bag, names, self._memory_before)
+        return Run(code, wall, self.output, self._bag, names)
 
 
 class Workbench:
@@ -229,12 +232,6 @@ def processes_with(name: str, value: str) -> list[tuple[int, str]]:
         except OSError:
             continue  # ended meanwhile, or another user's
     return found
-
-
-def shared_memory_of(domain: int) -> list[str]:
-    """Return the shared-memory ports that a ROS domain has left behind."""
-    names = {f"fastrtps_port{port}" for port in ports_of(domain)}
-    return sorted(path.name for path in SHARED_MEMORY.iterdir() if path.name in names)
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:

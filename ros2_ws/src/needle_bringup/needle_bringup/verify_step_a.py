@@ -31,8 +31,8 @@ MILESTONES = (
     ("", 0.3),
     ("ROS_DOMAIN_ID", 0.5),
     ("ROS_DOMAIN_ID", 4.0),
-    ("30.0 of", 0.5),
-    ("60.0 of", 0.5),
+    (r"3\d\.\d of", 0.5),
+    (r"6\d\.\d of", 0.5),
     ("operator: inserted", 0.1),
     ("operator: inserted", 1.0),
 )

@@ -1,0 +1,62 @@
+"""What Fast DDS leaves in shared memory where a process was killed, and how to take it away.
+
+A port is a file that every process of a domain opens. Who is killed never closes it: the count of
+its users stays wrong for good, and the next run in that domain inherits the file.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+from collections.abc import Iterable
+from pathlib import Path
+
+SHARED_MEMORY = Path("/dev/shm")
+
+
+def ports_left(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
+    """Return the names of the shared-memory ports that are there, used or not.
+
+    Parameters
+    ----------
+    ports : iterable of int
+        Port numbers to look for.
+    folder : Path
+        Where shared memory is mounted.
+    """
+    return [name for name in map(_name, ports) if (folder / name).exists()]
+
+
+def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> None:
+    """Remove the ports on which no living process listens; another user's stay.
+
+    Parameters
+    ----------
+    ports : iterable of int
+        Port numbers of a domain that has ended, or not begun.
+    folder : Path
+        Where shared memory is mounted.
+    """
+    for name in map(_name, ports):
+        lock = folder / f"{name}_el"
+        if _is_held(lock):
+            continue
+        for path in (folder / name, lock, folder / f"sem.{name}_mutex"):
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _name(port: int) -> str:
+    return f"fastrtps_port{port}"
+
+
+def _is_held(lock: Path) -> bool:
+    """Return whether a process listens: it holds this lock until it ends, however it ends."""
+    try:
+        with lock.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
