@@ -114,8 +114,8 @@ class OperatorNode(Node):
         return EXIT_DONE if outcome.done else EXIT_MISSED
 
     def _on_timer(self) -> None:
-        if self._sequence.hold:
-            self._send_hold(pressed=True)
+        if self._sequence.steering:
+            self._send_hold(pressed=self._sequence.hold(time.monotonic()))
         else:
             self._sequence.see_missing(self._missing())
         self._sequence.check_time(time.monotonic())
@@ -139,7 +139,7 @@ class OperatorNode(Node):
             self._progress.show(self._sequence.insertion, self._sequence.depth)
 
     def _on_device_status(self, message: DiagnosticStatus) -> None:
-        self._sequence.see_device(values_of(message))
+        self._sequence.see_device(values_of(message), time.monotonic())
         self._advance()
 
     def _missing(self) -> list[str]:
@@ -170,8 +170,9 @@ class OperatorNode(Node):
         self._hold.publish(message)
 
     def _report(self) -> None:
-        if self._sequence.hold:
-            message = "the hold is pressed"
+        if self._sequence.steering:
+            again = self._sequence.presses_again
+            message = "the hold is pressed" + (f" (pressed again {again} times)" if again else "")
         elif self.ended:
             message = "the hold is released"
         else:

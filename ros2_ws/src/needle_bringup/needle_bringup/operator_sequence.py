@@ -34,6 +34,10 @@ NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
 # Any other refusal may rest on news that are still under way (joints, the answer before this one).
 REFUSAL_PATIENCE = 2.0
+# A press that the device has not taken, or has forgotten because messages came late, counts again
+# only after a release: so long it is waited for the press, and so long it is then released [s].
+PRESS_PATIENCE = 2.0
+RELEASE_TIME = 0.25
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,6 +92,10 @@ class OperatorSequence:
         self._said_since_start: Mapping[str, str] | None = None
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
+        self._hold_counts = False
+        self._press_since = now
+        self._released_until = now
+        self.presses_again = 0
         self.insertion = 0.0
         self.depth: float | None = None
         self.outcome: Outcome | None = None
@@ -97,10 +105,9 @@ class OperatorSequence:
         """Whether the preparation is over and the run is not."""
         return self._prepared == len(PREPARATION) and self.outcome is None
 
-    @property
-    def hold(self) -> bool:
-        """Whether the hold is pressed."""
-        return self.steering
+    def hold(self, now: float) -> bool:
+        """Return whether the hold is pressed."""
+        return self.steering and now >= self._released_until
 
     @property
     def touched(self) -> bool:
@@ -134,7 +141,7 @@ class OperatorSequence:
             self._refusal = ""
             self._refused_since = None
             self._deadline = now + self._wait_timeout
-            self._progress_at = now
+            self._progress_at = self._press_since = now
             said = self._said_since_start or {}
             if self.steering and said.get("state") == "FAULT":
                 # The controller's status can overtake its answer.
@@ -149,9 +156,13 @@ class OperatorSequence:
         elif now >= self._refused_since + REFUSAL_PATIENCE:
             self._end(f"{call.service} was refused: {message}")
 
-    def see_device(self, values: Mapping[str, str]) -> None:
+    def see_device(self, values: Mapping[str, str], now: float) -> None:
         """Take the key-values of device/status."""
         self._homed = values.get("homed") == "true"
+        counts = bool(values.get("hold_owner"))
+        if self._hold_counts and not counts:
+            self._press_since = now
+        self._hold_counts = counts
         if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
             self._end(f"device {values['state']}: {_why(values)}")
 
@@ -186,9 +197,12 @@ class OperatorSequence:
             self.outcome = Outcome(False, "interrupted", interrupted=True)
 
     def check_time(self, now: float) -> None:
-        """End the run where the rig took too long."""
+        """Press again where the hold does not count; end the run where the rig took too long."""
         if self.outcome is not None:
             return
+        if self.hold(now) and not self._hold_counts and now >= self._press_since + PRESS_PATIENCE:
+            self.presses_again += 1
+            self._released_until = self._press_since = now + RELEASE_TIME
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
                 self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self._hangs()}")

@@ -12,7 +12,7 @@ def outcome(sequence: OperatorSequence) -> Outcome | None:
 
 def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
     sequence.see_missing([])
-    sequence.see_device({"homed": "true", "state": "DISABLED"})
+    sequence.see_device({"homed": "true", "state": "DISABLED"}, 1.0)
     calls = []
     while (call := sequence.next_call(now)) is not None:
         calls.append(call)
@@ -27,13 +27,13 @@ def steering(**values: str) -> dict[str, str]:
 def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    sequence.see_device({"homed": "true"})
+    sequence.see_device({"homed": "true"}, 1.0)
     for expected in PREPARATION:
-        assert not sequence.hold
+        assert not sequence.hold(1.0)
         assert sequence.next_call(1.0) == expected
         assert sequence.next_call(1.0) is None, "one call at a time"
         sequence.take_answer(True, "", 1.0)
-    assert sequence.hold
+    assert sequence.hold(1.0)
 
 
 def test_calls_nothing_while_a_partner_is_missing() -> None:
@@ -84,7 +84,7 @@ def test_waits_for_homing_before_it_enables() -> None:
         assert sequence.next_call(1.0) is not None
         sequence.take_answer(True, "", 1.0)
     assert sequence.next_call(1.0) is None
-    sequence.see_device({"homed": "true"})
+    sequence.see_device({"homed": "true"}, 1.0)
     assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
 
 
@@ -92,11 +92,11 @@ def test_done_is_success_and_releases_the_hold() -> None:
     sequence = fresh()
     prepare(sequence)
     sequence.see_controller(steering(), 2.0)
-    assert sequence.hold
+    assert sequence.hold(2.0)
     sequence.see_controller(steering(state="DONE", step="120", insertion_m="0.12"), 3.0)
     assert sequence.outcome is not None
     assert sequence.outcome.done
-    assert not sequence.hold
+    assert not sequence.hold(3.0)
 
 
 def test_the_done_of_an_earlier_run_does_not_count() -> None:
@@ -115,11 +115,11 @@ def test_fault_release_and_stop_end_the_run_with_their_reason() -> None:
         assert sequence.outcome is not None
         assert not sequence.outcome.done
         assert reason in sequence.outcome.reason
-        assert not sequence.hold
+        assert not sequence.hold(3.0)
     for state in ("FAULT", "ESTOPPED"):
         sequence = fresh()
         prepare(sequence)
-        sequence.see_device({"homed": "true", "state": state, "reason": "button"})
+        sequence.see_device({"homed": "true", "state": state, "reason": "button"}, 1.0)
         assert sequence.outcome is not None
         assert "button" in sequence.outcome.reason
 
@@ -139,9 +139,38 @@ def test_no_progress_releases_the_hold() -> None:
     sequence.check_time(69.9)
     assert outcome(sequence) is None
     sequence.check_time(70.0)
-    assert not sequence.hold
+    assert not sequence.hold(70.0)
     assert sequence.outcome is not None
     assert "no progress for 60 s at 3.0 mm" in sequence.outcome.reason
+
+
+def test_a_press_that_does_not_count_any_more_is_released_and_pressed_again() -> None:
+    sequence = fresh()
+    prepare(sequence, 1.0)
+    sequence.see_device({"homed": "true", "state": "HOLDING", "hold_owner": "operator"}, 1.1)
+    sequence.check_time(9.0)
+    assert sequence.hold(9.0), "a hold that counts stays pressed"
+    sequence.see_device({"homed": "true", "state": "HOLDING", "hold_owner": ""}, 9.0)
+    sequence.check_time(10.9)
+    assert sequence.hold(10.9), "news may be under way"
+    sequence.check_time(11.0)
+    assert not sequence.hold(11.0)
+    sequence.check_time(11.2)
+    assert sequence.hold(11.25)
+    sequence.check_time(13.2)
+    assert sequence.presses_again == 1
+    sequence.see_device({"homed": "true", "state": "MOVING", "hold_owner": "operator"}, 13.2)
+    sequence.check_time(20.0)
+    assert sequence.hold(20.0)
+    assert sequence.presses_again == 1
+
+
+def test_a_press_that_was_never_taken_is_tried_again() -> None:
+    sequence = fresh()
+    prepare(sequence, 1.0)
+    sequence.check_time(3.0)
+    assert not sequence.hold(3.0)
+    assert sequence.hold(3.25)
 
 
 def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
@@ -162,7 +191,7 @@ def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
 def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    sequence.see_device({"homed": "true", "state": "DISABLED"})
+    sequence.see_device({"homed": "true", "state": "DISABLED"}, 1.0)
     for _ in PREPARATION[:-1]:
         sequence.next_call(1.0)
         sequence.take_answer(True, "", 1.0)
