@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, run_command
 from needle_common.conversions import RELIABLE, to_diagnostic_status
 from needle_common.diagnostics import Diagnostic
 from needle_common.errors import UserError
@@ -124,9 +124,7 @@ def run_node(
     try:
         own = remove_ros_args(argv)[1:]
         if own in (["--help"], ["-h"]):
-            print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
-            print(describe(parameters))
-            return EXIT_DONE
+            return run_command(lambda: _explain(help_text, parameters))
         if own:
             raise UserError(f"unknown argument {own[0]!r}; see --help")
         rclpy.init(args=argv, signal_handler_options=signal_handlers)
@@ -147,11 +145,21 @@ def run_node(
         rclpy.try_shutdown()
 
 
+def _explain(help_text: str, parameters: type) -> int:
+    print(f"{help_text.strip()}\n\nParameters (--ros-args -p NAME:=VALUE):")
+    print(describe(parameters))
+    return EXIT_DONE
+
+
 def _spin(node: Node) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         executor.spin()
+    except RuntimeError:
+        # A signal ends the context also in the middle of a callback: rclpy then cannot publish.
+        if node.context.ok():
+            raise
     finally:
         # An executor that outlives the context complains when it is collected.
         executor.shutdown()

@@ -33,7 +33,10 @@ def run_command(command: Callable[[], int]) -> int:
         The command's own code, 2 after a `UserError`, 130 after an interrupt.
     """
     try:
-        return command()
+        code = command()
+        # a reader that has left shows here, and not when the interpreter ends
+        sys.stdout.flush()
+        return code
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_BAD_INPUT
