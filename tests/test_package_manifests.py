@@ -1,4 +1,4 @@
-"""package.xml names what its package imports, so that rosdep and colcon's order serve a stranger."""
+"""package.xml names what its package imports, so that rosdep and colcon serve a stranger."""
 
 from __future__ import annotations
 
