@@ -10,7 +10,9 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
+
+from tqdm import tqdm
 
 from needle_bringup import verify_step_a, verify_step_b, verify_step_c
 from needle_bringup.verification import Check, Finding, Workbench
@@ -67,17 +69,31 @@ def _verify(arguments: Sequence[str]) -> int:
         return EXIT_DONE
     begin = time.monotonic()
     findings: list[tuple[str, Finding]] = []
-    with _folder(given.keep) as folder:
+    tqdm.monitor_interval = 0  # its thread would outlive the bar
+    with _folder(given.keep) as folder, _progress(len(checks)) as bar:
         bench = Workbench([str(_checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
+            bar.set_description(f"{step} {check.__name__}")
             for finding in _findings(check, bench):
                 findings.append((step, finding))
-                _show(step, finding)
+                with bar.external_write_mode():
+                    _show(step, finding)
+            bar.update()
     failed = sum(not finding.passed for _, finding in findings)
     print(f"{len(findings) - failed} of {len(findings)} as wanted")
     if given.json:
         write_json(Path(given.json), _flat(findings, time.monotonic() - begin))
     return EXIT_MISSED if failed else EXIT_DONE
+
+
+def _progress(checks: int) -> Any:
+    """Return a bar over the checks, on a terminal; elsewhere the findings show how far it is."""
+    return tqdm(
+        total=checks,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+        bar_format="{desc} {bar} {n_fmt} of {total_fmt} checks, {elapsed}",
+    )
 
 
 def _findings(check: Check, bench: Workbench) -> Iterator[Finding]:

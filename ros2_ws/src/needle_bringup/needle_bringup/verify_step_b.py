@@ -2,113 +2,271 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
+import math
+import os
 import subprocess
+import sys
+import time
 from collections.abc import Iterator
-from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial.transform import Rotation
+
+from needle_bringup import control_studies
+from needle_bringup.control_studies import BEST, FIGURE_3, PAPER, SPEED, TROUBLE, Study
 from needle_bringup.installed import find_executable
+from needle_bringup.node_process import NodeProcess, stop
+from needle_bringup.ros_domain import own_domain
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.errors import UserError
+from needle_controller.control_settings import ControlSettings
+from needle_controller.curvature_fit import circle_curvature, fit_curvature
+from needle_controller.gains import design_gains
+from needle_controller.joint_history import JointSample
+from needle_controller.plane_control import PlaneControl
+from needle_controller.reachability import reachability
+from needle_controller.target_plane import offset_plane
 
-AT_END = "converged_at_end"
-LAST_20 = "converged_last_20"
-SEED = "20090201"
-ALL_TROUBLES = ("--outliers", "0.05", "--dropped", "0.2", "--delay", "1", "--kappa-patches", "0.2")
-"""Together with 20 deg of play."""
+Floats = npt.NDArray[np.float64]
+
+RADIUS = 0.122
+"""1 / kappa of the needle in [KC09] IV [m]."""
+NOISE = 1e-3
+"""Largest error of a measured coordinate there [m]."""
+HEADING_STD = math.radians(5.0)
+ENTRY_STD = 0.5e-3
+ARC = 0.06
+MEGABYTE = 1e6
+MEMORY_SLACK = 10.0 * MEGABYTE
 
 
 @dataclasses.dataclass(frozen=True)
-class Study:
-    """One study, and what it must show.
+class Size:
+    """How much of everything is run.
 
     Attributes
     ----------
-    key : str
-        Short name.
-    options : tuple of str
-        Of monte_carlo, beside the controller, the draws and the seed.
-    at_least, at_most : dict
-        Result's key to bound.
+    draws : int
+        Runs of each study from each of its 1000 starts.
+    trouble : tuple of Study
+        Which troubles.
+    insertions : int
+        Pure insertions that the curvature is found from.
     """
 
-    key: str
-    options: tuple[str, ...]
-    at_least: dict[str, float]
-    at_most: dict[str, float] = dataclasses.field(default_factory=dict)
+    draws: int = 10
+    trouble: tuple[Study, ...] = TROUBLE
+    insertions: int = 3000
 
 
-PAPER = (
-    Study("paper_endpoint", (), {AT_END: 0.955}, {"wall_s": 0.2}),
-    Study("paper_cell", ("--grid", "cell"), {AT_END: 0.98}),
-)
-BEST = (
-    Study(
-        "best",
-        (),
-        {AT_END: 0.999, LAST_20: 0.998},
-        {
-            "rms_last_20_mm": 0.25,
-            "p95_last_20_mm": 0.48,
-            "settle_median_mm": 40.0,
-            "settle_p95_mm": 70.0,
-            "rotation_mean_deg": 1500.0,
-            "wall_s": 10.0,
-        },
-    ),
-    Study("kappa_08", ("--kappa-scale", "0.8"), {AT_END: 0.998}),
-    Study("kappa_12", ("--kappa-scale", "1.2"), {AT_END: 0.998}),
-    *(Study(f"play_{d}", ("--play-deg", str(d)), {AT_END: 0.995}) for d in (10, 20, 30, 40)),
-    *(Study(f"lag_{d}", ("--lag-mm", str(d)), {AT_END: 0.97}) for d in (4, 8)),
-    Study("outliers", ("--outliers", "0.05"), {AT_END: 0.998}),
-    Study("dropped", ("--dropped", "0.2"), {AT_END: 0.998}),
-    Study("late", ("--delay", "1"), {AT_END: 0.998}),
-    Study("all_troubles", (*ALL_TROUBLES, "--play-deg", "20"), {AT_END: 0.975}),
-    Study("roll_120", ("--roll-deg", "180"), {AT_END: 0.965}),
-    Study("roll_160", ("--roll-deg", "180", "--depth-mm", "160"), {AT_END: 0.985}),
-    Study("x_120", ("--x-mm", "10"), {AT_END: 0.965}),
-    Study("x_180", ("--x-mm", "10", "--depth-mm", "180"), {AT_END: 0.998}),
-    Study("flips", ("--flips", "11"), {AT_END: 0.999}),
-)
+FULL = Size()
 
 
-def paper(bench: Workbench) -> Iterator[Finding]:
+def paper(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
     """Study the paper's observer and law on both grids."""
     for study in PAPER:
-        yield from _findings("paper", study, bench.folder)
+        yield from _findings(study, bench, size)
 
 
-def best(bench: Workbench) -> Iterator[Finding]:
-    """Study preset best, undisturbed and under each trouble."""
-    for study in BEST:
-        yield from _findings("best", study, bench.folder)
+def figure_3(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Settle from figure 3's start, over many noises."""
+    yield from _findings(FIGURE_3, bench, size)
 
 
-def _findings(controller: str, study: Study, folder: Path) -> Iterator[Finding]:
-    result = _run(controller, study, folder / f"{study.key}.json")
-    bounds = [(key, bound, True) for key, bound in study.at_least.items()]
-    bounds += [(key, bound, False) for key, bound in study.at_most.items()]
-    for key, bound, is_least in bounds:
-        value = result[key]
-        passed = value is not None and (value >= bound if is_least else value <= bound)
+def best(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Study preset best, undisturbed."""
+    yield from _findings(BEST, bench, size)
+
+
+def trouble(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Study preset best under each trouble, of which it is told nothing."""
+    for study in size.trouble:
+        yield from _findings(study, bench, size)
+
+
+def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Find the curvature from a pure insertion of 60 mm."""
+    tips, insertion = pure_insertions(size.insertions, np.random.default_rng(60))
+    radius = fit_curvature(tips, insertion).radius / RADIUS - 1.0
+    bias, spread = float(np.mean(radius)), float(np.std(radius))
+    # What so many insertions cannot tell from none.
+    doubt = 3.0 * spread / math.sqrt(size.insertions) if size.insertions < FULL.insertions else 0.0
+    circle = circle_curvature(tips) * RADIUS - 1.0
+    yield Finding(
+        "curvature_fit",
+        f"1/kappa from {size.insertions} insertions of 60 mm, +-1 mm noise",
+        "bias <= 0.5 %, spread <= 6.5 %",
+        f"bias {bias:+.2%}, spread {spread:.2%} (a plain circle: kappa {np.mean(circle):+.0%})",
+        abs(bias) <= 0.005 + doubt and spread <= 0.065,
+    )
+    file, result = bench.folder / "insertion.csv", bench.folder / "insertion.json"
+    with file.open("w", encoding="utf-8", newline="") as stream:
+        writer = csv.writer(stream)
+        writer.writerow(["insertion_m", "x_m", "y_m", "z_m"])
+        writer.writerows(np.column_stack([insertion, tips[0]]).tolist())
+    command = [find_executable("needle_controller", "identify_curvature"), str(file)]
+    done = subprocess.run(
+        [*command, "--json", str(result)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise UserError(f"identify_curvature: {done.stderr.strip()}")
+    found = json.loads(result.read_text("utf-8"))
+    low, high = found["radius_low_mm"], found["radius_high_mm"]
+    yield Finding(
+        "curvature_command",
+        "identify_curvature on a CSV of one of them",
+        f"a 95 % interval that holds {RADIUS * 1e3:.0f} mm",
+        f"{found['radius_mm']:.1f} mm, {low:.1f} to {high:.1f} mm",
+        low <= RADIUS * 1e3 <= high,
+    )
+
+
+def bad_parameters(bench: Workbench) -> Iterator[Finding]:
+    """Refuse bad parameters and planes with what and why, and keep the last good ones."""
+    weights = np.diag(ControlSettings.state_weights)
+    weights[0, 1] = 1.0
+    try:
+        settings = ControlSettings()
+        design_gains(
+            state_weights=weights,
+            input_weight=settings.input_weight,
+            process_noise=np.diag(settings.process_noise),
+            measurement_std=settings.measurement_std,
+            step_length=settings.step_length,
+        )
+        seen = "gains"
+    except UserError as error:
+        seen = str(error)
+    yield Finding(
+        "bad_weights", "weights that are not symmetric", "refused", seen, "symmetric" in seen
+    )
+    with own_domain() as domain:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        node = NodeProcess(
+            "plane_controller",
+            [find_executable("needle_controller", "plane_controller")],
+            environment=environment,
+            log=bench.folder / "plane_controller.log",
+        )
+        try:
+            asked = subprocess.run(
+                [sys.executable, "-m", "needle_bringup.bad_parameters_node"],
+                env=environment,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+        finally:
+            stop([node])
+    if asked.returncode:
+        raise UserError(f"bad_parameters: {asked.stderr.strip()}; {node.last_line}")
+    for case, answer in json.loads(asked.stdout.splitlines()[-1]).items():
         yield Finding(
-            f"{study.key}_{key}",
-            f"{controller} {' '.join(study.options) or '(undisturbed)'}: {key}",
-            f"{'>=' if is_least else '<='} {bound:g}",
-            "nothing" if value is None else f"{value:.4g}",
-            passed,
+            f"bad_{case.replace(' ', '_')}",
+            case,
+            "refused with the reason, all as before",
+            f"{answer['reason'] or 'taken'}{'' if answer['kept'] else '; CHANGED'}",
+            bool(answer["refused"] and answer["reason"] and answer["kept"]),
         )
 
 
-def _run(controller: str, study: Study, file: Path) -> dict[str, float | None]:
-    command = [find_executable("needle_sim", "monte_carlo"), "--controller", controller]
-    command += [*study.options, "--draws", "10", "--seed", SEED, "--json", str(file)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"{study.key}: {done.stderr.strip().splitlines()[-1]}")
-    result: dict[str, float | None] = json.loads(file.read_text(encoding="utf-8"))
-    return result
+def study_speed(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Steer 10,000 needles over 120 steps, on one core."""
+    for study, times in zip(SPEED, (3, 1), strict=True):
+        results = [
+            control_studies.run(study, bench.folder, size.draws).figures for _ in range(times)
+        ]
+        fastest = min(results, key=lambda figures: figures["wall_s"] or math.inf)
+        yield from control_studies.judge(study, fastest, size.draws)
 
 
-CHECKS: tuple[Check, ...] = (paper, best)
+def study_memory(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Need memory for the needles, not for the steps."""
+    for name in ("paper", "best"):
+        used = {}
+        for draws, depth in ((size.draws, 60), (size.draws, 240), (1, 60)):
+            study = Study(f"memory_{name}", name, ("--depth-mm", str(depth)))
+            used[draws, depth] = control_studies.run(study, bench.folder, draws).peak_memory
+        steps = used[size.draws, 240] - used[size.draws, 60]
+        needles = used[size.draws, 60] - used[1, 60]
+        yield Finding(
+            f"memory_{name}",
+            f"{name}: what four times as many steps need beside {size.draws * 1000} needles",
+            f"<= {MEMORY_SLACK / MEGABYTE:g} MB",
+            f"{steps / MEGABYTE:+.1f} MB ({used[size.draws, 60] / MEGABYTE:.0f} MB in all; "
+            f"{needles / MEGABYTE:+.0f} MB from 1000 to {size.draws * 1000} needles)",
+            steps <= MEMORY_SLACK,
+        )
+
+
+def node_update(_: Workbench) -> Iterator[Finding]:
+    """Take a tip in the node: estimate with covariance, command, reach."""
+    for preset in ("paper", "best"):
+        seconds = update_times(preset)
+        yield Finding(
+            f"update_{preset}",
+            f"{preset}: one update of the node's controller on one core",
+            "<= 1 ms (median)",
+            f"{np.median(seconds) * 1e3:.3f} ms, the slowest of {len(seconds)} "
+            f"{np.max(seconds) * 1e3:.3f} ms",
+            float(np.median(seconds)) <= 1e-3,
+        )
+
+
+CHECKS: tuple[Check, ...] = (
+    paper, figure_3, best, trouble, curvature, bad_parameters, study_speed, study_memory,
+    node_update,
+)  # fmt: skip
+
+
+def pure_insertions(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
+    """Return measured tips of insertions without rotation, and how far in each was.
+
+    Returns
+    -------
+    tips : ndarray, shape (count, 61, 3)
+        On circles of radius `RADIUS` at any roll, entering with a heading off by 5 deg and a place
+        off by 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
+    insertion : ndarray, shape (61,)
+        [m].
+    """
+    insertion = np.linspace(0.0, ARC, 61)
+    angle = insertion / RADIUS
+    circle = RADIUS * np.stack([np.zeros(61), np.cos(angle) - 1.0, np.sin(angle)], axis=-1)
+    rolls = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
+    heading = np.zeros((count, 3))
+    heading[:, :2] = rng.normal(0.0, HEADING_STD, (count, 2))
+    turned = (Rotation.from_rotvec(heading) * rolls).as_matrix()
+    tips = circle @ np.swapaxes(turned, -1, -2)
+    tips += rng.normal(0.0, ENTRY_STD, (count, 1, 3))
+    return tips + rng.uniform(-NOISE, NOISE, tips.shape), insertion
+
+
+def update_times(preset: str) -> Floats:
+    """Return how long each update of a run of 120 steps takes on the processor [s]."""
+    settings = dataclasses.replace(ControlSettings(), preset=preset)
+    control, rng = PlaneControl(settings, offset_plane(0.003)), np.random.default_rng(1)
+    length, rotation, seconds = settings.step_length, 0.0, []
+    place, turned = np.zeros(3), Rotation.identity()
+    for step in range(121):
+        insertion, tip = step * length, place + rng.uniform(-NOISE, NOISE, 3)
+        begin = time.process_time()
+        update = control.update(tip, JointSample(step, insertion, rotation))
+        estimate = update.estimate
+        estimate.covariance  # noqa: B018 - lazy, and published
+        reachability(estimate.reduced, estimate.curvature, insertion=insertion, end=0.12)
+        seconds.append(time.process_time() - begin)
+        turn = float(update.command.rotation_rate) * length
+        half = Rotation.from_rotvec([0.5 * length / RADIUS, 0.0, 0.5 * turn])
+        place = place + length * (turned * half).apply([0.0, 0.0, 1.0])
+        turned, rotation = turned * half * half, rotation + turn
+    return np.array(seconds)
+
+
+def _findings(study: Study, bench: Workbench, size: Size) -> Iterator[Finding]:
+    result = control_studies.run(study, bench.folder, size.draws)
+    return control_studies.judge(study, result.figures, size.draws)

@@ -84,6 +84,7 @@ def test_every_yaml_of_the_package_parses() -> None:
 
 def test_the_controller_knows_the_sensor_of_its_level() -> None:
     tip = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.5), Path("bag"))
+    assert tip["plane_controller"]["tip_covariance"] == "configured"
     assert tip["plane_controller"]["tip_noise"] == "bounded"
     assert tip["plane_controller"]["tip_noise_bound"] == pytest.approx(0.0005)
     exact = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.0), Path("bag"))
@@ -91,3 +92,4 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
     camera = command_line_parameters(SimulateOptions(), Path("bag"))
     assert "tip_noise" not in camera["plane_controller"]
     assert rig_parameters()["plane_controller"]["tip_noise"] == "normal"
+    assert rig_parameters()["plane_controller"]["tip_covariance"] == "from_tip_pose"

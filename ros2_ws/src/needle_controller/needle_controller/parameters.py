@@ -7,6 +7,7 @@ import math
 
 import numpy as np
 
+from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_controller.control_settings import PRESETS, TIP_NOISES, ControlSettings
 from needle_controller.flip_plan import FlipPlan
@@ -210,6 +211,10 @@ class PlaneControllerParameters:
     def __post_init__(self) -> None:
         """Check the whole, gains included."""
         check_fields(self)
+        for name in ("state_weights", "process_noise"):
+            numbers = getattr(self, name)
+            if len(numbers) != 3:
+                raise UserError(f"{name} = {list(numbers)}, wants three numbers, for s1, s2, s3")
         check_within_reach(offset_plane(self.target_offset), self.curvature, self.depth)
         FlipPlan(self.flip_depths).check_within(self.depth)
         self.control().gains()

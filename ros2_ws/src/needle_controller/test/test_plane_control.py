@@ -125,6 +125,9 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane() -> None:
         ({"curvature": 0.0}, "curvature = 0"),
         ({"tip_noise": "pink"}, "'pink'"),
         ({"tip_noise_bound": 0.0}, "tip_noise_bound"),
+        ({"state_weights": tuple(range(9))}, "state_weights.*three numbers"),
+        ({"process_noise": (1.0, 1.0)}, "process_noise.*three numbers"),
+        ({"tip_covariance": "none"}, "'none'"),
     ],
 )
 def test_a_bad_whole_is_refused_with_what_and_why(changes: dict[str, Any], said: str) -> None:
