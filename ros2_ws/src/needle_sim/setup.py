@@ -9,7 +9,7 @@ PACKAGE = "needle_sim"
 setup(
     name=PACKAGE,
     version="0.1.0",
-    packages=[PACKAGE],
+    packages=[PACKAGE, f"{PACKAGE}.drives"],
     package_data={PACKAGE: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -25,6 +25,7 @@ setup(
     entry_points={
         "console_scripts": [
             "sim_rig = needle_sim.sim_rig_node:main",
+            "drive_emulator = needle_sim.drive_emulator_node:main",
             "monte_carlo = needle_sim.monte_carlo:main",
             "render_images = needle_sim.render_images:main",
         ]

@@ -1,0 +1,230 @@
+"""The `drive_emulator` executable: two drives on a bus, as a process of their own."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from sensor_msgs.msg import JointState
+
+from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE
+from needle_common.conversions import JOINT_STATES, to_stamp
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.parameters import NodeParameters
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drives.drive_server import DriveServer, Port
+from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.fault_commands import COMMANDS
+from needle_sim.drives.power_state import PowerState
+from needle_sim.drives.pty_port import PtyPort
+from needle_sim.drives.socketcand_port import SocketcandPort
+
+HELP = f"""\
+drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
+
+Whatever drives them reaches the bus as through a serial adapter (slcan) at a pseudo-terminal, or by
+socketcand over TCP. The drives know profile position, homing (methods 17, 18, 35, 37) and cyclic
+synchronous position mode, software limits, following error, emergencies, heartbeats both ways.
+
+By hand, beside a driver:
+    ros2 run needle_sim drive_emulator --ros-args -p pty:=/tmp/can
+    ros2 run needle_device_driver device_driver --ros-args -p link:=slcan -p channel:=/tmp/can
+
+Faults on command: type a line into this program's terminal, or write it to its input.
+{"".join(f"    {line}" + chr(10) for line in COMMANDS.splitlines())}
+Publishes   sim/drive_positions: where the motors really are, from the home switch's edge, whatever
+            the drives count; with motion_clock sync one for every SYNC, else 50 Hz
+"""
+
+_WAIT = 0.005
+_PERIOD = 0.02
+_LOOK_AROUND = 0.05
+
+
+class DriveEmulatorNode(Node):
+    """Runs the drives and tells what their motors did.
+
+    Parameters
+    ----------
+    node_arguments : dict
+        Passed on to rclpy's Node (a context of its own, parameter overrides).
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("drive_emulator", **node_arguments)
+        values = NodeParameters(self, DriveEmulatorParameters).values
+        clock = MotionClock(values.motion_clock)
+        self._steps_with_sync = clock is MotionClock.SYNC
+        self._bus = EmulatedBus(values.insertion, values.rotation, clock, time.monotonic())
+        self._states = {name: drive.state for name, drive in self._bus.drives.items()}
+        self._syncs_told = 0
+        self._told_ns = -1
+        self._told_at = 0.0
+        self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
+        self._diagnostics = DiagnosticsPublisher(self)
+        port: Port
+        if values.socketcand_port:
+            port = SocketcandPort(values.socketcand_port)
+            self.get_logger().info(f"socketcand on localhost:{values.socketcand_port}, bus can0")
+        else:
+            pty = PtyPort(Path(values.pty).expanduser() if values.pty else None)
+            port = pty
+            self.get_logger().info(f"slcan adapter at {pty.path}")
+        self._server = DriveServer(self._bus, port)
+        self._tell_health()
+
+    def turn(self) -> bool:
+        """Serve the bus for a moment.
+
+        Returns
+        -------
+        bool
+            Whether the stamp of the last positions waits for /clock.
+        """
+        self._server.turn(_WAIT if not self._waits_for_time else 0.0)
+        now = time.monotonic()
+        if self._steps_with_sync:
+            self._tell_synced_positions()
+        elif now - self._told_at >= _PERIOD:
+            self._told_at = max(self._told_at + _PERIOD, now - _PERIOD)
+            self._tell_positions(self.get_clock().now().nanoseconds)
+        self._watch_states()
+        return self._waits_for_time
+
+    def obey(self, line: str) -> None:
+        """Carry out a fault on command; complain about what is none."""
+        try:
+            self._server.obey(line)
+        except UserError as error:
+            self.get_logger().error(str(error))
+            return
+        self.get_logger().warning(f"on command: {line.strip()}")
+        self._tell_health()
+
+    def close(self) -> None:
+        """Take the adapter away."""
+        self._server.close()
+
+    @property
+    def _waits_for_time(self) -> bool:
+        return self._steps_with_sync and self._bus.syncs > self._syncs_told
+
+    def _tell_synced_positions(self) -> None:
+        """Tell the positions of the last SYNC.
+
+        A SYNC is sent once the time that it belongs to is known to its sender, and that may be
+        before it is known here: the stamp is the first time after that of the SYNC before.
+        """
+        now_ns = self.get_clock().now().nanoseconds
+        behind = self._bus.syncs - self._syncs_told
+        if behind and (now_ns > self._told_ns or behind > 1):
+            self._syncs_told = self._bus.syncs
+            self._tell_positions(now_ns)
+
+    def _tell_positions(self, stamp_ns: int) -> None:
+        self._told_ns = stamp_ns
+        axes = self._bus.axes()
+        message = JointState(
+            name=[f"{name}_joint" for name in axes],
+            position=[axis.position for axis in axes.values()],
+            velocity=[axis.velocity for axis in axes.values()],
+        )
+        message.header.stamp = to_stamp(stamp_ns)
+        self._positions.publish(message)
+
+    def _watch_states(self) -> None:
+        states = {name: drive.state for name, drive in self._bus.drives.items()}
+        if states == self._states:
+            return
+        for name, state in states.items():
+            if state is PowerState.FAULT and self._states[name] is not state:
+                code = self._bus.drives[name].error_code
+                self.get_logger().warning(f"{name} drive: fault 0x{code:04X}")
+        self._states = states
+        self._tell_health()
+
+    def _tell_health(self) -> None:
+        states = {name: state.name for name, state in self._states.items()}
+        faults = [name for name, state in states.items() if state == PowerState.FAULT.name]
+        message = f"fault of {' and '.join(faults)}" if faults else "runs"
+        level = Level.WARN if faults or self._bus.is_cut else Level.OK
+        if self._bus.is_cut:
+            message += ", the bus is cut"
+        self._diagnostics.set("drives", Diagnostic(level, message, states))
+
+
+def main() -> int:
+    """Run the emulator; returns its exit code."""
+    ended = False
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    # rclpy's own handlers would leave the link to the port behind.
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, on_signal)
+
+    def spin(node: Node) -> int:
+        assert isinstance(node, DriveEmulatorNode)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        commands = _CommandInput()
+        looked_at = 0.0
+        try:
+            while not ended:
+                waits = node.turn()
+                for line in commands.lines():
+                    node.obey(line)
+                now = time.monotonic()
+                # A look at ROS costs more than serving a frame: only where there is a reason.
+                if waits or now - looked_at >= _LOOK_AROUND:
+                    looked_at = now
+                    executor.spin_once(timeout_sec=_WAIT if waits else 0.0)
+        finally:
+            node.close()
+            executor.shutdown()
+        return EXIT_DONE
+
+    return run_node(
+        DriveEmulatorNode,
+        help_text=HELP,
+        parameters=DriveEmulatorParameters,
+        spin=spin,
+        signal_handlers=SignalHandlerOptions.NO,
+    )
+
+
+class _CommandInput:
+    """Lines of this program's input as they come, without waiting for any."""
+
+    def __init__(self) -> None:
+        self._open = sys.stdin is not None
+        self._rest = b""
+
+    def lines(self) -> list[str]:
+        if not self._open or not select.select([sys.stdin], [], [], 0.0)[0]:
+            return []
+        # What is typed for a shell in front is not for a program in its background.
+        if sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
+            return []
+        data = os.read(sys.stdin.fileno(), 4096)
+        # An input that has ended is always ready: not looked at any more.
+        self._open = bool(data)
+        *lines, self._rest = (self._rest + data).split(b"\n")
+        return [line.decode(errors="replace") for line in lines if line.strip()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,307 @@
+"""What a powered drive does with its motor: its modes, ramps, limits and following error."""
+
+from __future__ import annotations
+
+import enum
+
+from needle_sim.drives.demand import Demand
+from needle_sim.drives.drive_objects import (
+    CYCLIC_SYNCHRONOUS_POSITION,
+    HOMING,
+    POSITION,
+    PROFILE_POSITION,
+    TARGET_POSITION,
+)
+from needle_sim.drives.homing import METHODS, Homing
+from needle_sim.drives.motor import Motor
+from needle_sim.drives.object_dictionary import Abort, ObjectDictionary, SdoAbortError
+
+# Motion is computed in steps of so much [s].
+MOTION_STEP = 0.001
+# Bits of the controlword and of the statusword that belong to the mode.
+NEW_SET_POINT = HOMING_START = 1 << 4
+_AT_ONCE, _RELATIVE = 1 << 5, 1 << 6
+HALT = 1 << 8
+_REACHED, _LIMITED, _BIT_12, _BIT_13 = 1 << 10, 1 << 11, 1 << 12, 1 << 13
+# 0x60FD.
+_NEGATIVE_SWITCH, _POSITIVE_SWITCH, _HOME_SWITCH = 1, 2, 4
+_NO_WINDOW = 0xFFFFFFFF
+
+
+class LimitAction(enum.Enum):
+    """What a drive does with a target beyond its software limits (0x607D)."""
+
+    CLAMP = "clamp"
+    FAULT = "fault"
+    ABORT = "abort"
+
+
+class LimitExceededError(Exception):
+    """A target beyond the software limits, and the drive is set to fail for it."""
+
+
+class DriveMotion:
+    """Moves a motor as the objects of its drive say. Positions are the motor's true counts.
+
+    Parameters
+    ----------
+    objects : ObjectDictionary
+        The drive's.
+    motor : Motor
+        What moves.
+    limit_action : LimitAction
+        For a target beyond the software limits; they act once the drive is homed.
+    """
+
+    def __init__(self, objects: ObjectDictionary, motor: Motor, limit_action: LimitAction) -> None:
+        self._objects = objects
+        self._motor = motor
+        self._limit_action = limit_action
+        self._demand = Demand(motor.position)
+        self._zero = motor.position
+        self._mode = 0
+        self._word = 0
+        self._homed = False
+        self._homing: Homing | None = None
+        self._homing_failed = False
+        self._target: float | None = None
+        self._next_target: float | None = None
+        self._limited = False
+        self._late = 0.0
+        objects.on_write(TARGET_POSITION, 0, check=self._check_target)
+
+    # ---- power --------------------------------------------------------------------------------
+
+    def power_up(self) -> None:
+        """Begin un-homed and count from where the motor stands."""
+        self.switch_off()
+        self._zero = self._motor.position
+        self._mode = self._word = 0
+        self._homed = self._homing_failed = self._limited = False
+
+    def switch_on(self) -> None:
+        """Hold the motor where it is."""
+        self._demand.hold(self._motor.position)
+        self.forget()
+
+    def switch_off(self) -> None:
+        """Let go of the motor: the friction of screw and gear holds it at once."""
+        self._motor.rest()
+        self._demand.hold(self._motor.position)
+        self.forget()
+
+    def forget(self) -> None:
+        """Drop every order to move; what moves needs a ramp still."""
+        self._target = self._next_target = self._homing = None
+        self._late = 0.0
+
+    # ---- orders -------------------------------------------------------------------------------
+
+    def set_mode(self, mode: int) -> None:
+        """Take the mode of operation."""
+        if mode != self._mode:
+            self._mode = mode
+            self.forget()
+            self._objects.set(0x6061, 0, mode)
+
+    def take_word(self, word: int, *, enabled: bool) -> None:
+        """Take the controlword's bits for the mode, `enabled` or not.
+
+        Raises
+        ------
+        LimitExceededError
+            If they order a target beyond the limits.
+        """
+        rising = word & ~self._word
+        self._word = word
+        if not enabled:
+            return
+        if self._mode == PROFILE_POSITION and rising & NEW_SET_POINT:
+            self._take_profile_target(word)
+        elif self._mode == HOMING and rising & HOMING_START:
+            self._begin_homing()
+        elif self._mode == HOMING and not word & HOMING_START:
+            self._homing = None
+
+    def take_set_point(self) -> None:
+        """Take the target of cyclic synchronous position mode; the way to it ends there.
+
+        Raises
+        ------
+        LimitExceededError
+            If it is beyond the limits.
+        """
+        if self._mode != CYCLIC_SYNCHRONOUS_POSITION or self._halted:
+            return
+        target = self._within_limits(self._objects.value(TARGET_POSITION))
+        if target is None:
+            return
+        way = target + self._zero - self._demand.position
+        if self._is_blocked(way):
+            self._limited = True
+        elif way != 0.0:
+            self._demand.begin_segment(target + self._zero, self.interpolation_period)
+
+    # ---- time ---------------------------------------------------------------------------------
+
+    @property
+    def interpolation_period(self) -> float:
+        """Time that the way to a cyclic set-point takes, 0x60C2 [s]."""
+        period = self._objects.value(0x60C2, 1) * 10.0 ** self._objects.value(0x60C2, 2)
+        return float(max(period, MOTION_STEP))
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the demand stands, whatever the motor does."""
+        return self._demand.at_rest
+
+    @property
+    def settled(self) -> bool:
+        """Whether time alone would change nothing."""
+        return (
+            self._demand.at_rest
+            and self._motor.position == self._demand.position
+            and self._homing is None
+            and self._target is None
+        )
+
+    def rest(self) -> None:
+        """Let time go by while nothing moves."""
+        self._motor.rest()
+        self._late = 0.0
+
+    def operate(self, period: float) -> None:
+        """Move the demand on for `period` [s] in the present mode."""
+        demand = self._demand
+        if self._homing is None and self._is_blocked(demand.velocity):
+            self.brake(0x6085, period)
+            self._target = self._next_target = None
+            self._limited = True
+        elif self._mode == CYCLIC_SYNCHRONOUS_POSITION and not self._halted:
+            demand.interpolate(period)
+        elif self._mode == PROFILE_POSITION and self._target is not None and not self._halted:
+            value = self._objects.value
+            speed = min(value(0x6081), value(0x607F))
+            if demand.approach(self._target, speed, value(0x6083), value(0x6084), period):
+                self._target, self._next_target = self._next_target, None
+        elif self._homing is not None and not self._halted:
+            self._home(self._homing, period)
+        else:
+            self.brake(0x6084, period)
+
+    def brake(self, ramp: int, period: float) -> None:
+        """Slow the demand down along the ramp in object `ramp`."""
+        self._demand.brake(float(self._objects.value(ramp)), period)
+
+    def follow(self, period: float) -> bool:
+        """Move the motor for `period` [s]; returns whether it is too far off for too long."""
+        self._motor.follow(self._demand.position, period)
+        window = self._objects.value(0x6065)
+        off = abs(self._demand.position - self._motor.position)
+        self._late = self._late + period if off > window and window != _NO_WINDOW else 0.0
+        return self._late > self._objects.value(0x6066) * 1e-3
+
+    # ---- what a master reads ------------------------------------------------------------------
+
+    def show(self, *, enabled: bool) -> int:
+        """Bring the objects up to date; returns the statusword's bits of the mode."""
+        put, motor = self._objects.set, self._motor
+        position = round(motor.position - self._zero)
+        demanded = round(self._demand.position - self._zero)
+        put(POSITION, 0, position)
+        put(0x6062, 0, demanded)
+        put(0x60F4, 0, demanded - position)
+        put(0x606C, 0, round(motor.velocity))
+        put(0x6077, 0, 1000 if motor.stalled and demanded != position else 0)
+        inputs = _NEGATIVE_SWITCH | _HOME_SWITCH if motor.at_negative_switch else 0
+        put(0x60FD, 0, inputs | (_POSITIVE_SWITCH if motor.at_positive_switch else 0))
+        return self._status_bits(enabled=enabled)
+
+    def _status_bits(self, *, enabled: bool) -> int:
+        bits = _LIMITED if self._limited else 0
+        if self._mode == PROFILE_POSITION:
+            reached = self._target is None and self._demand.at_rest
+            taken = self._word & NEW_SET_POINT
+            return (
+                bits
+                | (_REACHED if reached else 0)
+                | (_BIT_12 if taken else 0)
+                | (_BIT_13 if self._late else 0)
+            )
+        if self._mode == HOMING:
+            reached = self._homing is None and self._demand.at_rest
+            return (
+                bits
+                | (_REACHED if reached else 0)
+                | (_BIT_12 if self._homed else 0)
+                | (_BIT_13 if self._homing_failed else 0)
+            )
+        if self._mode == CYCLIC_SYNCHRONOUS_POSITION:
+            return bits | (_BIT_12 if enabled else 0) | (_BIT_13 if self._late else 0)
+        return bits
+
+    # ---- inside -------------------------------------------------------------------------------
+
+    @property
+    def _halted(self) -> bool:
+        return bool(self._word & HALT)
+
+    def _is_blocked(self, way: float) -> bool:
+        """Whether a limit switch lies in that direction."""
+        return (way < 0.0 and self._motor.at_negative_switch) or (
+            way > 0.0 and self._motor.at_positive_switch
+        )
+
+    def _take_profile_target(self, word: int) -> None:
+        value = self._objects.value
+        start = value(POSITION) if word & _RELATIVE else 0
+        target = self._within_limits(start + value(TARGET_POSITION))
+        if target is None:
+            return
+        if word & _AT_ONCE or self._target is None:
+            self._target, self._next_target = target + self._zero, None
+        else:
+            self._next_target = target + self._zero
+
+    def _begin_homing(self) -> None:
+        value = self._objects.value
+        self._homing_failed = value(0x6098) not in METHODS
+        if self._homing_failed:
+            return
+        self._homed = self._limited = False
+        self._homing = Homing(
+            value(0x6098),
+            self._motor,
+            speed=value(0x6099, 1),
+            edge_speed=value(0x6099, 2),
+            acceleration=value(0x609A),
+        )
+
+    def _home(self, homing: Homing, period: float) -> None:
+        homing.advance(self._demand, period)
+        if homing.done:
+            self._zero = homing.home_position + self._objects.value(0x607C)
+            self._homed = True
+            self._homing = None
+
+    def _within_limits(self, target: int) -> int | None:
+        """Return the target as the software limits leave it; None for one that is not taken."""
+        lower, upper = self._objects.value(0x607D, 1), self._objects.value(0x607D, 2)
+        self._limited = self._homed and not lower <= target <= upper
+        if not self._limited:
+            return target
+        if self._limit_action is LimitAction.CLAMP:
+            return min(max(target, lower), upper)
+        if self._limit_action is LimitAction.FAULT:
+            raise LimitExceededError
+        return None
+
+    def _check_target(self, target: int) -> None:
+        if self._limit_action is not LimitAction.ABORT or not self._homed:
+            return
+        lower, upper = self._objects.value(0x607D, 1), self._objects.value(0x607D, 2)
+        self._limited = not lower <= target <= upper
+        if target > upper:
+            raise SdoAbortError(Abort.VALUE_TOO_HIGH)
+        if target < lower:
+            raise SdoAbortError(Abort.VALUE_TOO_LOW)

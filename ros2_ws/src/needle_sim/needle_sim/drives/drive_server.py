@@ -1,0 +1,74 @@
+"""Connects the emulated bus to its adapter: waits for bytes, lets time go by, hands frames on."""
+
+from __future__ import annotations
+
+import select
+import time
+from typing import Protocol
+
+from needle_sim.drives.can_frame import CanFrame
+from needle_sim.drives.emulated_bus import EmulatedBus
+from needle_sim.drives.fault_commands import PlugOrder, obey
+
+
+class Port(Protocol):
+    """A way for a computer to the bus."""
+
+    @property
+    def filenos(self) -> list[int]:
+        """What to wait for input at."""
+
+    def plug_in(self) -> None:
+        """Appear."""
+
+    def unplug(self) -> None:
+        """Disappear."""
+
+    def receive(self) -> tuple[CanFrame, ...]:
+        """Return the frames that the computer has sent; waits for nothing."""
+
+    def send(self, frames: list[CanFrame]) -> None:
+        """Hand frames from the bus to the computer."""
+
+
+class DriveServer:
+    """Serves one bus at one port; whoever runs it calls `turn` again and again.
+
+    Parameters
+    ----------
+    bus : EmulatedBus
+        The drives.
+    port : Port
+        Where the computer is.
+    """
+
+    def __init__(self, bus: EmulatedBus, port: Port) -> None:
+        self.bus = bus
+        self._port = port
+
+    def turn(self, timeout: float) -> None:
+        """Wait for input, at most `timeout` [s], and do what is due."""
+        select.select(self._port.filenos, [], [], timeout)
+        self._port.send(self.bus.poll(time.monotonic()))
+        for frame in self._port.receive():
+            self.bus.receive(frame, time.monotonic())
+            # An answer may decide what the computer sends next: nothing is held back.
+            self._port.send(self.bus.poll(time.monotonic()))
+
+    def obey(self, line: str) -> None:
+        """Carry out a fault on command.
+
+        Raises
+        ------
+        UserError
+            A line that is no command.
+        """
+        order = obey(line, self.bus, time.monotonic())
+        if order is PlugOrder.OUT:
+            self._port.unplug()
+        elif order is PlugOrder.IN:
+            self._port.plug_in()
+
+    def close(self) -> None:
+        """Take the adapter away."""
+        self._port.unplug()

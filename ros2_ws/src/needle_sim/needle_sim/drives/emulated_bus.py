@@ -1,0 +1,135 @@
+"""The CAN bus with both drives, the clock of their motion, and faults on command."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+from needle_sim.drives.can_frame import CanFrame
+from needle_sim.drives.canopen_device import SYNC
+from needle_sim.drives.drive_motion import MOTION_STEP
+from needle_sim.drives.emulated_drive import DriveSettings, EmulatedDrive
+
+
+class MotionClock(enum.Enum):
+    """What lets the motors move on."""
+
+    # One SYNC period with every SYNC: the same commands give the same positions, to the count.
+    SYNC = "sync"
+    # The steady clock, as on a bench.
+    STEADY = "steady"
+
+
+@dataclasses.dataclass(frozen=True)
+class AxisState:
+    """Where a motor really is.
+
+    Attributes
+    ----------
+    position : float
+        From the edge of the home switch [m or rad], whatever the drive counts.
+    velocity : float
+        [m/s or rad/s].
+    """
+
+    position: float
+    velocity: float
+
+
+class EmulatedBus:
+    """Two drives on one bus.
+
+    Parameters
+    ----------
+    insertion, rotation : DriveSettings
+        The drives.
+    clock : MotionClock
+        What lets them move on.
+    now : float
+        Steady time at which the power comes [s].
+    """
+
+    def __init__(
+        self, insertion: DriveSettings, rotation: DriveSettings, clock: MotionClock, now: float
+    ) -> None:
+        if insertion.node_id == rotation.node_id:
+            raise ValueError(f"both drives have node id {insertion.node_id}")
+        self.drives = {"insertion": EmulatedDrive(insertion), "rotation": EmulatedDrive(rotation)}
+        self._clock = clock
+        self._moved_until = now
+        self.syncs = 0
+        self.is_cut = False
+        for drive in self.drives.values():
+            drive.power_up(now)
+
+    def receive(self, frame: CanFrame, now: float) -> None:
+        """Take a frame from the master at steady time `now` [s]."""
+        if self.is_cut:
+            return
+        self._move_until(now)
+        if frame.identifier == SYNC and not frame.remote:
+            self.syncs += 1
+            for drive in self.drives.values():
+                if self._clock is MotionClock.SYNC:
+                    drive.advance(round(drive.sync_period / MOTION_STEP))
+                drive.sync()
+            return
+        for drive in self.drives.values():
+            drive.receive(frame, now)
+
+    def poll(self, now: float) -> list[CanFrame]:
+        """Let time go by until `now` [s]; return what the drives put on the bus."""
+        self._move_until(now)
+        frames: list[CanFrame] = []
+        for drive in self.drives.values():
+            drive.tick(now)
+            frames += drive.device.outbox
+            drive.device.outbox.clear()
+        return [] if self.is_cut else frames
+
+    def axes(self) -> dict[str, AxisState]:
+        """Return where both motors really are."""
+        states = {}
+        for name, drive in self.drives.items():
+            scale = drive.settings.motor.counts_per_unit
+            states[name] = AxisState(drive.motor.position / scale, drive.motor.velocity / scale)
+        return states
+
+    @property
+    def moves(self) -> bool:
+        """Whether a motor turns or is about to."""
+        return any(drive.moves for drive in self.drives.values())
+
+    # ---- faults -------------------------------------------------------------------------------
+
+    def stall(self, axis: str) -> None:
+        """Block a motor."""
+        self.drives[axis].motor.stalled = True
+
+    def reboot(self, axis: str, now: float) -> None:
+        """Take a drive's power away for a moment."""
+        self.drives[axis].power_up(now)
+
+    def emergency(self, axis: str, code: int) -> None:
+        """Let a drive have a fault of that error code."""
+        self.drives[axis].fail(code)
+
+    def hang(self, axis: str) -> None:
+        """Let a drive's processor hang: silent, while its motor ends at its set-point."""
+        self.drives[axis].hung = True
+
+    def restore(self) -> None:
+        """End what goes on: cut bus, stalled motors, hung processors. Faults stay until reset."""
+        self.is_cut = False
+        for drive in self.drives.values():
+            drive.motor.stalled = False
+            drive.hung = False
+
+    def _move_until(self, now: float) -> None:
+        if self._clock is not MotionClock.STEADY:
+            return
+        steps = int((now - self._moved_until) / MOTION_STEP)
+        if steps > 0:
+            self._moved_until += steps * MOTION_STEP
+            for drive in self.drives.values():
+                drive.advance(steps)

@@ -1,0 +1,284 @@
+"""One emulated CiA 402 drive with its motor: what it does on the bus, with its power, and when."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from needle_sim.drives.can_frame import CanFrame
+from needle_sim.drives.canopen_device import HEARTBEAT_LOST, CanopenDevice
+from needle_sim.drives.drive_motion import (
+    MOTION_STEP,
+    DriveMotion,
+    LimitAction,
+    LimitExceededError,
+)
+from needle_sim.drives.drive_objects import (
+    CONTROLWORD,
+    ERROR_CODE,
+    MODE,
+    MODES,
+    STATUSWORD,
+    drive_dictionary,
+)
+from needle_sim.drives.homing import METHODS
+from needle_sim.drives.motor import Motor, MotorSettings
+from needle_sim.drives.object_dictionary import Abort, SdoAbortError
+from needle_sim.drives.power_state import FAULT_RESET, Order, PowerState, next_state, order_of
+
+FOLLOWING_ERROR = 0x8611
+LIMIT_EXCEEDED = 0x8612
+_MOTION_ERROR = 0x20
+_ON = (PowerState.OPERATION_ENABLED, PowerState.QUICK_STOP_ACTIVE, PowerState.FAULT_REACTION)
+_VOLTAGE, _REMOTE = 1 << 4, 1 << 9
+# Ramps.
+_SLOW_DOWN, _QUICK = 0x6084, 0x6085
+# Option codes (0x6007, 0x605A, 0x605B, 0x605C, 0x605E).
+_AT_ONCE = 0
+_LOST_FAULT, _LOST_DISABLE, _LOST_QUICK_STOP = 1, 2, 3
+_BY_SLOW_DOWN = (1, 5)
+_THEN_DISABLE = (1, 2)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveSettings:
+    """What a drive is.
+
+    Attributes
+    ----------
+    name : str
+        Its axis.
+    node_id : int
+        1..127.
+    device_type : int
+        Object 0x1000: stepper or servo.
+    motor : MotorSettings
+        The mechanics behind it.
+    limit_action : LimitAction
+        For a target beyond the software limits.
+    boot_time : float
+        From power-up to the boot-up message [s].
+    """
+
+    name: str
+    node_id: int
+    device_type: int
+    motor: MotorSettings
+    limit_action: LimitAction
+    boot_time: float
+
+
+class EmulatedDrive:
+    """A drive on the bus. Times are readings of one steady clock [s]; motion has its own.
+
+    Parameters
+    ----------
+    settings : DriveSettings
+        What it is.
+    """
+
+    def __init__(self, settings: DriveSettings) -> None:
+        self.settings = settings
+        self.motor = Motor(settings.motor)
+        self._objects = objects = drive_dictionary(
+            settings.name,
+            settings.device_type,
+            settings.node_id,
+            counts_per_unit=settings.motor.counts_per_unit,
+        )
+        self._motion = DriveMotion(objects, self.motor, settings.limit_action)
+        self.device = CanopenDevice(
+            settings.node_id,
+            objects,
+            default_receive=(CONTROLWORD << 16 | 16,),
+            default_transmit=(STATUSWORD << 16 | 16,),
+            boot_time=settings.boot_time,
+            on_power_up=self._on_power_up,
+            on_boot=self._on_boot,
+            on_connection_lost=self._on_connection_lost,
+        )
+        objects.on_write(CONTROLWORD, 0, then=self._on_controlword)
+        objects.on_write(MODE, 0, check=_one_of(MODES), then=self._motion.set_mode)
+        objects.on_write(0x6098, 0, check=_one_of((0, *METHODS)))
+        self.state = PowerState.NOT_READY
+        # Where a ramp leads that has to end first.
+        self._leaving: PowerState | None = None
+        self._word = 0
+        self.hung = False
+
+    # ---- the bus ------------------------------------------------------------------------------
+
+    def power_up(self, now: float) -> None:
+        """Start as if the power had just come."""
+        self.device.power_up(now)
+
+    def receive(self, frame: CanFrame, now: float) -> None:
+        """Take a frame from the bus, SYNC excepted."""
+        if not self.hung:
+            self.device.receive(frame, now)
+            self._show()
+
+    def sync(self) -> None:
+        """Take a SYNC: tell where the motor is, then take the set-point that came before it."""
+        if self.hung:
+            return
+        self.device.sync()
+        if self.state is PowerState.OPERATION_ENABLED and self._leaving is None:
+            self._try(self._motion.take_set_point)
+        self._show()
+
+    def tick(self, now: float) -> None:
+        """Do what is due by the clock."""
+        if not self.hung:
+            self.device.tick(now)
+
+    def fail(self, code: int) -> None:
+        """Have a fault of that error code: brake, then FAULT."""
+        if self.state in (PowerState.FAULT, PowerState.FAULT_REACTION, PowerState.NOT_READY):
+            return
+        self._leaving = None
+        self._objects.set(ERROR_CODE, 0, code)
+        self.state = PowerState.FAULT_REACTION if self.state in _ON else PowerState.FAULT
+        # A lost heartbeat was told when it was missed.
+        if code != HEARTBEAT_LOST:
+            self.device.emergency(code, _MOTION_ERROR)
+        self._show()
+
+    @property
+    def error_code(self) -> int:
+        """Code of the fault, 0x603F; 0 without."""
+        return self._objects.value(ERROR_CODE)
+
+    # ---- motion -------------------------------------------------------------------------------
+
+    @property
+    def sync_period(self) -> float:
+        """From one SYNC to the next, as the drive was told [s]."""
+        microseconds = self._objects.value(0x1006)
+        return microseconds * 1e-6 if microseconds else self._motion.interpolation_period
+
+    @property
+    def moves(self) -> bool:
+        """Whether the motor turns or is about to."""
+        return self.motor.velocity != 0.0 or (self.state in _ON and not self._settled)
+
+    def advance(self, steps: int) -> None:
+        """Let `steps` of `MOTION_STEP` go by."""
+        for _ in range(steps):
+            if self.state not in _ON or self._settled:
+                self._motion.rest()
+                break
+            self._step(MOTION_STEP)
+        self._show()
+
+    @property
+    def _settled(self) -> bool:
+        """Whether time alone would change nothing."""
+        if self._leaving is not None or self.state is PowerState.FAULT_REACTION:
+            return False
+        if self.state is PowerState.QUICK_STOP_ACTIVE and self._quick_stop_option in _THEN_DISABLE:
+            return False
+        return self._motion.settled
+
+    def _step(self, period: float) -> None:
+        motion = self._motion
+        if self.state is PowerState.QUICK_STOP_ACTIVE:
+            option = self._quick_stop_option
+            motion.brake(_SLOW_DOWN if option in _BY_SLOW_DOWN else _QUICK, period)
+            if option == _AT_ONCE or (option in _THEN_DISABLE and motion.at_rest):
+                self.state = PowerState.SWITCH_ON_DISABLED
+        elif self.state is PowerState.FAULT_REACTION:
+            option = self._objects.value(0x605E)
+            motion.brake(_SLOW_DOWN if option == 1 else _QUICK, period)
+            if option == _AT_ONCE or motion.at_rest:
+                self.state = PowerState.FAULT
+        elif self._leaving is not None:
+            motion.brake(_SLOW_DOWN, period)
+            if motion.at_rest:
+                self.state, self._leaving = self._leaving, None
+        else:
+            motion.operate(period)
+        if self.state not in _ON:
+            motion.switch_off()
+        elif motion.follow(period):
+            self.fail(FOLLOWING_ERROR)
+
+    @property
+    def _quick_stop_option(self) -> int:
+        return self._objects.value(0x605A)
+
+    # ---- power --------------------------------------------------------------------------------
+
+    def _on_controlword(self, word: int) -> None:
+        rising = word & ~self._word
+        self._word = word
+        if self.state is PowerState.FAULT:
+            if rising & FAULT_RESET:
+                self._objects.set(ERROR_CODE, 0, 0)
+                self.device.emergency(0)
+                self.state = PowerState.SWITCH_ON_DISABLED
+        elif self._leaving is None:
+            self._change(next_state(self.state, word))
+        enabled = self.state is PowerState.OPERATION_ENABLED and self._leaving is None
+        self._try(lambda: self._motion.take_word(word, enabled=enabled))
+
+    def _change(self, state: PowerState) -> None:
+        before = self.state
+        if state is before:
+            return
+        if state is PowerState.OPERATION_ENABLED and before is not PowerState.QUICK_STOP_ACTIVE:
+            self._motion.switch_on()
+        self._motion.forget()
+        if before is PowerState.OPERATION_ENABLED and self._slows_down_before(state):
+            self._leaving = state
+            return
+        self.state = state
+        if state not in _ON:
+            self._motion.switch_off()
+
+    def _slows_down_before(self, state: PowerState) -> bool:
+        """Whether the motor brakes before it gets no more power."""
+        at_once = order_of(self._word) is Order.DISABLE_VOLTAGE or self._motion.at_rest
+        if state in _ON or at_once:
+            return False
+        index = 0x605B if state is PowerState.READY_TO_SWITCH_ON else 0x605C
+        return self._objects.value(index) != _AT_ONCE
+
+    def _try(self, order: Callable[[], None]) -> None:
+        try:
+            order()
+        except LimitExceededError:
+            self.fail(LIMIT_EXCEEDED)
+
+    def _on_power_up(self) -> None:
+        self.state = PowerState.NOT_READY
+        self._leaving = None
+        self._word = 0
+        self._motion.power_up()
+
+    def _on_boot(self) -> None:
+        self.state = PowerState.SWITCH_ON_DISABLED
+        self._show()
+
+    def _on_connection_lost(self) -> None:
+        option = self._objects.value(0x6007)
+        if option == _LOST_FAULT:
+            self.fail(HEARTBEAT_LOST)
+        elif option == _LOST_DISABLE and self.state in _ON[:2]:
+            self.state = PowerState.SWITCH_ON_DISABLED
+            self._motion.switch_off()
+        elif option == _LOST_QUICK_STOP and self.state is PowerState.OPERATION_ENABLED:
+            self._change(PowerState.QUICK_STOP_ACTIVE)
+
+    def _show(self) -> None:
+        """Bring up to date what a master can read."""
+        bits = self._motion.show(enabled=self.state is PowerState.OPERATION_ENABLED)
+        self._objects.set(STATUSWORD, 0, self.state.value | _VOLTAGE | _REMOTE | bits)
+
+
+def _one_of(values: tuple[int, ...]) -> Callable[[int], None]:
+    def check(value: int) -> None:
+        if value not in values:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+
+    return check

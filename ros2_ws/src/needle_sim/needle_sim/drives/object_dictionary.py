@@ -1,0 +1,214 @@
+"""The object dictionary of a CANopen device (CiA 301): typed values by index and sub-index."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable
+
+Key = tuple[int, int]
+
+
+class Abort(enum.IntEnum):
+    """SDO abort codes of CiA 301."""
+
+    TOGGLE = 0x05030000
+    COMMAND = 0x05040001
+    UNSUPPORTED_ACCESS = 0x06010000
+    WRITE_ONLY = 0x06010001
+    READ_ONLY = 0x06010002
+    NO_OBJECT = 0x06020000
+    NOT_MAPPABLE = 0x06040041
+    MAPPING_TOO_LONG = 0x06040042
+    WRONG_LENGTH = 0x06070010
+    NO_SUBINDEX = 0x06090011
+    VALUE_RANGE = 0x06090030
+    VALUE_TOO_HIGH = 0x06090031
+    VALUE_TOO_LOW = 0x06090032
+    DEVICE_STATE = 0x08000022
+
+
+class SdoAbortError(Exception):
+    """An access that the device refuses."""
+
+    def __init__(self, code: Abort) -> None:
+        super().__init__(f"{code.name} (0x{code:08X})")
+        self.code = code
+
+
+class Kind(enum.Enum):
+    """A numeric type: size in bytes, and whether it has a sign."""
+
+    U8 = (1, False)
+    U16 = (2, False)
+    U32 = (4, False)
+    I8 = (1, True)
+    I16 = (2, True)
+    I32 = (4, True)
+
+    @property
+    def size(self) -> int:
+        """Size in bytes."""
+        return self.value[0]
+
+    @property
+    def signed(self) -> bool:
+        """Whether it has a sign."""
+        return self.value[1]
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """Smallest and largest value."""
+        bits = 8 * self.size
+        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
+
+
+class Access(enum.Enum):
+    """What an SDO client may do."""
+
+    READ = "ro"
+    READ_WRITE = "rw"
+
+
+@dataclasses.dataclass
+class Entry:
+    """One value.
+
+    Attributes
+    ----------
+    kind : Kind or None
+        Its type; None for a text.
+    value : int
+        The number; 0 for a text.
+    access : Access
+        What a client may do.
+    mappable : bool
+        Whether a PDO may carry it.
+    text : bytes
+        The text, if it is one.
+    default : int
+        The number after power-up.
+    """
+
+    kind: Kind | None
+    value: int
+    access: Access = Access.READ
+    mappable: bool = False
+    text: bytes = b""
+    default: int = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        """Keep the value after power-up."""
+        self.default = self.value
+
+
+class ObjectDictionary:
+    """Values, what may be done with them, and what happens when a client writes one."""
+
+    def __init__(self) -> None:
+        self._entries: dict[Key, Entry] = {}
+        self._indices: set[int] = set()
+        self._checks: dict[Key, Callable[[int], None]] = {}
+        self._reactions: dict[Key, Callable[[int], None]] = {}
+
+    def add(
+        self,
+        index: int,
+        subindex: int,
+        kind: Kind | None,
+        value: int = 0,
+        *,
+        access: Access = Access.READ,
+        mappable: bool = False,
+        text: bytes = b"",
+    ) -> None:
+        """Add an entry; the arguments are those of `Entry`."""
+        self._entries[index, subindex] = Entry(kind, value, access, mappable, text)
+        self._indices.add(index)
+
+    def on_write(
+        self,
+        index: int,
+        subindex: int,
+        *,
+        check: Callable[[int], None] | None = None,
+        then: Callable[[int], None] | None = None,
+    ) -> None:
+        """React to what a client writes.
+
+        Parameters
+        ----------
+        index, subindex : int
+            The entry.
+        check : callable, optional
+            Called before the value is taken; raises `SdoAbortError` to refuse it.
+        then : callable, optional
+            Called after it was taken.
+        """
+        if check is not None:
+            self._checks[index, subindex] = check
+        if then is not None:
+            self._reactions[index, subindex] = then
+
+    def entry(self, index: int, subindex: int) -> Entry:
+        """Return an entry.
+
+        Raises
+        ------
+        SdoAbortError
+            If there is none.
+        """
+        entry = self._entries.get((index, subindex))
+        if entry is None:
+            raise SdoAbortError(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
+        return entry
+
+    def value(self, index: int, subindex: int = 0) -> int:
+        """Return a number."""
+        return self._entries[index, subindex].value
+
+    def set(self, index: int, subindex: int, value: int) -> None:
+        """Set a number from inside the device: unchecked, but cut to its type's range."""
+        entry = self._entries[index, subindex]
+        assert entry.kind is not None
+        lower, upper = entry.kind.bounds
+        entry.value = min(max(value, lower), upper)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Return a value as bytes, lowest first.
+
+        Raises
+        ------
+        SdoAbortError
+            If there is none.
+        """
+        entry = self.entry(index, subindex)
+        if entry.kind is None:
+            return entry.text
+        return entry.value.to_bytes(entry.kind.size, "little", signed=entry.kind.signed)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Write a value as a client.
+
+        Raises
+        ------
+        SdoAbortError
+            If the device refuses it; the value stays as it was.
+        """
+        entry = self.entry(index, subindex)
+        if entry.access is Access.READ or entry.kind is None:
+            raise SdoAbortError(Abort.READ_ONLY)
+        if len(data) != entry.kind.size:
+            raise SdoAbortError(Abort.WRONG_LENGTH)
+        value = int.from_bytes(data, "little", signed=entry.kind.signed)
+        key = (index, subindex)
+        if key in self._checks:
+            self._checks[key](value)
+        entry.value = value
+        if key in self._reactions:
+            self._reactions[key](value)
+
+    def power_up(self) -> None:
+        """Forget everything that was written."""
+        for entry in self._entries.values():
+            entry.value = entry.default

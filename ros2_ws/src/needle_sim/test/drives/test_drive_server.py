@@ -1,0 +1,183 @@
+"""The drives behind a pseudo-terminal and a socket, reached with python-can and canopen."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import can
+import canopen
+import pytest
+
+from needle_common.errors import UserError
+from needle_sim.drives.drive_motion import LimitAction
+from needle_sim.drives.drive_server import DriveServer, Port
+from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.fault_commands import PlugOrder, obey
+from needle_sim.drives.pty_port import PtyPort
+from needle_sim.drives.socketcand_port import SocketcandPort
+
+from .master import INSERTION, ROTATION, settings
+
+
+def troubles(bus: EmulatedBus) -> tuple[bool, bool, bool]:
+    drives = bus.drives
+    return bus.is_cut, drives["insertion"].motor.stalled, drives["rotation"].hung
+
+
+def make_bus() -> EmulatedBus:
+    drives = [settings(name, LimitAction.CLAMP) for name in ("insertion", "rotation")]
+    # Booted long ago.
+    return EmulatedBus(drives[0], drives[1], MotionClock.SYNC, 0.0)
+
+
+class Served:
+    """A server on a thread of its own."""
+
+    def __init__(self, port: Port) -> None:
+        self.server = DriveServer(make_bus(), port)
+        self._orders: list[str] = []
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def obey(self, line: str) -> None:
+        self._orders.append(line)
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        for _ in range(2000):
+            if condition():
+                return
+            threading.Event().wait(0.005)
+        raise AssertionError("timed out")
+
+    def close(self) -> None:
+        self._end.set()
+        self._thread.join()
+        self.server.close()
+
+    def _run(self) -> None:
+        while not self._end.is_set():
+            self.server.turn(0.005)
+            while self._orders:
+                self.server.obey(self._orders.pop(0))
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[Served]:
+    served = Served(PtyPort(tmp_path / "can"))
+    yield served
+    served.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stock_slcan_and_canopen_reach_both_drives(served: Served, tmp_path: Path) -> None:
+    network = canopen.Network()
+    network.connect(
+        interface="slcan", channel=str(tmp_path / "can"), bitrate=500_000, sleep_after_open=0
+    )
+    try:
+        for node_id, name in ((INSERTION, "insertion"), (ROTATION, "rotation")):
+            node = network.add_node(node_id, None)
+            assert node.sdo.upload(0x1008, 0) == f"Emulated {name} drive".encode()
+        network.nmt.send_command(1)
+        for word in (0x06, 0x07, 0x0F):
+            network.nodes[INSERTION].sdo.download(0x6040, 0, word.to_bytes(2, "little"))
+        served.until(lambda: served.server.bus.drives["insertion"].state.value == 0x27)
+        network.sync.transmit()
+        served.until(lambda: served.server.bus.syncs == 1)
+    finally:
+        network.disconnect()
+
+
+def test_unplugged_adapter_is_an_error_and_comes_back(served: Served, tmp_path: Path) -> None:
+    link = tmp_path / "can"
+    bus: Any = can.Bus(interface="slcan", channel=str(link), bitrate=500_000, sleep_after_open=0)
+    served.obey("unplug")
+    served.until(lambda: not link.exists())
+    with pytest.raises((can.CanError, OSError)):
+        for _ in range(100):
+            bus.recv(0.01)
+            bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
+    bus.serialPortOrig.close()
+    bus._is_shutdown = True
+    served.obey("restore")
+    served.until(link.exists)
+    network = canopen.Network()
+    network.connect(interface="slcan", channel=str(link), bitrate=500_000, sleep_after_open=0)
+    try:
+        node = network.add_node(INSERTION, None)
+        assert node.sdo.upload(0x1000, 0) == b"\x92\x01\x04\x00"
+    finally:
+        network.disconnect()
+
+
+def test_socketcand_serves_the_same_bus() -> None:
+    port = SocketcandPort(0)
+    served = Served(port)
+    try:
+        network = canopen.Network()
+        network.connect(interface="socketcand", channel="can0", host="127.0.0.1", port=port.port)
+        try:
+            node = network.add_node(ROTATION, None)
+            assert node.sdo.upload(0x1008, 0) == b"Emulated rotation drive"
+        finally:
+            network.disconnect()
+    finally:
+        served.close()
+
+
+def test_socketcand_port_in_use_is_named() -> None:
+    port = SocketcandPort(0)
+    with pytest.raises(UserError, match=str(port.port)):
+        SocketcandPort(port.port)
+    port.unplug()
+
+
+def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
+    file = tmp_path / "can"
+    file.write_text("mine")
+    with pytest.raises(UserError, match="can"):
+        PtyPort(file)
+    assert file.read_text() == "mine"
+    # A link that leads nowhere is what a killed emulator leaves.
+    stale = tmp_path / "stale"
+    stale.symlink_to(tmp_path / "gone")
+    port = PtyPort(stale)
+    assert stale.exists()
+    port.unplug()
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "explode",
+        "stall",
+        "stall both",
+        "stall insertion now",
+        "emcy insertion",
+        "emcy insertion x",
+        "emcy rotation 0x10000",
+        "cut_bus now",
+    ],
+)
+def test_bad_commands_are_named_and_do_nothing(line: str) -> None:
+    bus = make_bus()
+    with pytest.raises(UserError, match=line.split(maxsplit=1)[0]):
+        obey(line, bus, 0.0)
+    assert troubles(bus) == (False, False, False)
+
+
+def test_commands_do_what_they_say() -> None:
+    bus = make_bus()
+    bus.poll(1.0)
+    for line in ("cut_bus", "stall insertion", "hang rotation", "emcy insertion 0x5530"):
+        assert obey(line, bus, 1.0) is None
+    assert troubles(bus) == (True, True, True)
+    assert bus.drives["insertion"].error_code == 0x5530
+    assert obey("unplug", bus, 1.0) is PlugOrder.OUT
+    assert obey("restore", bus, 1.0) is PlugOrder.IN
+    assert troubles(bus) == (False, False, False)
