@@ -26,6 +26,7 @@ setup(
         "console_scripts": [
             "recorder = needle_bringup.recorder_node:main",
             "operator = needle_bringup.operator_node:main",
+            "recover = needle_bringup.recover:main",
             "report = needle_bringup.report:main",
         ]
     },

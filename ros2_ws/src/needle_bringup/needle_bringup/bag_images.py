@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from needle_bringup.bag_reader import Run, nanoseconds, read_messages
+from needle_bringup.bag_files import read_messages
+from needle_bringup.bag_reader import Run, nanoseconds
 
 SIDES = ("left", "right")
 TOPICS = {

@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 import yaml
-from rosbags.highlevel import AnyReader, AnyReaderError
-from rosbags.rosbag2 import Reader, ReaderError
-from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.bag_writer import METADATA_FILE
+from needle_bringup.bag_files import BagContents, read_contents, read_messages
 from needle_common.errors import UserError
 
 Floats = npt.NDArray[np.float64]
@@ -23,6 +20,20 @@ Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
 _LANDMARK = "needle/controller_status"
+_TYPES = {
+    "needle/tip": "geometry_msgs/msg/PointStamped",
+    "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "sim/tip_pose": "geometry_msgs/msg/PoseStamped",
+    "needle/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "needle/reduced_state": "geometry_msgs/msg/Vector3Stamped",
+    "needle/control_input": "geometry_msgs/msg/Vector3Stamped",
+    "joint_states": "sensor_msgs/msg/JointState",
+    "device/hold": "sensor_msgs/msg/Joy",
+    "device/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
+    "device/result": "std_msgs/msg/Header",
+    "needle/controller_status": "diagnostic_msgs/msg/DiagnosticStatus",
+    "device/status": "diagnostic_msgs/msg/DiagnosticStatus",
+}
 
 
 class _HasStamp(Protocol):
@@ -200,16 +211,22 @@ def read_run(path: Path) -> Run:
     UserError
         If there is no bag, it is broken or incomplete, or it holds no needle run.
     """
-    topics, custom = read_contents(path)
-    namespace = _namespace(path, topics)
+    contents = read_contents(path)
+    custom = contents.custom_data
+    namespace = _namespace(contents)
     collected = _Collector()
     takers = {namespace + name: taker for name, taker in collected.takers().items()}
     takers["/diagnostics"] = collected.take_diagnostics
+    _require_types(contents, namespace)
     for topic, log_time, message in read_messages(path, lambda name: name in takers):
         try:
             takers[topic](log_time, message)
-        except (AttributeError, TypeError) as error:
-            raise UserError(f"{path}: {topic} has another type than the rig's: {error}") from error
+        except (AttributeError, TypeError, ValueError) as error:
+            where = contents.distribution or "another distribution"
+            raise UserError(
+                f"{path}: {topic} is not {contents.topics[topic].type_name} as Jazzy has it "
+                f"(bag of {where}: {error}): record it with ROS 2 Jazzy"
+            ) from error
     return Run(
         path=path,
         tips=collected.series("tips", 3),
@@ -227,7 +244,7 @@ def read_run(path: Path) -> Run:
         device_status=collected.device_status,
         results=collected.results,
         health=collected.health,
-        topics=topics,
+        topics=contents.counts,
         parameters=_parameters(custom.get("parameters", "")),
         run_info=_mapping(custom.get("run_info", "")),
         versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
@@ -325,61 +342,26 @@ class _Collector:
             self._last_health[status.name] = now
 
 
-def read_contents(path: Path) -> tuple[dict[str, int], dict[str, str]]:
-    """Return messages by topic and the bag's custom data.
-
-    Raises
-    ------
-    UserError
-        If there is no bag, or it is broken or incomplete.
-    """
-    if not path.is_dir():
-        raise UserError(f"{path}: no such bag directory")
-    if not (path / METADATA_FILE).is_file():
-        if any(path.glob("*.mcap")):
-            raise UserError(f"{path}: the bag was not completed ({METADATA_FILE} is missing)")
-        raise UserError(f"{path} is not a bag: it has no {METADATA_FILE}")
-    try:
-        with Reader(path) as reader:
-            topics: dict[str, int] = {}
-            for connection in reader.connections:
-                topics[connection.topic] = topics.get(connection.topic, 0) + connection.msgcount
-        information = yaml.safe_load((path / METADATA_FILE).read_text(encoding="utf-8"))
-    except (ReaderError, OSError, ValueError, KeyError, yaml.YAMLError) as error:
-        raise _broken(path, error) from error
-    custom = information["rosbag2_bagfile_information"].get("custom_data") or {}
-    return topics, {str(key): str(value) for key, value in custom.items()}
-
-
-def _namespace(path: Path, topics: dict[str, int]) -> str:
-    found = sorted(name for name in topics if name.endswith(f"/{_LANDMARK}"))
+def _namespace(contents: BagContents) -> str:
+    found = sorted(name for name in contents.topics if name.endswith(f"/{_LANDMARK}"))
     if not found:
-        raise UserError(f"{path} holds no needle run: no topic {_LANDMARK} among {len(topics)}")
+        raise UserError(
+            f"{contents.path} holds no needle run: no topic {_LANDMARK} among its "
+            f"{len(contents.topics)}; it needs a bag that the rig's recorder made"
+        )
     return found[0].removesuffix(_LANDMARK)
 
 
-def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:
-    """Yield (topic, log time [ns], message) of the wanted topics, in order of log time.
-
-    Raises
-    ------
-    UserError
-        If the bag is broken.
-    """
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            connections = [c for c in reader.connections if wanted(c.topic)]
-            if not connections:
-                return
-            for connection, log_time, data in reader.messages(connections=connections):
-                yield connection.topic, log_time, reader.deserialize(data, connection.msgtype)
-    except (AnyReaderError, ReaderError, OSError) as error:
-        raise _broken(path, error) from error
-
-
-def _broken(path: Path, error: Exception) -> UserError:
-    lines = str(error).splitlines()
-    return UserError(f"{path}: the bag is broken: {lines[0] if lines else type(error).__name__}")
+def _require_types(contents: BagContents, namespace: str) -> None:
+    types = {namespace + name: type_name for name, type_name in _TYPES.items()}
+    types["/diagnostics"] = "diagnostic_msgs/msg/DiagnosticArray"
+    for name, wanted in types.items():
+        topic = contents.topics.get(name)
+        if topic is not None and topic.type_name != wanted:
+            raise UserError(
+                f"{contents.path}: {name} has type {topic.type_name}, the rig's has {wanted}: "
+                "this bag is not of the rig's graph"
+            )
 
 
 def _parameters(text: str) -> dict[str, dict[str, Any]]:

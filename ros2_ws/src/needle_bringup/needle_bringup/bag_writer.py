@@ -2,92 +2,35 @@
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+import contextlib
+import fcntl
+from collections.abc import Mapping
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Final
 
-import yaml
 from mcap.writer import CompressionType, Writer
 
+from needle_bringup.bag_metadata import (
+    METADATA_FILE,
+    METADATA_RECORD,
+    BagTopic,
+    DataFile,
+    bag_information,
+    to_yaml,
+    write_metadata,
+)
+from needle_bringup.mcap_repair import NO_ROOM, give_back_chunk, repair, scan_file
 from needle_common.errors import UserError
 
-METADATA_VERSION = 9
-LIBRARY = "needle_bringup"
-METADATA_FILE = "metadata.yaml"
-_NANOSECONDS = 1_000_000_000
-INFINITE_NS = 2**63 - 1
+LIBRARY: Final = "needle_bringup"
+COMPRESSIONS: Final = ("none", "zstd")
+CHUNK_SIZE: Final = 4 * 2**20
+DISTRO_KEY: Final = "ROS_DISTRO"
+_SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 
 class BagWriteError(Exception):
     """The disk refused the bag's data; the message says why and where."""
-
-
-@dataclasses.dataclass(frozen=True)
-class OfferedQos:
-    """Quality of service that one publisher offers, in rosbag2's words.
-
-    Attributes
-    ----------
-    history, reliability, durability, liveliness : str
-        Names of rmw's policies in lower case, e.g. `keep_last`, `transient_local`.
-    depth : int
-        Queue length; 0 where DDS does not tell it.
-    deadline, lifespan, lease_duration : int
-        Durations in ns; `INFINITE_NS` for none.
-    """
-
-    history: str = "unknown"
-    depth: int = 0
-    reliability: str = "reliable"
-    durability: str = "volatile"
-    deadline: int = INFINITE_NS
-    lifespan: int = INFINITE_NS
-    liveliness: str = "automatic"
-    lease_duration: int = INFINITE_NS
-
-    def as_rosbag2(self) -> dict[str, Any]:
-        """Return the profile as metadata.yaml has it from version 9 on."""
-
-        def duration(nanoseconds: int) -> dict[str, int]:
-            return {"sec": nanoseconds // _NANOSECONDS, "nsec": nanoseconds % _NANOSECONDS}
-
-        return {
-            "history": self.history,
-            "depth": self.depth,
-            "reliability": self.reliability,
-            "durability": self.durability,
-            "deadline": duration(self.deadline),
-            "lifespan": duration(self.lifespan),
-            "liveliness": self.liveliness,
-            "liveliness_lease_duration": duration(self.lease_duration),
-            "avoid_ros_namespace_conventions": False,
-        }
-
-
-@dataclasses.dataclass(frozen=True)
-class BagTopic:
-    """What a bag says about a topic, beside its messages.
-
-    Attributes
-    ----------
-    name : str
-        Absolute name.
-    type_name : str
-        `package/msg/Name`.
-    definition : str
-        Full definition text (`message_definitions.full_definition`).
-    type_hash : str
-        `RIHS01_...` as the publishers announce it, or an empty text.
-    offered_qos : tuple of OfferedQos
-        One for each publisher.
-    """
-
-    name: str
-    type_name: str
-    definition: str
-    type_hash: str = ""
-    offered_qos: tuple[OfferedQos, ...] = ()
 
 
 class BagWriter:
@@ -101,6 +44,10 @@ class BagWriter:
         ROS distribution whose message types the bag holds.
     chunk_size : int
         Bytes after which a chunk is written out.
+    max_file_size : int
+        Bytes of messages after which another data file is begun; 0: never.
+    compression : str
+        `none` or `zstd`, chunk by chunk.
 
     Raises
     ------
@@ -109,64 +56,60 @@ class BagWriter:
     """
 
     def __init__(
-        self, directory: Path, *, distribution: str = "jazzy", chunk_size: int = 2**20
+        self,
+        directory: Path,
+        *,
+        distribution: str = "jazzy",
+        chunk_size: int = CHUNK_SIZE,
+        max_file_size: int = 0,
+        compression: str = "none",
     ) -> None:
         refuse_existing_bag(directory)
         self.directory = directory
-        self._data_file = f"{directory.absolute().name}_0.mcap"
         self._distribution = distribution
-        self._topics: dict[int, BagTopic] = {}
-        self._counts: dict[int, int] = {}
-        self._schemas: dict[tuple[str, str], int] = {}
+        self._chunk_size = chunk_size
+        self._max_file_size = max_file_size
+        self._compression = CompressionType[compression.upper()]
+        self._topics: list[BagTopic] = []
+        self._files: list[DataFile] = []
         self._custom_data: dict[str, str] = {}
-        self._first: int | None = None
-        self._last = 0
         try:
             directory.mkdir(parents=True, exist_ok=True)
-            self._stream: IO[bytes] = (directory / self._data_file).open("xb")
+            self._begin_file()
         except OSError as error:
             raise UserError(f"cannot record into {directory}: {error.strerror}") from error
-        self._mcap = Writer(self._stream, chunk_size=chunk_size, compression=CompressionType.NONE)
-        self._mcap.start(profile="ros2", library=LIBRARY)
-        self._mcap.add_metadata("rosbag2", {"ROS_DISTRO": distribution})
 
     @property
     def message_count(self) -> int:
         """Messages written so far."""
-        return sum(self._counts.values())
+        return sum(file.message_count for file in self._files)
+
+    @property
+    def data_file(self) -> Path:
+        """The file that is written now."""
+        return self.directory / self._files[-1].name
 
     def add_topic(self, topic: BagTopic) -> int:
-        """Announce a topic and return the channel number that its messages are written with."""
-        key = (topic.type_name, topic.definition)
-        if key not in self._schemas:
-            self._schemas[key] = self._mcap.register_schema(
-                topic.type_name, "ros2msg", topic.definition.encode()
-            )
-        profiles = [qos.as_rosbag2() for qos in topic.offered_qos]
-        channel = self._mcap.register_channel(
-            topic.name,
-            "cdr",
-            self._schemas[key],
-            {
-                "offered_qos_profiles": _to_yaml(profiles).strip() if profiles else "",
-                "topic_type_hash": topic.type_hash,
-            },
-        )
-        self._topics[channel] = topic
-        self._counts[channel] = 0
-        return channel
+        """Announce a topic and return the number that its messages are written with."""
+        self._topics.append(topic)
+        self._register(topic)
+        return len(self._topics) - 1
 
-    def write(self, channel: int, data: bytes, log_time: int, publish_time: int) -> None:
+    def write(
+        self, topic: int, data: bytes, log_time: int, publish_time: int, sequence: int = 0
+    ) -> None:
         """Append one serialised message.
 
         Parameters
         ----------
-        channel : int
+        topic : int
             Number from `add_topic`.
         data : bytes
             The message as CDR with its header.
         log_time, publish_time : int
             When it was received and sent, system clock [ns].
+        sequence : int
+            The publisher's own number of the message, 0 where it has none.
 
         Raises
         ------
@@ -174,14 +117,15 @@ class BagWriter:
             If the disk refuses the data.
         """
         try:
+            if self._max_file_size and self._file_bytes + len(data) > self._max_file_size:
+                self._split()
             self._mcap.add_message(
-                channel, log_time, data, publish_time, self._counts[channel] & 0xFFFFFFFF
+                self._channels[topic], log_time, data, publish_time, sequence & _SEQUENCE_MASK
             )
         except OSError as error:
             raise self._failure(error) from error
-        self._counts[channel] += 1
-        self._first = log_time if self._first is None else min(self._first, log_time)
-        self._last = max(self._last, log_time)
+        self._file_bytes += len(data)
+        self._files[-1].add(self._topics[topic].name, log_time)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a named MCAP metadata record."""
@@ -218,56 +162,110 @@ class BagWriter:
         """
         information = self._information()
         try:
-            self._mcap.add_metadata("rosbag2", {"serialized_metadata": _to_yaml(information)})
-            self._mcap.finish()  # type: ignore[no-untyped-call]
-            self._stream.close()
-            # Renamed into place: a metadata.yaml that exists is complete.
-            partial = self.directory / f"{METADATA_FILE}.tmp"
-            partial.write_text(
-                _to_yaml({"rosbag2_bagfile_information": information}), encoding="utf-8"
-            )
-            partial.replace(self.directory / METADATA_FILE)
+            self._mcap.add_metadata(METADATA_RECORD, {"serialized_metadata": to_yaml(information)})
+            self._end_file()
+            write_metadata(self.directory, information)
         except OSError as error:
             raise self._failure(error) from error
 
-    def abandon(self) -> None:
-        """Close the file as it is, without an index: after a `BagWriteError`."""
-        try:
+    def end_early(self) -> dict[str, int]:
+        """Complete the bag after a `BagWriteError`, as far as what is written is whole.
+
+        What a full disk cut off is dropped; if there is no room for the index and metadata.yaml
+        either, the last chunks make room for them.
+
+        Returns
+        -------
+        dict of str to int
+            Messages of each topic that were taken and are not in the bag.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses that, too.
+        """
+        # The buffer's rest meets the same disk; the file is closed all the same.
+        with contextlib.suppress(OSError):
             self._stream.close()
-        except OSError:
-            # The buffer's rest meets the same full disk again.
-            return
+        path = self.data_file
+        taken = self._files[-1].counts
+        try:
+            found = scan_file(path)
+            while True:
+                repair(path, found, library=LIBRARY)
+                names = {number: channel.topic for number, channel in found.channels.items()}
+                counts = {names[number]: count for number, count in found.counts.items()}
+                self._files[-1] = DataFile(path.name, counts, *found.times)
+                try:
+                    write_metadata(self.directory, self._information())
+                except OSError as error:
+                    if error.errno not in NO_ROOM:
+                        raise
+                    with path.open("r+b", buffering=0) as stream:
+                        give_back_chunk(stream, found)
+                else:
+                    break
+        except OSError as error:
+            raise self._failure(error) from error
+        kept = self._files[-1].counts
+        missing = {topic: count - kept.get(topic, 0) for topic, count in taken.items()}
+        return {topic: count for topic, count in missing.items() if count}
+
+    def update_metadata(self) -> None:
+        """Write metadata.yaml again, with custom data that came after the end.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses it; the file that is there stays as it is.
+        """
+        try:
+            write_metadata(self.directory, self._information())
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def _begin_file(self) -> None:
+        name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
+        self._stream: IO[bytes] = (self.directory / name).open("xb")
+        # Held until the file is closed: `recover` keeps off a bag that is being recorded.
+        fcntl.flock(self._stream, fcntl.LOCK_EX)
+        self._files.append(DataFile(name))
+        self._file_bytes = 0
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels: list[int] = []
+        self._mcap = Writer(
+            self._stream, chunk_size=self._chunk_size, compression=self._compression
+        )
+        self._mcap.start(profile="ros2", library=LIBRARY)
+        self._mcap.add_metadata(METADATA_RECORD, {DISTRO_KEY: self._distribution})
+        for topic in self._topics:
+            self._register(topic)
+
+    def _end_file(self) -> None:
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._stream.close()
+
+    def _split(self) -> None:
+        self._end_file()
+        self._begin_file()
+
+    def _register(self, topic: BagTopic) -> None:
+        key = (topic.type_name, topic.definition)
+        if key not in self._schemas:
+            self._schemas[key] = self._mcap.register_schema(
+                topic.type_name, "ros2msg", topic.definition.encode()
+            )
+        self._channels.append(
+            self._mcap.register_channel(
+                topic.name, "cdr", self._schemas[key], topic.channel_metadata()
+            )
+        )
 
     def _failure(self, error: OSError) -> BagWriteError:
-        return BagWriteError(f"cannot write {self.directory / self._data_file}: {error.strerror}")
+        return BagWriteError(f"cannot write {self.data_file}: {error.strerror}")
 
-    def _information(self) -> dict[str, Any]:
-        start = {"nanoseconds_since_epoch": self._first or 0}
-        duration = {"nanoseconds": self._last - (self._first or 0)}
-        return {
-            "version": METADATA_VERSION,
-            "storage_identifier": "mcap",
-            "duration": duration,
-            "starting_time": start,
-            "message_count": self.message_count,
-            "topics_with_message_count": [
-                {"topic_metadata": _topic_metadata(topic), "message_count": self._counts[channel]}
-                for channel, topic in self._topics.items()
-            ],
-            "compression_format": "",
-            "compression_mode": "",
-            "relative_file_paths": [self._data_file],
-            "files": [
-                {
-                    "path": self._data_file,
-                    "starting_time": start,
-                    "duration": duration,
-                    "message_count": self.message_count,
-                }
-            ],
-            "custom_data": self._custom_data or None,
-            "ros_distro": self._distribution,
-        }
+    def _information(self) -> dict[str, object]:
+        return bag_information(self._files, self._topics, self._custom_data, self._distribution)
 
 
 def refuse_existing_bag(directory: Path) -> None:
@@ -276,25 +274,3 @@ def refuse_existing_bag(directory: Path) -> None:
         raise UserError(f"cannot record into {directory}: it is a file")
     if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
         raise UserError(f"{directory} holds a bag already: name a new directory")
-
-
-def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
-    return {
-        "name": topic.name,
-        "type": topic.type_name,
-        "serialization_format": "cdr",
-        "offered_qos_profiles": [qos.as_rosbag2() for qos in topic.offered_qos],
-        "type_description_hash": topic.type_hash,
-    }
-
-
-class _PlainDumper(yaml.SafeDumper):
-    """Writes no anchors: rosbag2's reader and other simple ones do not follow them."""
-
-    def ignore_aliases(self, data: Any) -> bool:
-        return True
-
-
-def _to_yaml(value: dict[str, Any] | Sequence[Any]) -> str:
-    text: str = yaml.dump(value, Dumper=_PlainDumper, sort_keys=False, allow_unicode=True)
-    return text

@@ -1,4 +1,4 @@
-"""Asks every node of the graph for its parameters, once, as soon as it can answer."""
+"""The parameters of every node of the graph: as they are when it can first answer, and changes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.msg import ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
 from rclpy.node import Node
@@ -39,7 +39,7 @@ def plain_value(value: ParameterValue) -> Any:
 
 
 class ParameterSnapshots:
-    """The parameters of all nodes as they were when each node was first seen.
+    """The parameters of all nodes as they were when each node was first seen, and their changes.
 
     Parameters
     ----------
@@ -47,6 +47,11 @@ class ParameterSnapshots:
         The node that asks; its own parameters are taken too.
     on_snapshot : callable
         Called with a node's full name and its parameters, when they have come.
+
+    Attributes
+    ----------
+    changes : list of dict
+        All changes since (`take_event`), in order.
     """
 
     def __init__(self, node: Node, on_snapshot: Callable[[str, dict[str, Any]], None]) -> None:
@@ -56,10 +61,35 @@ class ParameterSnapshots:
         self._asked: set[str] = set()
         self._clients: dict[str, tuple[Client, Client]] = {}
         self._values: dict[str, dict[str, Any]] = {}
+        self._now: dict[str, dict[str, Any]] = {}
+        self.changes: list[dict[str, Any]] = []
 
     def document(self) -> dict[str, Any]:
         """Return all parameters known so far, in the form of a ROS parameter file."""
         return {name: {"ros__parameters": values} for name, values in self._values.items()}
+
+    def take_event(self, event: ParameterEvent) -> list[dict[str, Any]]:
+        """Take a message of /parameter_events; return the changes that it tells of.
+
+        Each is `stamp_ns` (ROS time), `node`, `name`, `value` (None: deleted). What a node declares
+        before its first snapshot is in the snapshot.
+        """
+        known = self._now.get(event.node)
+        if known is None:
+            return []
+        told = {
+            p.name: plain_value(p.value) for p in (*event.new_parameters, *event.changed_parameters)
+        }
+        told.update({p.name: None for p in event.deleted_parameters})
+        stamp = event.stamp.sec * 1_000_000_000 + event.stamp.nanosec
+        changes = [
+            {"stamp_ns": stamp, "node": event.node, "name": name, "value": value}
+            for name, value in told.items()
+            if known.get(name) != value
+        ]
+        known.update(told)
+        self.changes += changes
+        return changes
 
     def poll(self) -> None:
         """Ask nodes that have appeared since the last call and can answer now."""
@@ -112,6 +142,7 @@ class ParameterSnapshots:
         self._values[full_name] = {
             name: value for name, value in values.items() if value is not None
         }
+        self._now[full_name] = dict(self._values[full_name])
         self._on_snapshot(full_name, self._values[full_name])
 
     def _drop_clients(self, full_name: str) -> None:

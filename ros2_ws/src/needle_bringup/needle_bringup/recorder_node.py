@@ -14,20 +14,24 @@ from types import FrameType
 from typing import Any, cast
 
 import yaml
-from rclpy.duration import Duration
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from needle_bringup.bag_writer import BagTopic, OfferedQos
+from needle_bringup.bag_files import recover_hint
+from needle_bringup.bag_metadata import BagTopic
+from needle_bringup.bag_writer import COMPRESSIONS
+from needle_bringup.conversions import offered_qos, strictest_request
+from needle_bringup.free_space import megabytes
 from needle_bringup.message_definitions import full_definition
+from needle_bringup.message_loss import SequenceGaps
 from needle_bringup.parameters import ParameterSnapshots
 from needle_bringup.provenance import commit, distribution, versions
-from needle_bringup.recording import Recording
+from needle_bringup.recording import RESERVE, Recording
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
@@ -39,24 +43,33 @@ HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
 
 Topics that appear later are recorded too, images included. The bag also carries the message
-definitions, all nodes' parameters, the calibration file, versions and commit.
-Ctrl-C ends the recording and completes the bag.
+definitions, all nodes' parameters and their changes, the calibration file, versions and commit.
+Ctrl-C ends the recording and completes the bag. Written out at least five times a second: what a
+crash or kill -9 leaves is made whole by `ros2 run needle_bringup recover BAG`.
 
   ros2 run needle_bringup recorder --ros-args -p bag:=bags/my_run
 
-Subscribes to every topic of the graph; publishes /diagnostics.
-Exit codes: 0 the bag is whole; 1 the disk refused data; 2 bad parameters.
+Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost or
+the disk is nearly full. Down to `reserve` the recording ends, the bag is completed, and the node
+stays to say so; the rest of the graph goes on.
+Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters.
 """
 
 GRAPH_PERIOD = 0.1
 # All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
 DEPTH = 5000
-IMAGE_DEPTH = 20
+IMAGE_DEPTH = 60
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
 LAST_WORDS_LIMIT = 1.0
 WARN_WAITING = 20_000
+# The disk is nearly full when it lasts less than this at the present rate [s], or when what is
+# left is less than so many times the reserve.
+WARN_BEFORE = 120.0
+WARN_RESERVES = 3
+REPORT_PERIOD = 0.5
+PARAMETER_EVENTS = "/parameter_events"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,6 +91,27 @@ class RecorderParameters:
         description="Text about the run to keep in the bag: YAML `key: value` lines or JSON.",
         read_only=True,
     )
+    max_file_size: int = parameter(
+        10_000_000_000,
+        unit="B",
+        lower=0,
+        description="Messages in one data file, after which another is begun; 0: no bound.",
+        read_only=True,
+    )
+    compression: str = parameter(
+        "none",
+        unit="-",
+        choices=COMPRESSIONS,
+        description="Of the data: zstd takes a third of a core for noisy images.",
+        read_only=True,
+    )
+    reserve: int = parameter(
+        RESERVE,
+        unit="B",
+        lower=0,
+        description="Free space at which the recording ends; at most a tenth of the disk.",
+        read_only=True,
+    )
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -94,11 +128,17 @@ class _Topic:
         self.subscription: Subscription | None = None
         self.publishers = -1
         self.described = False
-        self.lost = 0
+        self.lost_events = 0
+        self.gaps = SequenceGaps()
         # Source stamps of the last messages: a subscription that replaces another may get some
         # of them again.
         self.recent: collections.deque[int] = collections.deque(maxlen=64)
         self.check_repeats_until = 0.0
+
+    @property
+    def lost(self) -> int:
+        """Messages that did not arrive: as DDS tells, or as the numbers of the others show."""
+        return max(self.lost_events, self.gaps.missing)
 
 
 class Recorder(Node):
@@ -112,15 +152,22 @@ class Recorder(Node):
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics: dict[str, _Topic] = {}
         self._refused: dict[str, str] = {}
-        self._told_error = False
+        self._told: str = ""
+        self._bytes_before, self._rate = 0, 0.0
         self.bag = Path(bag)
-        self.recording = Recording(self.bag, distribution=distribution())
+        self.recording = Recording(
+            self.bag,
+            distribution=distribution(),
+            max_file_size=self._settings.max_file_size,
+            compression=self._settings.compression,
+            reserve=self._settings.reserve,
+        )
         try:
             self._write_provenance(calibration)
             self._snapshots = ParameterSnapshots(self, self._take_parameters)
             self._poll_graph()
             self.create_timer(GRAPH_PERIOD, self._poll_graph, clock=STEADY_CLOCK)
-            self.create_timer(0.5, self.report, clock=STEADY_CLOCK)
+            self.create_timer(REPORT_PERIOD, self.report, clock=STEADY_CLOCK)
         except BaseException:
             self.recording.close()
             raise
@@ -146,7 +193,19 @@ class Recorder(Node):
         self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
         self.recording.set_custom_data("parameters", yaml.safe_dump(self._snapshots.document()))
 
+    def _take_parameter_event(self, data: bytes) -> None:
+        changes = self._snapshots.take_event(deserialize_message(data, ParameterEvent))
+        for change in changes:
+            record = {key: yaml.safe_dump(value).split("\n")[0] for key, value in change.items()}
+            self.recording.add_record("parameter_change", record)
+        if changes:
+            text = yaml.safe_dump(self._snapshots.changes)
+            self.recording.set_custom_data("parameter_changes", text)
+
     def _poll_graph(self) -> None:
+        if self.recording.error is not None:
+            self._leave()
+            return
         for name, types in self.get_topic_names_and_types():
             topic = self._topics.get(name)
             if topic is None:
@@ -184,9 +243,10 @@ class Recorder(Node):
         if len(offers) != publishers:
             return  # the graph is changing under us: look again at the next poll
         topic.publishers = publishers
+        topic.gaps.forget()
         if topic.subscription is not None and not offers:
             return
-        qos = _matching_qos(topic.type_name, offers)
+        qos = strictest_request(offers, IMAGE_DEPTH if topic.type_name in IMAGE_TYPES else DEPTH)
         before = topic.subscription
         if before is not None:
             now = before.qos_profile
@@ -195,7 +255,7 @@ class Recorder(Node):
             topic.check_repeats_until = time.monotonic() + 2.0
 
         def count_lost(event: Any) -> None:
-            topic.lost = event.total_count
+            topic.lost_events = event.total_count
 
         topic.subscription = self.create_subscription(
             topic.message_class,
@@ -228,8 +288,13 @@ class Recorder(Node):
         topic.recent.append(sent)
         if not topic.described:
             self._describe(topic)
+        number = info["publication_sequence_number"] or 0
+        if number:
+            topic.gaps.take(number)
         received = info["received_timestamp"] or time.time_ns()
-        self.recording.append(topic.name, data, received, sent or received)
+        self.recording.append(topic.name, data, received, sent or received, number)
+        if topic.name == PARAMETER_EVENTS:
+            self._take_parameter_event(data)
 
     def _describe(self, topic: _Topic) -> None:
         topic.described = True
@@ -241,59 +306,103 @@ class Recorder(Node):
                 type_name=topic.type_name,
                 definition=full_definition(topic.type_name),
                 type_hash=str(known[0].topic_type_hash) if known else "",
-                offered_qos=tuple(_offered(offer) for offer in offers),
+                offered_qos=tuple(offered_qos(offer) for offer in offers),
             )
         )
+
+    def _leave(self) -> None:
+        """Stop listening, once the recording has ended before its time."""
+        for topic in self._topics.values():
+            if topic.subscription is not None:
+                self.destroy_subscription(topic.subscription)
+                topic.subscription = None
 
     def report(self) -> None:
         """Publish the recording's health."""
         recording = self.recording
-        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
+        received = recording.bytes_received
+        # A second's mean or so: images come in bursts.
+        self._rate += 0.5 * ((received - self._bytes_before) / REPORT_PERIOD - self._rate)
+        self._bytes_before = received
         values = {
             "bag": str(self.bag),
             "topics": str(len(self._topics)),
             "messages": str(recording.messages_received),
             "messages_waiting": str(recording.messages_waiting),
-            "messages_lost": str(sum(lost.values())),
-            "size_bytes": str(recording.bytes_received),
+            "messages_lost": str(sum(self._lost().values())),
+            "size_bytes": str(received),
         }
-        level, message = Level.OK, "recording"
-        if recording.error is not None:
-            level, message = Level.ERROR, f"recording ended: {recording.error}"
-            if not self._told_error:
-                self._told_error = True
-                self.get_logger().error(message)
-        elif lost:
-            level, message = Level.WARN, f"messages lost on {', '.join(lost)}"
-        elif recording.messages_waiting > WARN_WAITING:
-            level, message = Level.WARN, "the disk is slower than the graph"
-        elif self._refused:
-            level, message = Level.WARN, "; ".join(self._refused.values())
+        level, message = self._health()
         self._diagnostics.set("bag", Diagnostic(level, message, values))
+        if level is Level.OK or message == self._told:
+            return
+        self._told = message
+        if level is Level.ERROR:
+            self.get_logger().error(message)
+        else:
+            self.get_logger().warning(message)
+
+    def _health(self) -> tuple[Level, str]:
+        recording = self.recording
+        if recording.error is not None:
+            return Level.ERROR, f"recording ended: {recording.error}"
+        lost = self._lost()
+        if lost:
+            return Level.WARN, f"messages lost on {', '.join(lost)}"
+        if recording.messages_waiting > WARN_WAITING:
+            return Level.WARN, "the disk is slower than the graph"
+        warning = self._space_warning()
+        if not warning and self._refused:
+            warning = "; ".join(self._refused.values())
+        return (Level.WARN, warning) if warning else (Level.OK, "recording")
+
+    def _space_warning(self) -> str:
+        space = self.recording.space
+        try:
+            usable = space.usable()
+        except OSError as error:
+            return f"cannot look at the disk of {self.bag}: {error.strerror}"
+        if usable >= max(WARN_BEFORE * self._rate, WARN_RESERVES * space.reserve):
+            return ""
+        reserve = megabytes(space.reserve)
+        return f"the disk of {self.bag} is nearly full: recording ends at {reserve} free"
+
+    def _lost(self) -> dict[str, int]:
+        """Return how many messages of which topic are not in the bag."""
+        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
+        for name, count in list(self.recording.dropped.items()):
+            lost[name] = lost.get(name, 0) + count
+        return lost
 
     def finish(self) -> int:
         """Complete the bag; return the exit code and say one line about it."""
-        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
         for topic in self._topics.values():
             if not topic.described:
                 self._describe(topic)
-        if lost:
-            self.recording.set_custom_data("messages_lost", json.dumps(lost))
         self.recording.add_file(
             "parameters.yaml",
             "application/yaml",
             yaml.safe_dump(self._snapshots.document()).encode(),
             time.time_ns(),
         )
+        lost = self._lost()
+        if lost:
+            self.recording.set_custom_data("messages_lost", json.dumps(lost))
         self.recording.close()
-        if self.recording.error is not None:
-            print(f"error: {self.recording.error}; the bag is not complete", file=sys.stderr)
-            return EXIT_MISSED
         count = self.recording.messages_received
-        print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")
+        lost = self._lost()
+        if self.recording.error is not None:
+            state = (
+                "the bag is whole up to there"
+                if self.recording.is_whole
+                else recover_hint(self.bag)
+            )
+            print(f"error: recording ended: {self.recording.error}; {state}", file=sys.stderr)
+        else:
+            print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")
         if lost:
             print(f"warning: messages lost: {json.dumps(lost)}", file=sys.stderr)
-        return EXIT_DONE
+        return EXIT_DONE if self.recording.error is None else EXIT_MISSED
 
 
 def _read_calibration(path: str) -> str:
@@ -303,39 +412,6 @@ def _read_calibration(path: str) -> str:
         return Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"calibration_file: cannot read {path}: {error}") from error
-
-
-def _matching_qos(type_name: str, offers: list[TopicEndpointInfo]) -> QoSProfile:
-    """Return the strictest quality of service that every publisher can serve."""
-    profiles = [offer.qos_profile for offer in offers]
-    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
-    latched = bool(profiles) and all(
-        p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles
-    )
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=IMAGE_DEPTH if type_name in IMAGE_TYPES else DEPTH,
-        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-    )
-
-
-def _offered(offer: TopicEndpointInfo) -> OfferedQos:
-    qos = offer.qos_profile
-
-    def nanoseconds(duration: Duration) -> int:
-        return int(duration.nanoseconds)
-
-    return OfferedQos(
-        history=qos.history.name.lower(),
-        depth=int(qos.depth),
-        reliability=qos.reliability.name.lower(),
-        durability=qos.durability.name.lower(),
-        deadline=nanoseconds(qos.deadline),
-        lifespan=nanoseconds(qos.lifespan),
-        liveliness=qos.liveliness.name.lower(),
-        lease_duration=nanoseconds(qos.liveliness_lease_duration),
-    )
 
 
 class _StopRequest:
@@ -359,9 +435,8 @@ def main(args: list[str] | None = None) -> int:
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
-            while not stop.wanted and recorder.recording.error is None:
+            while not stop.wanted:
                 executor.spin_once(timeout_sec=0.1)
-            recorder.report()
             limit = time.monotonic() + LAST_WORDS_LIMIT
             end = time.monotonic() + LAST_WORDS
             while time.monotonic() < min(end, limit):

@@ -12,7 +12,8 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.bag_writer import BagTopic, BagWriter, OfferedQos
+from needle_bringup.bag_metadata import BagTopic, OfferedQos
+from needle_bringup.bag_writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120

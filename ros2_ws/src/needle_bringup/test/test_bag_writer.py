@@ -13,7 +13,8 @@ from rosbags.interfaces import QosDurability, QosHistory, QosReliability
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from needle_bringup.bag_writer import BagTopic, BagWriter, OfferedQos
+from needle_bringup.bag_metadata import BagTopic, OfferedQos
+from needle_bringup.bag_writer import BagWriter
 from needle_bringup.message_definitions import full_definition
 from needle_bringup.recording import Recording
 from needle_common.errors import UserError
