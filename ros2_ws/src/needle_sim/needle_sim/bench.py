@@ -1,4 +1,4 @@
-"""The simulated bench: two axes, the needle they move, and what a measurement of it says."""
+"""The simulated bench: the needle that two axes move, and what a measurement of it says."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 
 from needle_sim.plant import NeedlePlant, initial_pose
 from needle_sim.se3 import FloatArray
-from needle_sim.simulated_axis import SimulatedAxis
 from needle_sim.tissue import Torsion, measured_tip
 
 # Streams of the noise of one exposure; 0 and 1 are the left and the right image's.
@@ -14,7 +13,7 @@ _TIP_STREAM = 4
 
 
 class SimulatedBench:
-    """Moves the plant by what the axes did, and by nothing else.
+    """Moves the plant by where the axes went, and by nothing else.
 
     Parameters
     ----------
@@ -43,8 +42,8 @@ class SimulatedBench:
         tip_noise: float,
         seed: int,
     ) -> None:
-        self.insertion = SimulatedAxis("insertion")
-        self.rotation = SimulatedAxis("rotation")
+        self.insertion = 0.0
+        self.rotation = 0.0
         self.plant = NeedlePlant(
             initial_pose(pitch, roll),
             curvature=curvature,
@@ -53,12 +52,10 @@ class SimulatedBench:
         self._tip_noise = tip_noise
         self._seed = seed
 
-    def advance(self, period: float) -> None:
-        """Let `period` [s] go by: the axes move, and the needle with them."""
-        before = (self.insertion.position, self.rotation.position)
-        self.insertion.advance(period)
-        self.rotation.advance(period)
-        moved = (self.insertion.position - before[0], self.rotation.position - before[1])
+    def move_to(self, insertion: float, rotation: float) -> None:
+        """Move the axes to these positions [m], [rad], and the needle with them."""
+        moved = (insertion - self.insertion, rotation - self.rotation)
+        self.insertion, self.rotation = insertion, rotation
         if moved != (0.0, 0.0):
             self.plant.advance(*moved)
 

@@ -22,7 +22,7 @@ class SimRigParameters:
         unit="-",
         choices=LEVELS,
         read_only=True,
-        description="tip: measured tips; camera: rendered images; drive: not available yet.",
+        description="tip: measured tips; camera: images; drive: images and emulated drives.",
     )
     seed: int = parameter(
         0,
@@ -129,6 +129,14 @@ class SimRigParameters:
         read_only=True,
         description="Lock step: expose again when a steered, held needle hears nothing so long.",
     )
+    tick_timeout: float = parameter(
+        0.5,
+        unit="s",
+        lower=0.02,
+        upper=60.0,
+        read_only=True,
+        description="Level drive: how long driver and drives may leave a tick unanswered.",
+    )
     max_depth: float = parameter(
         SafetyLimits.max_depth,
         unit="m",
@@ -208,12 +216,9 @@ class SimRigParameters:
         Raises
         ------
         UserError
-            A parameter out of bounds, a level that does not exist yet, or images wanted of a level
-            that has none.
+            A parameter out of bounds, or images wanted of a level that has none.
         """
         check_fields(self)
-        if self.level == "drive":
-            raise UserError("level drive is not available yet; there are tip and camera")
         if self.level == "tip" and self.scenario != CLEAN.name:
             raise UserError(f"scenario = {self.scenario!r}: level tip has no images")
         if self.level == "tip" and self.images:

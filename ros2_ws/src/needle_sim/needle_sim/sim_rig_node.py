@@ -34,14 +34,12 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
-from needle_device_driver.device_interface_node import DeviceInterface
-from needle_device_driver.reports import StepResult
-from needle_device_driver.states import Activity
-from needle_device_driver.supervisor import MotionSupervisor
 from needle_sim.bench import SimulatedBench
 from needle_sim.conversions import to_camera_info, to_image, to_tip, to_tip_pose, to_truth
+from needle_sim.driven_device_node import DrivenDevice
 from needle_sim.image_folder import ImageFolder, truth_of
 from needle_sim.lock_step import Action, LockStep
+from needle_sim.own_device_node import OwnDevice
 from needle_sim.pace import Pace
 from needle_sim.parameters import SimRigParameters
 from needle_sim.renderer import StereoRenderer
@@ -51,12 +49,17 @@ from needle_sim.stereo_rig import load_stereo_rig
 HELP = """\
 sim_rig: stands in for the rig, so that every other node runs as on the real one.
 
-Publishes   /clock, joint_states, device/status, device/result, sim/tip_pose (the truth);
+Publishes   /clock, sim/tip_pose (the truth);
+            levels tip and camera: joint_states, device/status, device/result;
             level tip: needle/tip, needle/tip_pose;
-            level camera: stereo/{left,right}/image_raw, stereo/{left,right}/camera_info
-Subscribes  device/joint_trajectory, device/hold, device/estop, needle/controller_status;
-            level camera: needle/tip_pose
-Services    device/{home,retract,stop,reset}, device/{enable,confirm_needle_out}
+            levels camera and drive: stereo/{left,right}/{image_raw,camera_info}
+Subscribes  needle/controller_status;
+            levels tip and camera: device/joint_trajectory, device/hold, device/estop;
+            levels camera and drive: needle/tip_pose;
+            level drive: sim/drive_positions, which moves the needle, and device/status,
+            device/result, joint_states of the device_driver that talks to drive_emulator
+Services    levels tip and camera: device/{home,retract,stop,reset},
+            device/{enable,confirm_needle_out}
 """
 
 TICK_NS = 20_000_000
@@ -91,7 +94,7 @@ class SimRigNode(Node):
             tip_noise=values.tip_noise,
             seed=values.seed,
         )
-        self._is_camera = values.level == "camera"
+        self._is_camera = values.level != "tip"
         self._lock_step: LockStep | None = None
         self._pace: Pace | None = None
         if values.real_time_factor > 0.0:
@@ -100,21 +103,16 @@ class SimRigNode(Node):
             self._lock_step = LockStep(
                 answered=self._is_camera, reexpose_after=values.reexpose_after
             )
-        self._supervisor = MotionSupervisor(
-            self._bench.insertion,
-            self._bench.rotation,
-            values.limits,
-            pause_on_lapse=self._lock_step is not None,
-        )
         self._time_ns = START_NS
         self._started = False
+        # What the tick under way is for; None between ticks.
+        self._under_way: Action | None = None
         self._ended = ""
         self._missing = "all partners"
         self._match_checked_at = -math.inf
         self._clock_told_at = -math.inf
         self._exposures = 0
         self._next_frame_ns = START_NS
-        self._supervisor.configure(time.monotonic())
         if not self.get_parameter("use_sim_time").value:
             # Its own time without the detour over /clock.
             self.get_clock()._set_ros_time_is_active(True)
@@ -123,13 +121,26 @@ class SimRigNode(Node):
         self._clock_publisher = self.create_publisher(Clock, "/clock", RELIABLE)
         self._truth = self.create_publisher(PoseStamped, "sim/tip_pose", RELIABLE)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._device = DeviceInterface(
-            self,
-            self._supervisor,
-            self._diagnostics,
-            refuse=self._why_not_ready,
-            on_result=self._on_result,
-        )
+        self._device: OwnDevice | DrivenDevice
+        if values.level == "drive":
+            self._device = DrivenDevice(
+                self,
+                self._diagnostics,
+                self._bench,
+                timeout=values.tick_timeout,
+                on_step_end=self._on_step_end,
+            )
+        else:
+            self._device = OwnDevice(
+                self,
+                self._diagnostics,
+                self._bench,
+                values.limits,
+                in_lock_step=self._lock_step is not None,
+                refuse=self._why_not_ready,
+                on_step_end=self._on_step_end,
+                now=time.monotonic(),
+            )
         self._controller_status = self.create_subscription(
             DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
         )
@@ -156,32 +167,30 @@ class SimRigNode(Node):
             self._start_if_matched(now)
             self._idle(now)
             return _IDLE
+        if self._under_way is not None and not self._finish_tick(now):
+            return self._device.patience
         if self._pace is not None:
             return self._turn_in_real_time(self._pace, now)
         assert self._lock_step is not None
-        self._supervisor.observe(now)
+        self._device.observe(now)
         trips = self._lock_step.watchdog_trips
         action = self._lock_step.next_action(
-            under_way=self._supervisor.activity is not Activity.NONE,
-            may_move=self._supervisor.may_move(now),
-            held=bool(self._supervisor.status(now).hold_owner),
+            under_way=self._device.under_way(),
+            may_move=self._device.may_move(now),
+            held=self._device.held(now),
             now=now,
         )
         if self._lock_step.watchdog_trips > trips:
-            self._supervisor.count_watchdog_trip()
+            self._device.count_watchdog_trip()
             self.get_logger().warning(
                 f"nothing heard for {self._settings.reexpose_after:g} s: exposed again"
             )
         if self._ended and action is Action.EXPOSE:
             action = Action.WAIT
-        if action is Action.TICK:
-            self._tick(now)
-        elif action is Action.EXPOSE:
-            self._tick(now)
-            self._expose(now)
-        else:
+        if action is Action.WAIT:
             self._idle(now)
             return _IDLE
+        self._tick(action, now)
         return 0.0
 
     def turns(self) -> float:
@@ -190,14 +199,13 @@ class SimRigNode(Node):
         # Behind real time, more ticks in a row would keep the hold's messages waiting.
         for _ in range(_TURNS_PER_LOOK if self._pace is None else 1):
             wait = self.turn()
-            if wait > 0.0:
+            if wait > 0.0 or self._under_way is not None:
                 break
         return wait
 
     def close(self) -> None:
-        """Stop the simulated axes and say so."""
-        self._supervisor.close()
-        self._device.report()
+        """Stop what is ours to stop, and say so."""
+        self._device.close()
         if self._folder is not None:
             self._folder.close()
 
@@ -205,32 +213,41 @@ class SimRigNode(Node):
         if pace.wait(now) > 0.0:
             return pace.wait(now)
         pace.tick(now)
-        self._tick(now)
-        if self._time_ns >= self._next_frame_ns and not self._ended:
-            self._next_frame_ns = self._time_ns + round(NANOSECONDS / self._settings.camera_rate)
-            self._expose(now)
+        due = self._time_ns + TICK_NS >= self._next_frame_ns and not self._ended
+        if due:
+            self._next_frame_ns = (
+                self._time_ns + TICK_NS + round(NANOSECONDS / self._settings.camera_rate)
+            )
+        self._tick(Action.EXPOSE if due else Action.TICK, now)
         return pace.wait(time.monotonic())
 
     def _idle(self, now: float) -> None:
-        self._supervisor.observe(now)
-        self._supervisor.note_time(self._time_ns, now)
-        self._device.report()
-        if now - self._clock_told_at >= _CLOCK_REPEAT:
+        self._device.observe(now)
+        repeat = now - self._clock_told_at >= _CLOCK_REPEAT
+        if repeat:
             self._tell_time(now)
-            if self._started and not self._exposures:
-                # A partner that others had matched before this node did has missed the first.
-                self._device.publish_joint_states(self._time_ns)
+        # A partner that others had matched before this node did has missed the first joints.
+        self._device.idle(
+            self._time_ns, now, repeat=repeat and self._started and not self._exposures
+        )
 
-    def _tick(self, now: float) -> None:
+    def _tick(self, action: Action, now: float) -> None:
+        """Let a tick go by, and expose at its end if that is the action."""
         self._set_time(self._time_ns + TICK_NS)
-        self._supervisor.note_time(self._time_ns, now)
-        self._supervisor.drive(TICK, now)
-        self._bench.advance(TICK)
-        self._supervisor.observe(now)
-        self._end_outside_phantom()
+        self._under_way = action
+        self._device.begin_tick(self._time_ns, TICK, now)
         self._tell_time(now)
-        self._device.publish_joint_states(self._time_ns)
-        self._device.report()
+        self._finish_tick(now)
+
+    def _finish_tick(self, now: float) -> bool:
+        """Do what is due at the end of a tick; returns whether it has ended."""
+        if not self._device.end_tick(self._time_ns, now):
+            return False
+        action, self._under_way = self._under_way, None
+        self._end_outside_phantom()
+        if action is Action.EXPOSE:
+            self._expose(now)
+        return True
 
     def _set_time(self, time_ns: int) -> None:
         self._time_ns = time_ns
@@ -254,7 +271,7 @@ class SimRigNode(Node):
                 self._folder.write(
                     number,
                     images,
-                    self._bench.insertion.position,
+                    self._bench.insertion,
                     truth_of(pose) if there else None,
                     self._renderer.share_seen(pose, line, number),
                 )
@@ -295,7 +312,7 @@ class SimRigNode(Node):
                 f"the tip left the phantom: x = {height * 1e3:.2f} mm is beyond "
                 f"{math.copysign(self._surface_height, height) * 1e3:.2f} mm"
             )
-            self._supervisor.fail(self._ended)
+            self._device.end_run(self._ended)
             self._tell_health()
 
     # ---- start --------------------------------------------------------------------------------
@@ -312,13 +329,13 @@ class SimRigNode(Node):
             return
         self._started = True
         self._tell_time(now)
-        self._device.publish_joint_states(self._time_ns)
+        self._device.idle(self._time_ns, now, repeat=True)
         self._tell_health()
         self.get_logger().info("all partners are there: time starts")
 
     def _missing_partners(self) -> list[str]:
-        publishers = [self._device.joint_states, self._device.results, self._device.statuses]
-        subscriptions = [self._device.commands, self._device.holds, self._controller_status]
+        publishers = self._device.publishers
+        subscriptions = [*self._device.subscriptions, self._controller_status]
         if self._is_camera:
             publishers += [image_raw for image_raw, _ in self._views]
             subscriptions.append(self._answers)
@@ -334,6 +351,7 @@ class SimRigNode(Node):
             for subscription in subscriptions
             if subscription.get_publisher_count() == 0
         ]
+        missing += self._device.missing()
         if not missing and self._settings.wait_for_recorder:
             publishers += [self._truth, *self._measurements]
             missing += unrecorded(self, publishers)
@@ -375,7 +393,7 @@ class SimRigNode(Node):
 
     # ---- callbacks ----------------------------------------------------------------------------
 
-    def _on_result(self, _: StepResult) -> None:
+    def _on_step_end(self) -> None:
         if self._lock_step is not None:
             self._lock_step.step_ended(time.monotonic())
 

@@ -491,7 +491,6 @@ def test_what_it_renders_is_written_with_insertion_and_truth(tmp_path: Path) -> 
         ({"scenario": "clutter"}, "scenario = 'clutter': level tip has no images"),
         ({"images": "somewhere"}, "images = 'somewhere': level tip has no images"),
         ({"level": "camera", "images": "/dev/null/x"}, "cannot write /dev/null/x"),
-        ({"level": "drive"}, "drive is not available yet"),
         ({"level": "x"}, "level"),
         ({"curvature": -1.0}, "curvature"),
         ({"max_speed": 0.006}, "max_speed"),
