@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from needle_bringup.bag_reader import Run, Series
 from needle_bringup.paper_runs import Columns, Laboratory
+from needle_bringup.pure_insertions import ARC, CurvatureErrors, curvature_errors
 from needle_bringup.run_summary import reduced_states, target_offset
 from needle_common.cli import JsonValue
 
@@ -73,6 +74,10 @@ class Results:
         Single runs from starts over (x, pitch) and over (x, roll).
     best : dict
         Figures of preset `best` on the endpoint grid.
+    curvature : dict
+        What `identify_curvature` finds in a pure insertion by cameras.
+    curvature_errors : CurvatureErrors
+        What many pure insertions with the paper's noise give.
     """
 
     open_loop: Trial
@@ -87,6 +92,8 @@ class Results:
     domain_pitch: Columns
     domain_roll: Columns
     best: dict[str, JsonValue]
+    curvature: dict[str, JsonValue]
+    curvature_errors: CurvatureErrors
 
 
 def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
@@ -107,6 +114,11 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
     open_loop = laboratory.trial("open_loop", *tip, "--controller", "open_loop", "--noise-mm", "0")
     closed_loop = laboratory.trial(
         "closed_loop", *tip, "--controller", "paper", "--noise-mm", "0.5"
+    )
+    laboratory.trial(
+        "pure_insertion",
+        *("--level", "camera", "--controller", "open_loop", "--seed", str(seed)),
+        *("--initial=0,0,90", "--depth-mm", f"{ARC * 1e3:g}"),
     )
     grids, runs, longer = {}, {}, {}
     for grid in GRIDS:
@@ -141,6 +153,9 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
         domain_pitch=domain_pitch,
         domain_roll=domain_roll,
         best=laboratory.study("best", "--controller", "best", "--seed", str(seed), *draws)[0],
+        # What the tracker says before it sees the needle is no measurement.
+        curvature=laboratory.identify("curvature", "pure_insertion", "--from-mm", "5"),
+        curvature_errors=curvature_errors(300 if quick else 3000, np.random.default_rng(seed)),
     )
 
 

@@ -72,6 +72,21 @@ class Laboratory:
         columns = {name: table[:, k] for k, name in enumerate(head)}
         return dict(json.loads(figures.read_text("utf-8"))), columns
 
+    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
+        """Find the curvature in a trial's bag with `identify_curvature`; return what it found.
+
+        Raises
+        ------
+        UserError
+            If it does not run.
+        """
+        figures = self._folder / f"{name}.json"
+        if not figures.is_file():
+            command = [find_executable("needle_controller", "identify_curvature")]
+            command += [str(self._folder / bag), *arguments, "--json", str(figures)]
+            _run(name, command, (EXIT_DONE,))
+        return dict(json.loads(figures.read_text("utf-8")))
+
 
 def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:
     print(f"running {name} ...", file=sys.stderr, flush=True)

@@ -20,11 +20,11 @@ from needle_bringup import control_studies
 from needle_bringup.control_studies import BEST, FIGURE_3, PAPER, SPEED, TROUBLE, Study
 from needle_bringup.installed import find_executable
 from needle_bringup.node_process import NodeProcess, stop
+from needle_bringup.pure_insertions import NOISE, RADIUS, curvature_errors, pure_insertions
 from needle_bringup.ros_domain import own_domain
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.errors import UserError
 from needle_controller.control_settings import ControlSettings
-from needle_controller.curvature_fit import circle_curvature, fit_curvature
 from needle_controller.gains import design_gains
 from needle_controller.joint_history import JointSample
 from needle_controller.plane_control import PlaneControl
@@ -33,13 +33,6 @@ from needle_controller.target_plane import offset_plane
 
 Floats = npt.NDArray[np.float64]
 
-RADIUS = 0.122
-"""1 / kappa of the needle in [KC09] IV [m]."""
-NOISE = 1e-3
-"""Largest error of a measured coordinate there [m]."""
-HEADING_STD = math.radians(5.0)
-ENTRY_STD = 0.5e-3
-ARC = 0.06
 MEGABYTE = 1e6
 MEMORY_SLACK = 10.0 * MEGABYTE
 
@@ -90,19 +83,19 @@ def trouble(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
 
 def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
     """Find the curvature from a pure insertion of 60 mm."""
-    tips, insertion = pure_insertions(size.insertions, np.random.default_rng(60))
-    radius = fit_curvature(tips, insertion).radius / RADIUS - 1.0
-    bias, spread = float(np.mean(radius)), float(np.std(radius))
+    off = curvature_errors(size.insertions, np.random.default_rng(60))
     # What so many insertions cannot tell from none.
-    doubt = 3.0 * spread / math.sqrt(size.insertions) if size.insertions < FULL.insertions else 0.0
-    circle = circle_curvature(tips) * RADIUS - 1.0
+    fewer = size.insertions < FULL.insertions
+    doubt = 3.0 * off.spread / math.sqrt(size.insertions) if fewer else 0.0
     yield Finding(
         "curvature_fit",
         f"1/kappa from {size.insertions} insertions of 60 mm, +-1 mm noise",
         "bias <= 0.5 %, spread <= 6.5 %",
-        f"bias {bias:+.2%}, spread {spread:.2%} (a plain circle: kappa {np.mean(circle):+.0%})",
-        abs(bias) <= 0.005 + doubt and spread <= 0.065,
+        f"bias {off.bias:+.2%}, spread {off.spread:.2%} (a plain circle: kappa "
+        f"{off.circle_bias:+.0%})",
+        abs(off.bias) <= 0.005 + doubt and off.spread <= 0.065,
     )
+    tips, insertion = pure_insertions(1, np.random.default_rng(61))
     file, result = bench.folder / "insertion.csv", bench.folder / "insertion.json"
     with file.open("w", encoding="utf-8", newline="") as stream:
         writer = csv.writer(stream)
@@ -221,29 +214,6 @@ CHECKS: tuple[Check, ...] = (
     paper, figure_3, best, trouble, curvature, bad_parameters, study_speed, study_memory,
     node_update,
 )  # fmt: skip
-
-
-def pure_insertions(count: int, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return measured tips of insertions without rotation, and how far in each was.
-
-    Returns
-    -------
-    tips : ndarray, shape (count, 61, 3)
-        On circles of radius `RADIUS` at any roll, entering with a heading off by 5 deg and a place
-        off by 0.5 mm (standard deviations), with +-1 mm of uniform noise [m].
-    insertion : ndarray, shape (61,)
-        [m].
-    """
-    insertion = np.linspace(0.0, ARC, 61)
-    angle = insertion / RADIUS
-    circle = RADIUS * np.stack([np.zeros(61), np.cos(angle) - 1.0, np.sin(angle)], axis=-1)
-    rolls = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
-    heading = np.zeros((count, 3))
-    heading[:, :2] = rng.normal(0.0, HEADING_STD, (count, 2))
-    turned = (Rotation.from_rotvec(heading) * rolls).as_matrix()
-    tips = circle @ np.swapaxes(turned, -1, -2)
-    tips += rng.normal(0.0, ENTRY_STD, (count, 1, 3))
-    return tips + rng.uniform(-NOISE, NOISE, tips.shape), insertion
 
 
 def update_times(preset: str) -> Floats:

@@ -11,7 +11,6 @@ the problem is almost linear, has no singular point at kappa = 0, and the unknow
 guess. What is known of heading and entry are priors. Tips that the arc explains badly lose weight,
 so that a few outliers do no harm.
 
-`circle_curvature` is the plain least-squares circle, for comparison: over short arcs it is biased.
 Leading axes broadcast.
 """
 
@@ -24,21 +23,24 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_controller.arc_motion import cross_matrix, left_jacobian, rotation_exp
 from needle_controller.arrays import Array
+from needle_controller.insertion_arc import (
+    BEND,
+    ENTRY,
+    HEADING,
+    UNKNOWNS,
+    arc_points,
+    frame,
+    headings,
+)
 
 FEWEST_TIPS = 8
 SHORTEST_ARC = 0.01
 """Fewer tips, or a shorter insertion [m], say nothing of the curvature."""
-_ENTRY, _HEADING, _BEND = slice(0, 3), slice(3, 5), slice(5, 7)
-_UNKNOWNS = 7
-_SERIES_BELOW = 1e-2
 _ITERATIONS = 30
 _ROBUST_ITERATIONS = 5
 _SMALLEST_NOISE = 1e-9
 _ARBITRARY_START = 1e-3
-# Standard deviations beyond which the tips contradict a prior.
-_CONTRADICTION = 4.0
 # Median of a tip's squared distance, in variances of a coordinate, of normal and uniform noise:
 # about halfway between the two.
 _MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
@@ -66,6 +68,9 @@ class CurvatureFitSettings:
     outlier_limit : float
         A tip farther from the arc than this many standard deviations of a coordinate loses weight,
         with the 4th power of its distance; infinite for plain least squares.
+    repeating_error : float
+        What all tips may be off together, bowed along the arc (a calibration's error), which the
+        residuals cannot show [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
     """
 
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
@@ -74,6 +79,7 @@ class CurvatureFitSettings:
     entry_std: float = 0.0005
     measurement_std: float | None = None
     outlier_limit: float = 4.0
+    repeating_error: float = 0.0
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError or UserError with the value."""
@@ -88,6 +94,8 @@ class CurvatureFitSettings:
         for name, value, unit in checked:
             if not value >= tiny:
                 raise OutOfBoundsError(name, value, tiny, math.inf, unit)
+        if not 0.0 <= self.repeating_error < math.inf:
+            raise OutOfBoundsError("repeating_error", self.repeating_error, 0.0, math.inf, "m")
         if not abs(float(np.linalg.norm(self.heading)) - 1.0) < 1e-6:
             raise UserError(f"heading = {self.heading} is not of unit length")
         if not np.all(np.isfinite(self.entry)):
@@ -174,13 +182,13 @@ def fit_curvature(
         Too few tips, too short an arc, or something that is not finite.
     """
     settings = CurvatureFitSettings() if settings is None else settings
-    tips = _checked_tips(tips)
-    frame = _frame(np.asarray(settings.heading, dtype=float))
-    precision = np.zeros(_UNKNOWNS)
-    precision[_ENTRY] = settings.entry_std**-2.0
-    precision[_HEADING] = settings.heading_std**-2.0
+    tips = checked_tips(tips)
+    axes = frame(np.asarray(settings.heading, dtype=float))
+    precision = np.zeros(UNKNOWNS)
+    precision[ENTRY] = settings.entry_std**-2.0
+    precision[HEADING] = settings.heading_std**-2.0
     # In the frame of the known heading, about the known entry.
-    measured = (tips - np.asarray(settings.entry, dtype=float)) @ frame
+    measured = (tips - np.asarray(settings.entry, dtype=float)) @ axes
     known = insertion is not None
     if insertion is None:
         # Where the arc begins along itself is then arbitrary: near the entry's place.
@@ -189,11 +197,11 @@ def fit_curvature(
     else:
         length = np.broadcast_to(np.asarray(insertion, dtype=float), tips.shape[:-1])
     _check_length(length)
-    unknowns = np.zeros((*tips.shape[:-2], _UNKNOWNS))
+    unknowns = np.zeros((*tips.shape[:-2], UNKNOWNS))
     weights = np.ones(tips.shape[:-1])
     sigma = np.full(tips.shape[:-2], settings.measurement_std or 1e-3)
     for iteration in range(_ITERATIONS):
-        expected, slopes, tangent = _arc_points(unknowns, length)
+        expected, slopes, tangent = arc_points(unknowns, length)
         residual = measured - expected
         if not known:
             along = np.sum(residual * tangent, axis=-1, keepdims=True)
@@ -210,134 +218,31 @@ def fit_curvature(
         normal = np.einsum("...kij,...kil->...jl", scaled, slopes)
         gradient = np.einsum("...kij,...ki->...j", scaled, residual)
         weighed = precision * sigma[..., None] ** 2
-        normal = normal + np.eye(_UNKNOWNS) * weighed[..., None, :]
+        normal = normal + np.eye(UNKNOWNS) * weighed[..., None, :]
         inverse = np.linalg.inv(normal * _SCALE[:, None] * _SCALE) * _SCALE[:, None] * _SCALE
         change = np.einsum("...ij,...j->...i", inverse, gradient - weighed * unknowns)
         unknowns = unknowns + change
-        if iteration > _ROBUST_ITERATIONS and np.all(np.abs(change[..., _BEND]) < 1e-9):
+        if iteration > _ROBUST_ITERATIONS and np.all(np.abs(change[..., BEND]) < 1e-9):
             break
     covariance = inverse * (sigma**2)[..., None, None]
-    curvature, std = _length(unknowns[..., _BEND], covariance[..., _BEND, _BEND])
+    curvature, std = _length(unknowns[..., BEND], covariance[..., BEND, BEND])
+    span = np.max(length, axis=-1) - np.min(length, axis=-1)
+    std = np.hypot(std, 8.0 * settings.repeating_error / span**2)
     variances = np.diagonal(covariance, axis1=-2, axis2=-1)
     return CurvatureFit(
         curvature=curvature,
         std=std,
         measurement_std=sigma,
         weights=weights,
-        entry=unknowns[..., _ENTRY] @ frame.T + np.asarray(settings.entry, dtype=float),
-        entry_std=np.sqrt(np.max(variances[..., _ENTRY], axis=-1)),
-        heading=_headings(unknowns[..., _HEADING])[..., :, 2] @ frame.T,
-        heading_std=np.sqrt(np.max(variances[..., _HEADING], axis=-1)),
+        entry=unknowns[..., ENTRY] @ axes.T + np.asarray(settings.entry, dtype=float),
+        entry_std=np.sqrt(np.max(variances[..., ENTRY], axis=-1)),
+        heading=headings(unknowns[..., HEADING])[..., :, 2] @ axes.T,
+        heading_std=np.sqrt(np.max(variances[..., HEADING], axis=-1)),
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class CheckedFit:
-    """A fit, and what of the settings the tips contradicted and was left out of it."""
-
-    fit: CurvatureFit
-    warnings: tuple[str, ...]
-
-
-def fit_checked(
-    tips: npt.ArrayLike, insertion: npt.ArrayLike | None, settings: CurvatureFitSettings
-) -> CheckedFit:
-    """Return the fit of one needle, without such priors as its tips contradict.
-
-    An arc is first fitted without entry and heading; where it is more than four standard deviations
-    from what was said to be known, that is not used.
-
-    Parameters
-    ----------
-    tips : array_like, shape (K, 3)
-        Measured tips [m].
-    insertion : array_like, shape (K,), or None
-        See `fit_curvature`.
-    settings : CurvatureFitSettings
-        What is known beside them.
-
-    Returns
-    -------
-    CheckedFit
-        The fit, and a line on everything that was not used.
-
-    Raises
-    ------
-    UserError
-        As `fit_curvature`.
-    """
-    tips = _checked_tips(tips)
-    third = max(len(tips) // 3, 1)
-    first, last = np.median(tips[:third], axis=0), np.median(tips[-third:], axis=0)
-    chord = last - first
-    size = float(np.linalg.norm(chord))
-    if size < 1e-4:
-        raise UserError(f"the tips are all in one place (they move by {size:.3g} m)")
-    x, y, z = (float(v) for v in chord / size)
-    e, f, g = (float(v) for v in first)
-    free = fit_curvature(
-        tips,
-        insertion,
-        dataclasses.replace(
-            settings, heading=(x, y, z), heading_std=math.inf, entry=(e, f, g), entry_std=math.inf
-        ),
-    )
-    warnings: list[str] = []
-    if math.isfinite(settings.entry_std):
-        off = np.asarray(free.entry) - settings.entry
-        if insertion is None:
-            # Along the arc the start of the free fit is arbitrary.
-            off = off - free.heading * (off @ free.heading)
-        distance = float(np.linalg.norm(off))
-        allowed = _CONTRADICTION * math.hypot(settings.entry_std, float(free.entry_std))
-        if distance > allowed:
-            warnings.append(
-                f"the entry was not used: the tips start {1e3 * distance:.1f} mm beside it, "
-                f"wants <= {1e3 * allowed:.1f} mm"
-            )
-            settings = dataclasses.replace(settings, entry=(e, f, g), entry_std=math.inf)
-    if math.isfinite(settings.heading_std):
-        angle = math.acos(min(1.0, max(-1.0, float(free.heading @ np.asarray(settings.heading)))))
-        allowed = _CONTRADICTION * math.hypot(settings.heading_std, float(free.heading_std))
-        if angle > allowed:
-            warnings.append(
-                f"the heading was not used: the tips start {math.degrees(angle):.1f} deg off it, "
-                f"wants <= {math.degrees(allowed):.1f} deg"
-            )
-            settings = dataclasses.replace(settings, heading=(x, y, z), heading_std=math.inf)
-    return CheckedFit(fit_curvature(tips, insertion, settings), tuple(warnings))
-
-
-def circle_curvature(tips: npt.ArrayLike) -> Array:
-    """Return the curvature of the least-squares circle through tips ([KC09] IV-B), biased.
-
-    The plane of the tips is that of their two largest principal axes, the circle the algebraic one
-    that minimises the sum of (|p - c|^2 - r^2)^2. Noise along a short arc looks like curvature: at
-    60 mm, +-1 mm, the result is a quarter too large. Use `fit_curvature`.
-
-    Parameters
-    ----------
-    tips : array_like, shape (..., K, 3)
-        Measured tips [m].
-
-    Returns
-    -------
-    ndarray, shape (...)
-        1 / r [1/m].
-    """
-    tips = np.asarray(tips, dtype=float)
-    centred = tips - np.mean(tips, axis=-2, keepdims=True)
-    _, _, axes = np.linalg.svd(centred, full_matrices=False)
-    flat = centred @ np.swapaxes(axes[..., :2, :], -1, -2)
-    squared = np.sum(flat**2, axis=-1)
-    design = np.concatenate([2.0 * flat, np.ones_like(flat[..., :1])], axis=-1)
-    transposed = np.swapaxes(design, -1, -2)
-    solution = np.linalg.solve(transposed @ design, transposed @ squared[..., None])[..., 0]
-    radius = np.sqrt(solution[..., 2] + np.sum(solution[..., :2] ** 2, axis=-1))
-    return np.asarray(1.0 / radius)
-
-
-def _checked_tips(tips: npt.ArrayLike) -> Array:
+def checked_tips(tips: npt.ArrayLike) -> Array:
+    """Return tips as an array, shape (..., K, 3); raises UserError for too few or not finite."""
     tips = np.asarray(tips, dtype=float)
     count = tips.shape[-2] if tips.ndim >= 2 else 0
     if count < FEWEST_TIPS:
@@ -357,69 +262,6 @@ def _check_length(length: Array) -> None:
         )
 
 
-def _frame(heading: Array) -> Array:
-    """Return axes (as columns) of which the third is a heading."""
-    aside = np.eye(3)[np.argmin(np.abs(heading))]
-    first = np.cross(aside, heading)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(heading, first), heading], axis=-1)
-
-
-def _headings(angles: Array) -> Array:
-    """Return the frames whose third axis is turned by two angles, shape (..., 3, 3)."""
-    return rotation_exp(_with_zero(angles))
-
-
-def _with_zero(angles: Array) -> Array:
-    return np.concatenate([angles, np.zeros_like(angles[..., :1])], axis=-1)
-
-
-def _arc_points(unknowns: Array, length: Array) -> tuple[Array, Array, Array]:
-    """Return points on the arcs, (..., K, 3), derivatives, (..., K, 3, 7), and tangents."""
-    bend = unknowns[..., None, _BEND]
-    rotation = _headings(unknowns[..., _HEADING])[..., None, :, :]
-    q = np.sum(bend**2, axis=-1) * length**2
-    along, across, d_along, d_across = _arc_factors(q)
-    local = np.concatenate(
-        [bend * (across * length**2)[..., None], (along * length)[..., None]], axis=-1
-    )
-    turned = np.einsum("...ij,...j->...i", rotation, local)
-    slopes = np.zeros((*turned.shape, _UNKNOWNS))
-    slopes[..., _ENTRY] = np.eye(3)
-    turning = left_jacobian(_with_zero(unknowns[..., _HEADING]))[..., None, :, :2]
-    slopes[..., _HEADING] = -cross_matrix(turned) @ turning
-    for i in range(2):
-        dq = 2.0 * bend[..., i] * length**2
-        d_local = bend * (d_across * dq * length**2)[..., None]
-        d_local[..., i] += across * length**2
-        whole = np.concatenate([d_local, (d_along * dq * length)[..., None]], axis=-1)
-        slopes[..., 5 + i] = np.einsum("...ij,...j->...i", rotation, whole)
-    sides = bend * (along * length)[..., None]
-    ahead = 1.0 - (across * q)[..., None]
-    tangent = np.einsum("...ij,...j->...i", rotation, np.concatenate([sides, ahead], axis=-1))
-    return unknowns[..., None, _ENTRY] + turned, slopes, tangent
-
-
-def _arc_factors(q: Array) -> tuple[Array, Array, Array, Array]:
-    """Return sin(a)/a, (1 - cos(a))/a^2 of q = a^2 and their derivatives by q."""
-    small = q < _SERIES_BELOW
-    safe = np.where(small, 1.0, q)
-    a = np.sqrt(safe)
-    along = np.where(small, 1.0 - q / 6.0 * (1.0 - q / 20.0 * (1.0 - q / 42.0)), np.sin(a) / a)
-    across = np.where(
-        small,
-        0.5 * (1.0 - q / 12.0 * (1.0 - q / 30.0 * (1.0 - q / 56.0))),
-        2.0 * (np.sin(0.5 * a) / a) ** 2,
-    )
-    d_along = np.where(
-        small, -1.0 / 6.0 + q / 60.0 - q * q / 1680.0, (np.cos(a) - along) / (2.0 * safe)
-    )
-    d_across = np.where(
-        small, -1.0 / 24.0 + q / 360.0 - q * q / 13440.0, (along - 2.0 * across) / (2.0 * safe)
-    )
-    return along, across, d_along, d_across
-
-
 def _noise(residual: Array, weights: Array, *, directions: int, robust: bool) -> Array:
     """Return the standard deviation of one coordinate, from the tips that are no outliers."""
     squared = np.sum(residual**2, axis=-1)
@@ -427,7 +269,7 @@ def _noise(residual: Array, weights: Array, *, directions: int, robust: bool) ->
         variance = np.median(squared, axis=-1) / _MEDIAN_SQUARED[directions]
     else:
         good = weights >= 1.0
-        degrees = np.maximum(directions * np.sum(good, axis=-1) - _UNKNOWNS, 1.0)
+        degrees = np.maximum(directions * np.sum(good, axis=-1) - UNKNOWNS, 1.0)
         variance = np.sum(np.where(good, squared, 0.0), axis=-1) / degrees
     return np.asarray(np.sqrt(np.maximum(variance, _SMALLEST_NOISE**2)))
 

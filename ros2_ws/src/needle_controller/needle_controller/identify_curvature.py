@@ -21,13 +21,10 @@ from needle_common.cli import (
     write_json,
 )
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_controller.circle_fit import circle_curvature
+from needle_controller.curvature_checks import CheckedFit, fit_checked
 from needle_controller.curvature_data import InsertionRecord, read_record
-from needle_controller.curvature_fit import (
-    CheckedFit,
-    CurvatureFitSettings,
-    circle_curvature,
-    fit_checked,
-)
+from needle_controller.curvature_fit import CurvatureFitSettings
 
 DESCRIPTION = """\
 Find the curvature of the needle's path in a tissue, from an insertion without rotation.
@@ -57,6 +54,8 @@ examples:
       only what was inserted before the base began to turn
   ros2 run needle_controller identify_curvature tips.csv --entry-std-mm inf --heading-std-deg inf
       nothing is known of the entry but the tips
+  ros2 run needle_controller identify_curvature bags/insertion --from-mm 5
+      without the first tips of stereo_tracker: before it sees the needle it says where it must be
 
 exit codes: 0 done, 1 the tips cannot tell the path from a straight line, 2 bad input (turned on the
 way, too short, not finite, ...), 130 interrupted.
@@ -74,6 +73,7 @@ class Options:
     until_mm: float
     entry_std_mm: float
     heading_std_deg: float
+    repeating_error_mm: float
     rotation_tolerance_deg: float
 
 
@@ -111,6 +111,13 @@ def parse(arguments: Sequence[str]) -> Options:
         help="how well it is known that it enters along rig's z axis; inf: not at all (default: 5)",
     )
     add(
+        "--repeating-error-mm",
+        default="0.02",
+        metavar="E",
+        help="what all tips may be off together, as by a calibration's error: more tips do not "
+        "make it smaller (default: 0.02)",
+    )
+    add(
         "--rotation-tolerance-deg",
         default="1",
         metavar="R",
@@ -127,6 +134,9 @@ def parse(arguments: Sequence[str]) -> Options:
         until_mm=_number("--until-mm", given.until_mm, 0.0, math.inf, "mm"),
         entry_std_mm=_number("--entry-std-mm", given.entry_std_mm, 0.001, math.inf, "mm"),
         heading_std_deg=_number("--heading-std-deg", given.heading_std_deg, 0.01, math.inf, "deg"),
+        repeating_error_mm=_number(
+            "--repeating-error-mm", given.repeating_error_mm, 0.0, 100.0, "mm"
+        ),
         rotation_tolerance_deg=_number(
             "--rotation-tolerance-deg", given.rotation_tolerance_deg, 0.0, 10.0, "deg"
         ),
@@ -139,7 +149,9 @@ def identify(options: Options) -> tuple[InsertionRecord, CheckedFit]:
     record = record.between(options.from_mm * 1e-3, options.until_mm * 1e-3)
     record.check_pure(math.radians(options.rotation_tolerance_deg))
     settings = CurvatureFitSettings(
-        entry_std=options.entry_std_mm * 1e-3, heading_std=math.radians(options.heading_std_deg)
+        entry_std=options.entry_std_mm * 1e-3,
+        heading_std=math.radians(options.heading_std_deg),
+        repeating_error=options.repeating_error_mm * 1e-3,
     )
     try:
         return record, fit_checked(record.tips, record.insertion, settings)
@@ -198,7 +210,7 @@ def _run(arguments: Sequence[str]) -> int:
     print(f"curvature: {float(fit.curvature):.4g}  # 1/m, +- {float(fit.std):.2g}")
     print(
         f"{values['tips']} tips over {float(values['arc_mm'] or 0.0):.1f} mm, "
-        f"{values['outliers']} of them outliers, noise {1e3 * float(fit.measurement_std):.2f} mm"
+        f"{values['outliers']} of them outliers, noise {1e3 * float(fit.measurement_std):.3f} mm"
     )
     if not math.isfinite(high):
         print("the tips cannot tell this path from a straight line: insert deeper")

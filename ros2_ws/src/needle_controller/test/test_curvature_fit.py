@@ -16,15 +16,12 @@ from scipy.spatial.transform import Rotation
 
 from needle_common.errors import UserError
 from needle_controller.arrays import Array
+from needle_controller.circle_fit import circle_curvature
+from needle_controller.curvature_checks import fit_checked
 from needle_controller.curvature_data import read_record
-from needle_controller.curvature_fit import (
-    CurvatureFitSettings,
-    _arc_points,
-    circle_curvature,
-    fit_checked,
-    fit_curvature,
-)
+from needle_controller.curvature_fit import CurvatureFitSettings, fit_curvature
 from needle_controller.identify_curvature import main
+from needle_controller.insertion_arc import arc_points
 from needle_sim.plant import NeedlePlant
 
 RADIUS = 0.122
@@ -57,12 +54,12 @@ def uniform(tips: Array, rng: Generator) -> Array:
 def test_arc_points_and_slopes() -> None:
     unknowns = np.array([1e-3, -2e-3, 5e-4, 0.2, -0.1, 5.0, -6.0])
     length, h = np.linspace(0.0, 0.1, 7), 1e-6
-    points, slopes, tangents = _arc_points(unknowns, length)
+    points, slopes, tangents = arc_points(unknowns, length)
     for i in range(7):
         d = np.eye(7)[i] * h
-        high, low = (_arc_points(unknowns + s * d, length)[0] for s in (1.0, -1.0))
+        high, low = (arc_points(unknowns + s * d, length)[0] for s in (1.0, -1.0))
         np.testing.assert_allclose(slopes[..., i], (high - low) / (2 * h), rtol=1e-5, atol=1e-9)
-    high, low = (_arc_points(unknowns, length + s * h)[0] for s in (1.0, -1.0))
+    high, low = (arc_points(unknowns, length + s * h)[0] for s in (1.0, -1.0))
     np.testing.assert_allclose(tangents, (high - low) / (2 * h), atol=1e-8)
     # On a circle of radius 1 / |b|: chords.
     chord = np.linalg.norm(points[-1] - points[0])
@@ -382,3 +379,17 @@ def test_bags_without_a_needle_are_one_line(
     error = capsys.readouterr().err
     assert "cannot be read" in error
     assert error.count("\n") == 1
+
+
+def test_errors_that_repeat_widen_the_interval_and_more_tips_do_not_help() -> None:
+    """Exact tips, all bowed by 0.02 mm: the residuals are next to nothing, the curvature is off."""
+    for count in (61, 601):
+        insertion = np.linspace(0.0, 0.06, count)
+        angle = insertion / RADIUS
+        tips = RADIUS * np.stack([np.zeros(count), 1.0 - np.cos(angle), np.sin(angle)], axis=-1)
+        tips[:, 1] += 2e-5 * 4.0 * (insertion / 0.06) * (insertion / 0.06 - 1.0)
+        narrow = fit_curvature(tips, insertion)
+        honest = fit_curvature(tips, insertion, CurvatureFitSettings(repeating_error=2e-5))
+        off = abs(float(honest.curvature) - 1.0 / RADIUS)
+        assert float(narrow.std) < 0.5 * off
+        assert off < 1.96 * float(honest.std) < 0.1
