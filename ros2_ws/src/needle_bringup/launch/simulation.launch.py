@@ -1,4 +1,4 @@
-"""The simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
+"""The simulated rig: sim_rig, tracker, controller; for ROS 2 Jazzy with `ros2 launch`.
 
     ros2 launch needle_bringup simulation.launch.py level:=tip operator:=true bag:=bags/by_launch
 
@@ -24,6 +24,7 @@ def generate_launch_description() -> LaunchDescription:
     rig = str(Path(get_package_share_directory("needle_bringup")) / "config" / "rig.yaml")
     params = LaunchConfiguration("params")
     sim_time = {"use_sim_time": True}
+    with_drives = LaunchConfigurationEquals("level", "drive")
     operator = Node(
         package="needle_bringup",
         executable="operator",
@@ -33,7 +34,7 @@ def generate_launch_description() -> LaunchDescription:
     )
     return LaunchDescription(
         [
-            DeclareLaunchArgument("level", default_value="camera", description="tip or camera"),
+            DeclareLaunchArgument("level", default_value="camera", description="tip, camera or drive"),
             DeclareLaunchArgument("seed", default_value="1", description="seed of all noise"),
             DeclareLaunchArgument(
                 "real_time_factor", default_value="1.0", description="0.0: lock step"
@@ -45,6 +46,11 @@ def generate_launch_description() -> LaunchDescription:
                 "operator", default_value="false", description="let the stand-in keep the hold"
             ),
             DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
+            DeclareLaunchArgument(
+                "can",
+                default_value="/tmp/needle_can",
+                description="level drive: where the emulated CAN adapter appears",
+            ),
             DeclareLaunchArgument(
                 "params", default_value=rig, description="parameter file on top of rig.yaml"
             ),
@@ -76,7 +82,31 @@ def generate_launch_description() -> LaunchDescription:
                 executable="stereo_tracker",
                 parameters=[rig, params, sim_time],
                 output="screen",
-                condition=LaunchConfigurationEquals("level", "camera"),
+                condition=LaunchConfigurationNotEquals("level", "tip"),
+            ),
+            Node(
+                package="needle_sim",
+                executable="drive_emulator",
+                parameters=[
+                    rig,
+                    params,
+                    sim_time,
+                    {"pty": LaunchConfiguration("can"), "motion_clock": "sync"},
+                ],
+                output="screen",
+                condition=with_drives,
+            ),
+            Node(
+                package="needle_device_driver",
+                executable="device_driver",
+                parameters=[
+                    rig,
+                    params,
+                    sim_time,
+                    {"link": "slcan", "channel": LaunchConfiguration("can")},
+                ],
+                output="screen",
+                condition=with_drives,
             ),
             Node(
                 package="needle_controller",

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +17,21 @@ from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 
 RIG_FILE = "config/rig.yaml"
-NODES = ("recorder", "sim_rig", "stereo_tracker", "plane_controller", "operator")
+NODES = (
+    "recorder",
+    "sim_rig",
+    "drive_emulator",
+    "device_driver",
+    "stereo_tracker",
+    "plane_controller",
+    "operator",
+)
+# Nodes that not every level runs -> the levels that do.
+_LEVELS = {
+    "drive_emulator": ("drive",),
+    "device_driver": ("drive",),
+    "stereo_tracker": ("camera", "drive"),
+}
 
 # A sensor without noise still has this bound for the controllers' design [m].
 SMALLEST_NOISE = 1e-5
@@ -30,6 +46,7 @@ OPTIONS = {
     "torsion_play": "--play-deg",
     "torsion_lag": "--lag-mm",
     "real_time_factor": "--real-time-factor",
+    "lock_step": "--real-time-factor",
     "tip_noise": "--noise-mm",
     "tip_covariance": "--noise-mm",
     "tip_noise_bound": "--noise-mm",
@@ -85,7 +102,7 @@ def merge(*layers: Parameters) -> Parameters:
 
 def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
     """Return the nodes that a run needs."""
-    return tuple(n for n in NODES if n != "stereo_tracker" or options.level != "tip")
+    return tuple(node for node in NODES if options.level in _LEVELS.get(node, (options.level,)))
 
 
 def rig_parameters() -> Parameters:
@@ -118,6 +135,14 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     parameters: Parameters = {
         "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
         "sim_rig": sim_rig,
+        # Motors that move by a SYNC period with every SYNC repeat a run to the count.
+        "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},
+        "device_driver": {
+            "link": "slcan",
+            "channel": str(can_adapter()),
+            "lock_step": options.real_time_factor == 0.0,
+            "autostart": True,
+        },
         "stereo_tracker": {},
         "plane_controller": {
             "preset": options.controller,
@@ -137,6 +162,11 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     for node, values in parameters.items():
         values["use_sim_time"] = node != "recorder"
     return {node: parameters[node] for node in nodes_of(options)}
+
+
+def can_adapter() -> Path:
+    """Return where this process' emulated CAN adapter is plugged in; gone when it has ended."""
+    return Path(tempfile.gettempdir()) / f"needle_can_{os.getpid()}"
 
 
 def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> None:

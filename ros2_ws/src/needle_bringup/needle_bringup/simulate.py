@@ -42,6 +42,8 @@ from needle_common.errors import UserError
 PACKAGES = {
     "recorder": "needle_bringup",
     "sim_rig": "needle_sim",
+    "drive_emulator": "needle_sim",
+    "device_driver": "needle_device_driver",
     "stereo_tracker": "needle_tracker",
     "plane_controller": "needle_controller",
     "operator": "needle_bringup",

@@ -14,10 +14,10 @@ from needle_common.errors import OutOfBoundsError, UserError
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
 
-Starts recorder, sim_rig, stereo_tracker, plane_controller and operator as processes of their own,
-shows how far the needle is in, and leaves a folder that holds the bag (open it with rosbags, mcap,
-Foxglove, PlotJuggler or `ros2 bag`), report.html with its figures, summary.json, the parameters and
-the nodes' logs.
+Starts recorder, sim_rig, stereo_tracker, plane_controller and operator (at level drive also
+drive_emulator and device_driver) as processes of their own, shows how far the needle is in, and
+leaves a folder that holds the bag (open it with rosbags, mcap, Foxglove, PlotJuggler or
+`ros2 bag`), report.html with its figures, summary.json, the parameters and the nodes' logs.
 """
 
 EPILOG = """\
@@ -26,6 +26,8 @@ examples:
       camera images, controller best, start 3 mm beside the plane, 120 mm deep
   scripts/simulate --level tip --seed 7
       no images: the tip is measured with the paper's +-1 mm noise; quicker
+  scripts/simulate --level drive
+      camera images, and the device driver moves two emulated CANopen drives
   scripts/simulate --controller open_loop --level tip --noise-mm 0
       no steering: where the needle goes by itself (14.6 mm beside the plane; exit code 1)
   scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
@@ -38,8 +40,7 @@ exit codes: 0 converged (|r1| <= 1 mm at the end), 1 ran but missed, 2 bad input
 missing, 130 interrupted.
 """
 
-LEVELS = ("tip", "camera")
-LATER_LEVELS = ("drive",)
+LEVELS = ("tip", "camera", "drive")
 CONTROLLERS = ("best", "paper", "open_loop")
 
 
@@ -77,8 +78,8 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         Anything that cannot be run as asked.
     """
     given = _parser().parse_args(_join_initial(arguments))
-    _one_of("--level", given.level, LEVELS, LATER_LEVELS)
-    _one_of("--controller", given.controller, CONTROLLERS, ())
+    _one_of("--level", given.level, LEVELS)
+    _one_of("--controller", given.controller, CONTROLLERS)
     noise = None
     if given.level == "tip":
         noise = _number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
@@ -118,7 +119,8 @@ def _parser() -> argparse.ArgumentParser:
         default="camera",
         metavar="tip|camera|drive",
         help="what is simulated: only "
-        "the tip's measurement, or the stereo images of it (default: camera; drive comes later)",
+        "the tip's measurement, the stereo images of it, or also the drives that the device driver "
+        "moves over a CAN bus (default: camera)",
     )
     add(
         "--controller",
@@ -181,9 +183,7 @@ def _join_initial(arguments: Sequence[str]) -> list[str]:
     return joined
 
 
-def _one_of(name: str, value: str, known: Sequence[str], later: Sequence[str]) -> None:
-    if value in later:
-        raise UserError(f"{name} {value} does not exist yet; there is {', '.join(known)}")
+def _one_of(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
         raise UserError(f"{name} {value!r} is not one of {', '.join(known)}")
 

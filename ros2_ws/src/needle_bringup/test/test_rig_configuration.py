@@ -26,8 +26,19 @@ def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
 
 
 def test_only_the_nodes_of_the_level_run() -> None:
-    assert "stereo_tracker" not in nodes_of(SimulateOptions(level="tip"))
-    assert "stereo_tracker" in nodes_of(SimulateOptions(level="camera"))
+    everywhere = {"recorder", "sim_rig", "plane_controller", "operator"}
+    assert set(nodes_of(SimulateOptions(level="tip"))) == everywhere
+    assert set(nodes_of(SimulateOptions(level="camera"))) == everywhere | {"stereo_tracker"}
+    drives = {"drive_emulator", "device_driver"}
+    assert set(nodes_of(SimulateOptions(level="drive"))) == everywhere | {"stereo_tracker"} | drives
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+def test_driver_and_drives_meet_and_a_lapse_pauses_in_lock_step_only(factor: float) -> None:
+    options = SimulateOptions(level="drive", real_time_factor=factor)
+    parameters = command_line_parameters(options, Path("bags/x"))
+    assert parameters["device_driver"]["channel"] == parameters["drive_emulator"]["pty"]
+    assert parameters["device_driver"]["lock_step"] is (factor == 0.0)
 
 
 def test_later_layers_win_one_parameter_at_a_time() -> None:

@@ -28,7 +28,6 @@ def test_noise_belongs_to_level_tip() -> None:
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (["--level", "drive"], "does not exist yet"),
         (["--controller", "worst"], "worst"),
         (["--level", "x"], "'x'"),
         (["--initial", "-3,2"], "X_MM,PITCH_DEG,ROLL_DEG"),
