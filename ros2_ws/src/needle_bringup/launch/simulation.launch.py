@@ -1,4 +1,4 @@
-"""The simulated rig: sim_rig, tracker, controller; for ROS 2 Jazzy with `ros2 launch`.
+"""The simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
 
     ros2 launch needle_bringup simulation.launch.py level:=tip operator:=true bag:=bags/by_launch
 
@@ -12,7 +12,7 @@ from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandle
 from launch.conditions import IfCondition, LaunchConfigurationEquals, LaunchConfigurationNotEquals
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PythonExpression
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -34,7 +34,9 @@ def generate_launch_description() -> LaunchDescription:
     )
     return LaunchDescription(
         [
-            DeclareLaunchArgument("level", default_value="camera", description="tip, camera or drive"),
+            DeclareLaunchArgument(
+                "level", default_value="camera", description="tip, camera or drive"
+            ),
             DeclareLaunchArgument("seed", default_value="1", description="seed of all noise"),
             DeclareLaunchArgument(
                 "real_time_factor", default_value="1.0", description="0.0: lock step"
@@ -103,7 +105,14 @@ def generate_launch_description() -> LaunchDescription:
                     rig,
                     params,
                     sim_time,
-                    {"link": "slcan", "channel": LaunchConfiguration("can")},
+                    {
+                        "link": "slcan",
+                        "channel": LaunchConfiguration("can"),
+                        "lock_step": ParameterValue(
+                            PythonExpression([LaunchConfiguration("real_time_factor"), " == 0.0"]),
+                            value_type=bool,
+                        ),
+                    },
                 ],
                 output="screen",
                 condition=with_drives,

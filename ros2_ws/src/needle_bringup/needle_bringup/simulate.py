@@ -232,10 +232,15 @@ def _first_dead(nodes: dict[str, NodeProcess]) -> NodeProcess | None:
 
 
 def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
-    """End the operator, then the others, then the recorder that still records their ends."""
+    """End the operator, then the others, then the recorder that still records their ends.
+
+    The driver switches the drives off before they, too, are gone.
+    """
     operator, recorder = nodes.get("operator"), nodes.get("recorder")
-    rest = [node for node in nodes.values() if node not in (operator, recorder)]
+    driver = nodes.get("device_driver")
+    rest = [node for node in nodes.values() if node not in (operator, driver, recorder)]
     warnings = stop([operator]) if operator else []
+    warnings += stop([driver]) if driver else []
     warnings += stop(rest)
     warnings += stop([recorder], RECORDER_GRACE) if recorder else []
     for warning in warnings:
