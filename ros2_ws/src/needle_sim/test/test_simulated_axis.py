@@ -82,17 +82,20 @@ def test_homing_goes_to_zero_and_is_not_homed_until_there() -> None:
 
 def test_the_needle_moves_by_what_the_axes_did() -> None:
     bench = make_bench()
-    for axis, target in ((bench.insertion, 0.001), (bench.rotation, 0.3)):
+    axes = SimulatedAxis("insertion"), SimulatedAxis("rotation")
+    for axis, target in zip(axes, (0.001, 0.3), strict=True):
         axis.configure()
         axis.power(True)
         axis.start_move(target, target / 0.5)
     for _ in range(25):
-        bench.advance(PERIOD)
+        for axis in axes:
+            axis.advance(PERIOD)
+        bench.move_to(axes[0].position, axes[1].position)
     assert bench.plant.insertion == pytest.approx(0.001)
     assert bench.plant.rotation == pytest.approx(0.3)
-    bench.insertion.close()
+    assert (bench.insertion, bench.rotation) == (0.001, 0.3)
     tip = bench.tip
-    bench.advance(PERIOD)
+    bench.move_to(0.001, 0.3)
     np.testing.assert_array_equal(bench.tip, tip)
 
 
