@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -28,6 +29,10 @@ class Command:
 
     virtual_input: Array
     rotation_rate: Array
+
+
+StepLaw = Callable[[Estimate, float], Command]
+"""Takes the estimate and the insertion it is of [m]."""
 
 
 class Law(Protocol):

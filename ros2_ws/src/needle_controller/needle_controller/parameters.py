@@ -30,7 +30,8 @@ class PlaneControllerParameters:
         ControlSettings.preset,
         unit="-",
         description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
-        "open_loop = no rotation.",
+        "open_loop = no rotation; for comparison: kalman = time-varying gain and that law, "
+        "extended_kalman and orientation_fit = estimators of the full pose and roll law.",
         choices=PRESETS,
     )
     curvature: float = parameter(

@@ -2,30 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import numpy.typing as npt
 
 from needle_common.errors import UserError
 from needle_controller.best import BestSettings, make_best
-from needle_controller.control_settings import ControlSettings
-from needle_controller.estimator import Estimate, Estimator
+from needle_controller.control_settings import OTHER_PRESETS, ControlSettings
+from needle_controller.estimator import Estimator
 from needle_controller.filter_settings import FilterSettings
 from needle_controller.flip_plan import FlipPlan
 from needle_controller.gains import Gains
-from needle_controller.law import Command, Law, LinearizingLaw, OpenLoopLaw
+from needle_controller.law import Law, LinearizingLaw, OpenLoopLaw, StepLaw
 from needle_controller.luenberger import LuenbergerObserver, LuenbergerSettings
+from needle_controller.other_presets import make_other_controller
 from needle_controller.roll_law import RollLawSettings
-
-StepLaw = Callable[[Estimate, float], Command]
-"""Takes the estimate and the insertion it is of [m]."""
 
 
 def make_law(settings: ControlSettings, gains: Gains) -> Law:
     """Return the law of preset `paper` or `open_loop`."""
-    if settings.preset == "open_loop":
-        return OpenLoopLaw()
+    return OpenLoopLaw() if settings.preset == "open_loop" else linearizing_law(settings, gains)
+
+
+def linearizing_law(settings: ControlSettings, gains: Gains) -> LinearizingLaw:
+    """Return the law (7), (10) with these gains."""
     return LinearizingLaw(
         feedback=gains.feedback,
         step_length=settings.step_length,
@@ -86,12 +85,15 @@ def make_controller(
         return estimator, lambda estimate, insertion: roll_law(
             estimate, bend_sign=plan.bend_sign(insertion)
         )
+    gains = settings.gains()
+    if settings.preset in OTHER_PRESETS:
+        law = linearizing_law(settings, gains)
+        return make_other_controller(settings, law, plan, initial_rotation)
     if plan.depths:
         raise UserError(
             f"flip_depths: preset {settings.preset} cannot steer with the bevel flipped (its "
             "coordinates end at roll +-90 deg); best can"
         )
-    gains = settings.gains()
-    law = make_law(settings, gains)
+    paper_law = make_law(settings, gains)
     observer = LuenbergerObserver(observer_settings(settings, gains), initial_rotation)
-    return observer, lambda estimate, _: law(estimate)
+    return observer, lambda estimate, _: paper_law(estimate)

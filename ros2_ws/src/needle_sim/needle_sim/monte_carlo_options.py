@@ -112,7 +112,12 @@ def _parser() -> argparse.ArgumentParser:
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("--controller", required=True, metavar="NAME", help="paper, best or open_loop")
+    add(
+        "--controller",
+        required=True,
+        metavar="NAME",
+        help="best, paper, open_loop, kalman, extended_kalman or orientation_fit",
+    )
     add(
         "--grid",
         default="endpoint",

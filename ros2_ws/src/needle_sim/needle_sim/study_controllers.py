@@ -14,7 +14,8 @@ import numpy as np
 from needle_common.errors import UserError
 from needle_controller.control_settings import PRESETS, ControlSettings
 from needle_controller.estimator import Estimator
-from needle_controller.presets import StepLaw, make_controller
+from needle_controller.law import StepLaw
+from needle_controller.presets import make_controller
 from needle_sim.se3 import FloatArray
 
 CURVATURE = ControlSettings.curvature

@@ -1,0 +1,103 @@
+"""Presets beside `best` and `paper`: the other estimators, each with the law that suits it.
+
+For comparison, in the node and in studies alike; docs/estimators.md says what each is good for.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_controller.bend_side_law import TwoSidedLinearizingLaw
+from needle_controller.control_settings import ControlSettings
+from needle_controller.estimator import Estimate, Estimator
+from needle_controller.extended_kalman import ExtendedKalmanFilter, ExtendedKalmanSettings
+from needle_controller.flip_plan import FlipPlan
+from needle_controller.law import Command, LinearizingLaw, StepLaw
+from needle_controller.linear_observer import LinearObserver, LinearObserverSettings
+from needle_controller.orientation_fit import OrientationFit, OrientationFitSettings
+from needle_controller.roll_law import RollLaw, RollLawSettings
+
+_CURVATURES = 15
+"""Tried by the orientation fit."""
+
+
+def make_other_controller(
+    settings: ControlSettings,
+    law: LinearizingLaw,
+    plan: FlipPlan,
+    initial_rotation: npt.ArrayLike,
+) -> tuple[Estimator, StepLaw]:
+    """Return estimator and law of `kalman`, `extended_kalman` or `orientation_fit`.
+
+    Parameters
+    ----------
+    settings : ControlSettings
+        The preset and its numbers.
+    law : LinearizingLaw
+        (7) and (10), for `kalman`.
+    plan : FlipPlan
+        Where the bevel is flipped.
+    initial_rotation : array_like, shape (3, 3)
+        Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
+    """
+    if settings.preset == "kalman":
+        return _kalman(settings, law, plan, initial_rotation)
+    estimator: Estimator
+    if settings.preset == "extended_kalman":
+        estimator = ExtendedKalmanFilter(
+            ExtendedKalmanSettings(
+                curvature=settings.curvature,
+                measurement_std=settings.measurement_std,
+                initial_roll_std=settings.initial_roll_std,
+            ),
+            initial_rotation,
+        )
+    else:
+        estimator = OrientationFit(
+            OrientationFitSettings(
+                curvature=settings.curvature,
+                measurement_std=settings.measurement_std,
+                initial_roll_std=settings.initial_roll_std,
+                entry_std=settings.measurement_std,
+                curvatures=_CURVATURES,
+            ),
+            initial_rotation,
+        )
+    roll_law = RollLaw(
+        RollLawSettings(
+            step_length=settings.step_length,
+            max_rotation_per_length=settings.max_rotation_per_length,
+        )
+    )
+    if not plan.depths:
+        return estimator, lambda estimate, _: roll_law(estimate)
+    return estimator, lambda estimate, insertion: roll_law(estimate, plan.bend_sign(insertion))
+
+
+def _kalman(
+    settings: ControlSettings,
+    law: LinearizingLaw,
+    plan: FlipPlan,
+    initial_rotation: npt.ArrayLike,
+) -> tuple[Estimator, StepLaw]:
+    observer = LinearObserver(
+        LinearObserverSettings(
+            curvature=settings.curvature,
+            process_noise=np.diag(settings.process_noise),
+            measurement_std=settings.measurement_std,
+            initial_pitch_std=settings.initial_pitch_std,
+            initial_roll_std=settings.initial_roll_std,
+            initial_yaw_std=settings.initial_yaw_std,
+            saturation_margin=settings.saturation_margin,
+        ),
+        initial_rotation,
+    )
+    two_sided = TwoSidedLinearizingLaw(law)
+
+    def steer(estimate: Estimate, insertion: float) -> Command:
+        sign = plan.bend_sign(insertion) if plan.depths else 0.0
+        observer.flip_to(sign)
+        return two_sided(estimate, sign)
+
+    return observer, steer
