@@ -26,8 +26,10 @@ setup(
         "console_scripts": [
             "recorder = needle_bringup.recorder_node:main",
             "operator = needle_bringup.operator_node:main",
+            "player = needle_bringup.player_node:main",
             "recover = needle_bringup.recover:main",
             "report = needle_bringup.report:main",
+            "rerun = needle_bringup.rerun_node:main",
         ]
     },
 )

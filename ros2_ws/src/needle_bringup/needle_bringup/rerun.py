@@ -1,0 +1,253 @@
+"""A bag's inputs through today's code: one pass over the bag, recorded outputs beside today's."""
+
+from __future__ import annotations
+
+import array
+import dataclasses
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+from rosbags.typesys import Stores, get_typestore
+from tqdm import tqdm
+
+from needle_bringup.bag_images import TOPICS as IMAGE_TOPICS
+from needle_bringup.bag_order import messages_as_sent
+from needle_bringup.bag_reader import Run, Series, nanoseconds
+from needle_bringup.comparison import Record, members
+from needle_bringup.run_summary import reduced_states, target_offset
+
+TIP_TOPICS = ("needle/tip", "needle/tip_pose")
+TYPES: Mapping[str, str] = {
+    "needle/tip": "geometry_msgs/msg/PointStamped",
+    "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "needle/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
+    "needle/reduced_state": "geometry_msgs/msg/Vector3Stamped",
+    "needle/linearized_state": "geometry_msgs/msg/Vector3Stamped",
+    "needle/control_input": "geometry_msgs/msg/Vector3Stamped",
+    "device/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
+}
+"""Relative topic to type of what the stages put out."""
+
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    """A message that today's code puts out.
+
+    Attributes
+    ----------
+    topic : str
+        Relative name.
+    log_time : int
+        When what led to it was received [ns].
+    stamp : int
+        Its own stamp [ns].
+    message : Any
+        The message, as rosbags has it.
+    """
+
+    topic: str
+    log_time: int
+    stamp: int
+    message: Any
+
+    @property
+    def data(self) -> bytes:
+        """The message as CDR."""
+        return bytes(_STORE.serialize_cdr(self.message, TYPES[self.topic]))
+
+
+def stored(value: Any) -> Any:
+    """Return a message of rclpy as rosbags has it (rclpy's own CDR has a tail of chance bytes)."""
+    if hasattr(value, "get_fields_and_field_types"):
+        kind = type(value)
+        name = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
+        fields = value.get_fields_and_field_types()
+        return _STORE.types[name](**{field: stored(getattr(value, field)) for field in fields})
+    if isinstance(value, array.array):
+        return np.array(value)
+    return [stored(element) for element in value] if isinstance(value, list) else value
+
+
+class Stage(Protocol):
+    """A part of the rig that takes messages and puts some out."""
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """Names of what it takes, relative to the rig's namespace, or absolute."""
+        ...
+
+    def take(self, topic: str, log_time: int, message: Any) -> list[Output]:
+        """Take a message received at `log_time` [ns]; return what it led to."""
+        ...
+
+
+class FinishingStage(Stage, Protocol):
+    """A stage that may have something left when the bag ends."""
+
+    def finish(self, log_time: int) -> list[Output]:
+        """Return what is left."""
+        ...
+
+
+@dataclasses.dataclass(frozen=True)
+class Rerun:
+    """Both sides of a bag that was run again.
+
+    Attributes
+    ----------
+    recorded, today : list of Record
+        What is compared.
+    outputs : list of Output
+        Today's, as they came.
+    tips_without_images : int
+        Recorded answers of the tracker whose images are not in the bag.
+    """
+
+    recorded: list[Record]
+    today: list[Record]
+    outputs: list[Output]
+    tips_without_images: int
+
+
+def has_images(run: Run) -> bool:
+    """Return whether a bag has images of both cameras."""
+    sides = {side for topic, side in IMAGE_TOPICS.items() if run.topics.get(run.namespace + topic)}
+    return len(sides) == 2
+
+
+def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None) -> Rerun:
+    """Take a bag through the stages.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its bag is read again.
+    tracker : FinishingStage or None
+        What takes the images; None without images.
+    controller : Stage or None
+        What takes the tips, as recorded; None where no controller was recorded.
+
+    Returns
+    -------
+    Rerun
+        Outputs beside the recorded ones.
+
+    Raises
+    ------
+    UserError
+        If the bag is broken.
+    """
+    watched: set[str] = set()
+    if tracker is not None:
+        watched.update(TIP_TOPICS)
+    if controller is not None:
+        watched.update(topic for topic in TYPES if topic not in TIP_TOPICS)
+    stages = [stage for stage in (tracker, controller) if stage is not None]
+    recorded: list[Record] = []
+    outputs: list[Output] = []
+    exposed: set[int] = set()
+    without_images = last_time = 0
+    for topic, log_time, message in _inputs(run, watched, stages):
+        last_time = log_time
+        if IMAGE_TOPICS.get(topic) == "left":
+            exposed.add(nanoseconds(message.header.stamp))
+        if topic in watched:
+            stamp = nanoseconds(message.header.stamp)
+            recorded.append(Record(topic, stamp, dict(members(message))))
+        for stage in stages:
+            if topic in stage.topics:
+                outputs += stage.take(topic, log_time, message)
+    if tracker is not None:
+        outputs += tracker.finish(last_time)
+        kept = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
+        without_images = sum(record.topic == "needle/tip_pose" for record in recorded) - sum(
+            record.topic == "needle/tip_pose" for record in kept
+        )
+        recorded = kept
+    today = [Record(o.topic, o.stamp, dict(members(o.message))) for o in outputs]
+    return Rerun(recorded, today, outputs, without_images)
+
+
+def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Output]:
+    """Take a bag's joints through the controller with other tips than the recorded ones.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its bag is read again.
+    controller : Stage
+        What takes the tips.
+    answers : sequence of Output
+        What today's tracker said; it stands for the recorded answers of the same stamps.
+
+    Returns
+    -------
+    list of Output
+        What the controller puts out.
+    """
+    stamps = {answer.stamp for answer in answers}
+    waiting = sorted(answers, key=lambda answer: answer.log_time)
+    outputs: list[Output] = []
+    for topic, log_time, message in _inputs(run, set(), [controller]):
+        while waiting and waiting[0].log_time <= log_time:
+            answer = waiting.pop(0)
+            outputs += controller.take(answer.topic, answer.log_time, answer.message)
+        if topic not in TIP_TOPICS or nanoseconds(message.header.stamp) not in stamps:
+            outputs += controller.take(topic, log_time, message)
+    for answer in waiting:
+        outputs += controller.take(answer.topic, answer.log_time, answer.message)
+    return outputs
+
+
+def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[np.float64] | None:
+    """Return the RMS error of r = (x [m], beta [rad], gamma [rad]) against the truth, (3,).
+
+    Parameters
+    ----------
+    run : Run
+        The run, with its truth.
+    outputs : sequence of Output or None
+        Today's; None for the recorded estimates.
+
+    Returns
+    -------
+    ndarray or None
+        None without truth or estimates.
+    """
+    series = run.reduced_state
+    if outputs is not None:
+        found = [o for o in outputs if o.topic == "needle/reduced_state"]
+        rows = [(v.x, v.y, v.z) for v in (output.message.vector for output in found)]
+        stamps = np.array([output.stamp for output in found], np.int64)
+        series = Series(stamps, np.array(rows, np.float64).reshape(-1, 3), stamps)
+    here, there = series.at(run.truth.stamps)
+    if not len(here):
+        return None
+    error = series.values[here] - reduced_states(run.truth, target_offset(run))[there]
+    error[:, 1:] = (error[:, 1:] + np.pi) % (2.0 * np.pi) - np.pi
+    rms: npt.NDArray[np.float64] = np.sqrt(np.mean(error**2, axis=0))
+    return rms
+
+
+def _inputs(run: Run, watched: set[str], stages: Sequence[Stage]) -> Iterator[tuple[str, int, Any]]:
+    """Yield (relative topic, log time, message) of what is watched or taken, with a bar."""
+    relative = watched.union(*(stage.topics for stage in stages))
+    names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
+    messages = messages_as_sent(
+        run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS
+    )
+    bar = tqdm(
+        messages,
+        total=sum(run.topics.get(name, 0) for name in names),
+        unit="message",
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    )
+    for topic, log_time, message in bar:
+        yield names[topic], log_time, message

@@ -1,0 +1,213 @@
+"""`rerun`: a bag's images and tips through today's code, in place of the nodes."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+import yaml
+
+from needle_bringup.bag_reader import Run, read_run
+from needle_bringup.bag_writer import refuse_existing_bag
+from needle_bringup.comparison import compare
+from needle_bringup.controller_rerun_node import ControllerStage
+from needle_bringup.rerun import (
+    TIP_TOPICS,
+    has_images,
+    run_again,
+    run_tips,
+)
+from needle_bringup.rerun_bag import write_rerun
+from needle_bringup.rerun_text import describe, errors_text, flat, tolerance_table
+from needle_bringup.rig_configuration import read_parameters
+from needle_bringup.tracker_rerun_node import TrackerStage
+from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
+from needle_common.errors import UserError
+from needle_controller.control_settings import PRESETS
+from needle_controller.parameters import PlaneControllerParameters
+from needle_tracker.calibration import load_calibration, parse_calibration
+from needle_tracker.parameters import StereoTrackerParameters
+
+DESCRIPTION = """\
+Run a bag again, without a graph and without waiting: its images through today's tracker, its tips
+through today's estimator, law and step protocol, with the parameters and the calibration that were
+recorded. Compare every output with the recorded one, field by field, and say what changed where.
+
+The needle does what it did: joints, tips and the device's answers are the recorded ones.
+"""
+EPILOG = f"""\
+examples:
+  ros2 run needle_bringup rerun bags/my_run
+      does today's code still do the same?
+  ros2 run needle_bringup rerun bags/my_run --preset best
+      what would `best` have seen here, and how would it have turned the needle?
+  ros2 run needle_bringup rerun bags/my_run --params other.yaml --output bags/again
+  ros2 run needle_bringup report bags/my_run bags/again
+      other parameters, and both in one report
+
+tolerances: a value may differ by absolute + relative x recorded
+{tolerance_table()}
+
+exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 130 interrupted.
+"""
+TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
+# What rclpy declares on every node.
+_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+
+P = TypeVar("P")
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see --help")
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A recorded node.
+
+    Attributes
+    ----------
+    name : str
+        Its full name.
+    values : mapping
+        Its parameters, those of --params on top.
+    given : frozenset of str
+        Names of those of --params.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    given: frozenset[str]
+
+    def parameters(self, kind: type[P]) -> P:
+        """Return them as a node's parameter class has them; warn of those it no longer has."""
+        names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+        known = {name: value for name, value in self.values.items() if name in names}
+        unknown = [n for n in self.values if n not in names and not n.startswith(_OF_EVERY_NODE)]
+        refused = self.given.intersection(unknown)
+        if refused:
+            raise UserError(f"--params: {self.name} has no parameter {', '.join(sorted(refused))}")
+        if unknown:
+            text = f"{self.name} no longer has {', '.join(unknown)}: left out"
+            print(f"warning: {text}", file=sys.stderr)
+        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in known.items()}
+        try:
+            return kind(**plain)
+        except UserError as error:
+            raise UserError(f"{self.name}: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `rerun`; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    given = _parser().parse_args(words)
+    if given.json is not None and not given.json.absolute().parent.is_dir():
+        raise UserError(f"--json {given.json}: its folder must exist")
+    if given.output is not None:
+        refuse_existing_bag(given.output)
+    changes = read_parameters(given.params) if given.params is not None else {}
+    if given.preset is not None:
+        if given.preset not in PRESETS:
+            raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
+        changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), "preset": given.preset}}
+    run = read_run(given.bag)
+    tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
+    controller_node = _node(run, CONTROLLER, changes)
+    tracker = None if tracker_node is None else _tracker(run, tracker_node)
+    controller = _controller(controller_node)
+    rerun = run_again(run, tracker, controller)
+    comparison = compare(rerun.recorded, rerun.today)
+
+    print(f"{run.path}: {_summary(tracker, controller, controller_node)}")
+    for note in controller.notes:
+        print(f"note: {note}")
+    if rerun.tips_without_images:
+        print(f"note: {rerun.tips_without_images} recorded tips have no images in the bag")
+    print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
+    for text in (describe(run, comparison), errors_text(run, rerun.outputs)):
+        if text:
+            print(text)
+    if given.json is not None:
+        write_json(given.json, flat(run, comparison, rerun.outputs))
+    if given.output is not None:
+        outputs = rerun.outputs
+        answers = [output for output in outputs if output.topic in TIP_TOPICS]
+        if answers:
+            outputs = [*answers, *run_tips(run, _controller(controller_node), answers)]
+        nodes = [node for node in (tracker_node, controller_node) if node is not None]
+        write_rerun(run, given.output, outputs, {n.name: n.values for n in nodes})
+        print(f"written: {given.output}")
+    return EXIT_MISSED if comparison.changed else EXIT_DONE
+
+
+def _parser() -> _Parser:
+    parser = _Parser(
+        prog="rerun",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="the bag's directory")
+    add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")
+    add("--params", type=Path, metavar="FILE", help="ROS parameter file on top of the recorded")
+    add(
+        "--output",
+        type=Path,
+        metavar="NEW_BAG",
+        help="write a copy of the bag with today's outputs in place of the recorded ones",
+    )
+    add("--json", type=Path, metavar="FILE", help="write the result as one flat JSON object")
+    return parser
+
+
+def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node:
+    found = [full for full in run.parameters if full.rsplit("/", maxsplit=1)[-1] == name]
+    if not found and name not in changes:
+        raise UserError(
+            f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
+            f"with --params"
+        )
+    full_name = found[0] if found else f"{run.namespace}{name}"
+    given = changes.get(name, {})
+    return Node(full_name, {**run.parameters.get(full_name, {}), **given}, frozenset(given))
+
+
+def _tracker(run: Run, node: Node) -> TrackerStage:
+    parameters = node.parameters(StereoTrackerParameters)
+    if "calibration_file" in node.given:
+        calibration = load_calibration(Path(parameters.calibration_file))
+    elif run.calibration:
+        try:
+            calibration = parse_calibration(yaml.safe_load(run.calibration))
+        except (UserError, yaml.YAMLError) as error:
+            raise UserError(f"{run.path}: the calibration in the bag is broken: {error}") from error
+    else:
+        raise UserError(
+            f"{run.path} has images but no calibration: name one with --params "
+            f"({TRACKER}: {{ros__parameters: {{calibration_file: FILE}}}})"
+        )
+    return TrackerStage(calibration, parameters)
+
+
+def _controller(node: Node) -> ControllerStage:
+    return ControllerStage(node.parameters(PlaneControllerParameters), node.name)
+
+
+def _summary(tracker: TrackerStage | None, controller: ControllerStage, node: Node) -> str:
+    pairs = "" if tracker is None else f"{tracker.pairs} image pairs through {TRACKER}, "
+    return f"{pairs}{controller.tips} tips through {CONTROLLER} ({node.values.get('preset')})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())
