@@ -10,7 +10,7 @@ import numpy as np
 from needle_controller.arrays import Array
 from needle_controller.gains import Gains, design_gains
 
-OTHER_PRESETS = ("kalman", "extended_kalman", "orientation_fit")
+OTHER_PRESETS = ("kalman", "measured_pitch", "extended_kalman", "orientation_fit")
 """The other estimators, for comparison; see `other_presets`."""
 PRESETS = ("best", "paper", "open_loop", *OTHER_PRESETS)
 TIP_NOISES = ("bounded", "normal")

@@ -64,11 +64,22 @@ def to_tip(message: PointStamped) -> TipMeasurement:
 
 
 def to_tip_covariance(message: PoseWithCovarianceStamped) -> TipCovariance:
-    """Return the covariance of a measured tip's position as it came, nothing checked."""
+    """Return covariance and direction of a measured tip as they came, nothing checked."""
+    covariance = np.array(message.pose.covariance).reshape(6, 6)
+    q = message.pose.pose.orientation
     return TipCovariance(
         to_nanoseconds(message.header.stamp),
         message.header.frame_id,
-        np.array(message.pose.covariance).reshape(6, 6)[:3, :3],
+        covariance[:3, :3],
+        # The z axis of the pose.
+        direction=np.array(
+            [
+                2.0 * (q.x * q.z + q.w * q.y),
+                2.0 * (q.y * q.z - q.w * q.x),
+                1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+            ]
+        ),
+        direction_covariance=covariance[3:, 3:],
     )
 
 

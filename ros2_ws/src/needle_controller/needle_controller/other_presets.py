@@ -16,6 +16,7 @@ from needle_controller.flip_plan import FlipPlan
 from needle_controller.law import Command, LinearizingLaw, StepLaw
 from needle_controller.linear_observer import LinearObserver, LinearObserverSettings
 from needle_controller.orientation_fit import OrientationFit, OrientationFitSettings
+from needle_controller.pitch_observer import PitchObserver, PitchObserverSettings
 from needle_controller.roll_law import RollLaw, RollLawSettings
 
 _CURVATURES = 15
@@ -28,21 +29,21 @@ def make_other_controller(
     plan: FlipPlan,
     initial_rotation: npt.ArrayLike,
 ) -> tuple[Estimator, StepLaw]:
-    """Return estimator and law of `kalman`, `extended_kalman` or `orientation_fit`.
+    """Return estimator and law of one of `control_settings.OTHER_PRESETS`.
 
     Parameters
     ----------
     settings : ControlSettings
         The preset and its numbers.
     law : LinearizingLaw
-        (7) and (10), for `kalman`.
+        (7) and (10), for `kalman` and `measured_pitch`.
     plan : FlipPlan
         Where the bevel is flipped.
     initial_rotation : array_like, shape (3, 3)
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
     """
-    if settings.preset == "kalman":
-        return _kalman(settings, law, plan, initial_rotation)
+    if settings.preset in {"kalman", "measured_pitch"}:
+        return _on_linear_system(settings, law, plan, initial_rotation)
     estimator: Estimator
     if settings.preset == "extended_kalman":
         estimator = ExtendedKalmanFilter(
@@ -75,23 +76,25 @@ def make_other_controller(
     return estimator, lambda estimate, insertion: roll_law(estimate, plan.bend_sign(insertion))
 
 
-def _kalman(
+def _on_linear_system(
     settings: ControlSettings,
     law: LinearizingLaw,
     plan: FlipPlan,
     initial_rotation: npt.ArrayLike,
 ) -> tuple[Estimator, StepLaw]:
-    observer = LinearObserver(
-        LinearObserverSettings(
-            curvature=settings.curvature,
-            process_noise=np.diag(settings.process_noise),
-            measurement_std=settings.measurement_std,
-            initial_pitch_std=settings.initial_pitch_std,
-            initial_roll_std=settings.initial_roll_std,
-            initial_yaw_std=settings.initial_yaw_std,
-            saturation_margin=settings.saturation_margin,
-        ),
-        initial_rotation,
+    linear = LinearObserverSettings(
+        curvature=settings.curvature,
+        process_noise=np.diag(settings.process_noise),
+        measurement_std=settings.measurement_std,
+        initial_pitch_std=settings.initial_pitch_std,
+        initial_roll_std=settings.initial_roll_std,
+        initial_yaw_std=settings.initial_yaw_std,
+        saturation_margin=settings.saturation_margin,
+    )
+    observer = (
+        LinearObserver(linear, initial_rotation)
+        if settings.preset == "kalman"
+        else PitchObserver(PitchObserverSettings(linear), initial_rotation)
     )
     two_sided = TwoSidedLinearizingLaw(law)
 

@@ -31,6 +31,7 @@ class PlaneControllerParameters:
         unit="-",
         description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
         "open_loop = no rotation; for comparison: kalman = time-varying gain and that law, "
+        "measured_pitch = reduced-order observer (wants tip_covariance from_tip_pose), "
         "extended_kalman and orientation_fit = estimators of the full pose and roll law.",
         choices=PRESETS,
     )
@@ -216,6 +217,11 @@ class PlaneControllerParameters:
             numbers = getattr(self, name)
             if len(numbers) != 3:
                 raise UserError(f"{name} = {list(numbers)}, wants three numbers, for s1, s2, s3")
+        if self.preset == "measured_pitch" and self.tip_covariance != "from_tip_pose":
+            raise UserError(
+                "preset measured_pitch takes the pitch from needle/tip_pose: wants tip_covariance "
+                f"from_tip_pose, is {self.tip_covariance}"
+            )
         check_within_reach(offset_plane(self.target_offset), self.curvature, self.depth)
         FlipPlan(self.flip_depths).check_within(self.depth)
         self.control().gains()

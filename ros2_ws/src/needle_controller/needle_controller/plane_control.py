@@ -12,8 +12,11 @@ from needle_controller.estimator import Estimate
 from needle_controller.joint_history import JointSample
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.law import Command
+from needle_controller.measured_pitch import measured_pitch
+from needle_controller.pitch_observer import PitchObserver
 from needle_controller.presets import make_controller
 from needle_controller.target_plane import TargetPlane
+from needle_controller.tip_covariance import TipCovariance
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
 
@@ -101,7 +104,7 @@ class PlaneControl:
         return float(np.arctan2(-start[0, 1], start[0, 0]))
 
     def update(
-        self, tip: Array, joints: JointSample, covariance: Array | None = None
+        self, tip: Array, joints: JointSample, known: TipCovariance | None = None
     ) -> ControlUpdate:
         """Take a tip.
 
@@ -111,8 +114,8 @@ class PlaneControl:
             The tip in `rig` [m].
         joints : JointSample
             The joints at its exposure.
-        covariance : ndarray, shape (3, 3), optional
-            Of the tip, in `rig` [m^2]; the configured noise if none is given. `measurement_std`
+        known : TipCovariance, optional
+            How well the tip is known, in `rig`; as configured if none is given. `measurement_std`
             squared is added: no source knows what repeats from tip to tip, nor what the needle's
             model leaves out, and a filter that believes in micrometres holds on to the wrong roll.
 
@@ -122,11 +125,6 @@ class PlaneControl:
             The estimate and what to do next.
         """
         position = self._plane.from_rig(tip)
-        if covariance is None:
-            covariance = self._settings.tip_covariance()
-        else:
-            turn = self._plane.T_plane_rig[:3, :3]
-            covariance = turn @ covariance @ turn.T + np.eye(3) * self._settings.measurement_std**2
         if self._joints is None or self._first_joints is None:
             self._first_joints = joints
             self._estimator.reset(position, np.array([joints.insertion, joints.rotation]))
@@ -134,11 +132,24 @@ class PlaneControl:
             # An encoder at rest may read a count less; drawing out is the protocol's business.
             inserted = max(joints.insertion - self._joints.insertion, 0.0)
             self._estimator.advance(inserted, joints.rotation - self._joints.rotation)
-            self._estimator.correct(position, covariance)
+            self._correct(position, known)
         self._joints = joints
         estimate = self._estimator.estimate()
         turned = joints.rotation - self._first_joints.rotation
         return ControlUpdate(estimate, self._law(estimate, joints.insertion), turned)
+
+    def _correct(self, position: Array, known: TipCovariance | None) -> None:
+        estimator, settings = self._estimator, self._settings
+        if known is None:
+            estimator.correct(position, settings.tip_covariance())
+            return
+        turn = self._plane.T_plane_rig[:3, :3]
+        covariance = turn @ known.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
+        if isinstance(estimator, PitchObserver):
+            pitch = measured_pitch(known.direction, known.direction_covariance, turn)
+            estimator.correct(position, covariance, pitch=pitch)
+        else:
+            estimator.correct(position, covariance)
 
     def _warm_up(self) -> None:
         """Run once what an update runs: compiled code is made here, not at the first tip."""

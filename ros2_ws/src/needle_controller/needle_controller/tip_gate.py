@@ -10,6 +10,7 @@ import numpy as np
 from needle_controller.arrays import Array
 from needle_controller.joint_history import JointSample
 from needle_controller.target_plane import RIG
+from needle_controller.tip_covariance import TipCovariance
 
 STAMP_AHEAD_NS = 1_000_000_000
 """A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
@@ -59,13 +60,13 @@ class AcceptedTip:
         As it came.
     joints : JointSample
         The joints at its exposure.
-    covariance : ndarray, shape (3, 3), or None
-        Of its position in `rig` [m^2]; None for the configured noise.
+    covariance : TipCovariance or None
+        What came with it; None for the configured noise.
     """
 
     tip: TipMeasurement
     joints: JointSample
-    covariance: Array | None = None
+    covariance: TipCovariance | None = None
 
 
 @dataclasses.dataclass(frozen=True)

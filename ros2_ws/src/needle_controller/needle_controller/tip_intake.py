@@ -128,7 +128,7 @@ class TipIntake:
         problem = covariance.problem()
         if problem:
             return None, Refusal(tip, Fault.BAD_COVARIANCE, problem)
-        return AcceptedTip(tip, joints, covariance.matrix), None
+        return AcceptedTip(tip, joints, covariance), None
 
     def _give_up(self, refusal: Refusal) -> Refusal:
         self._pending = None

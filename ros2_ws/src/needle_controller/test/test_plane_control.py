@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from needle_common.errors import UserError
 from needle_controller.arrays import Array
@@ -16,6 +17,7 @@ from needle_controller.joint_history import JointSample
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.plane_control import PlaneControl
 from needle_controller.target_plane import offset_plane
+from needle_controller.tip_covariance import TipCovariance
 from needle_sim.plant import NeedlePlant, initial_pose
 
 OFFSET = 0.003
@@ -39,12 +41,27 @@ class Insertion:
         for _ in range(steps):
             tip = self.plant.T_rig_tip[:3, 3] + self.rng.uniform(-NOISE, NOISE, 3)
             joints = JointSample(self.steps, self.steps * STEP, self.rotation)
-            turn = float(self.control.update(tip, joints).command.rotation_rate) * STEP
+            update = self.control.update(tip, joints, self.known)
+            turn = float(update.command.rotation_rate) * STEP
             self.plant.advance(STEP, turn)
             self.rotation += turn
             self.steps += 1
             track.append(float(self.plant.T_rig_tip[0, 3]) - OFFSET)
         return np.array(track)
+
+    @property
+    def known(self) -> TipCovariance | None:
+        """What comes with a tip whose shaft's direction is measured, to 1 deg."""
+        if self.control._settings.preset != "measured_pitch":
+            return None
+        off = Rotation.from_rotvec(self.rng.normal(0.0, np.deg2rad(1.0), 3)).as_matrix()
+        return TipCovariance(
+            self.steps,
+            "rig",
+            np.eye(3) * NOISE**2 / 3.0,
+            direction=off @ self.plant.T_rig_tip[:3, 2],
+            direction_covariance=np.eye(3) * np.deg2rad(1.0) ** 2,
+        )
 
     @property
     def roll(self) -> float:
@@ -136,6 +153,7 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane(preset: str) -> None:
         ({"state_weights": tuple(range(9))}, "state_weights.*three numbers"),
         ({"process_noise": (1.0, 1.0)}, "process_noise.*three numbers"),
         ({"tip_covariance": "none"}, "'none'"),
+        ({"preset": "measured_pitch"}, "wants tip_covariance from_tip_pose"),
     ],
 )
 def test_a_bad_whole_is_refused_with_what_and_why(changes: dict[str, Any], said: str) -> None:

@@ -35,6 +35,8 @@ class Disturbances:
         Share of measurements that are missing.
     delay : int
         How many steps late a measurement arrives.
+    pitch_noise : float
+        Largest error of a measured pitch, uniform, for controllers that measure it [rad].
     curvature_scale : float
         The plant's curvature as a multiple of what the controller assumes.
     curvature_patches : float
@@ -49,6 +51,7 @@ class Disturbances:
     outliers: float = 0.0
     dropped: float = 0.0
     delay: int = 0
+    pitch_noise: float = 0.0
     curvature_scale: float = 1.0
     curvature_patches: float = 0.0
     play: float = 0.0
@@ -93,6 +96,15 @@ def measured(
     return seen
 
 
+def measured_pitch(
+    pitch: FloatArray, disturbances: Disturbances, seed: int, exposure: int, first: int
+) -> FloatArray:
+    """Return what is measured of some needles' pitch, (N,) [rad]; see `measured`."""
+    share = study_noise.uniform(seed, study_noise.PITCH, exposure, first, len(pitch))[:, 0]
+    off = 2.0 * share.astype(np.float64) - 1.0
+    return np.asarray(pitch + disturbances.pitch_noise * off)
+
+
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
     """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
     share = study_noise.uniform(seed, study_noise.CURVATURE, patch, first, count)[:, 0]
@@ -120,7 +132,7 @@ class DelayLine:
         Parameters
         ----------
         tips : ndarray, shape (N, 3)
-            Measured at this insertion [m].
+            Measured at this insertion [m]; further columns come along.
         insertion : float
             Where the needles are now [m].
 

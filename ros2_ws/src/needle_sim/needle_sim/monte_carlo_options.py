@@ -90,6 +90,9 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
             noise=_number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
             outliers=_number("--outliers", given.outliers, 0.0, 1.0, "-"),
             dropped=_number("--dropped", given.dropped, 0.0, 1.0, "-"),
+            pitch_noise=math.radians(
+                _number("--pitch-noise-deg", given.pitch_noise_deg, 0.0, 90.0, "deg")
+            ),
             delay=_whole("--delay", given.delay, 0, 100),
             curvature_scale=_number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
             curvature_patches=_number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
@@ -116,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
         "--controller",
         required=True,
         metavar="NAME",
-        help="best, paper, open_loop, kalman, extended_kalman or orientation_fit",
+        help="best, paper, open_loop, kalman, measured_pitch, extended_kalman or orientation_fit",
     )
     add(
         "--grid",
@@ -136,6 +139,7 @@ def _parser() -> argparse.ArgumentParser:
         ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
         ("--outliers", "0", "F", "share of measurements off by 5-10 mm in a random direction"),
         ("--dropped", "0", "F", "share of measurements that are missing"),
+        ("--pitch-noise-deg", "2", "P", "controller measured_pitch: largest error of the pitch"),
         ("--delay", "0", "N", "steps that a measurement comes late"),
         ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
         ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),

@@ -57,6 +57,11 @@ class NeedleBatch:
         return np.asarray(self._position.T)
 
     @property
+    def pitch(self) -> FloatArray:
+        """The tips' pitch out of the plane, shape (N,) [rad]."""
+        return np.asarray(np.arcsin(np.clip(self._rotation[2], -1.0, 1.0)))
+
+    @property
     def T_rig_tip(self) -> FloatArray:  # noqa: N802
         """The tips' poses, shape (N, 4, 4) [m]."""
         count = self._position.shape[1]

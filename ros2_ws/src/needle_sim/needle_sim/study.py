@@ -9,7 +9,14 @@ from typing import Protocol
 
 import numpy as np
 
-from needle_sim.disturbances import PATCH_LENGTH, DelayLine, Disturbances, measured, patch_factors
+from needle_sim.disturbances import (
+    PATCH_LENGTH,
+    DelayLine,
+    Disturbances,
+    measured,
+    measured_pitch,
+    patch_factors,
+)
 from needle_sim.figures_of_merit import Outcomes, Tally, joined
 from needle_sim.needle_batch import NeedleBatch
 from needle_sim.se3 import FloatArray
@@ -20,7 +27,15 @@ CHUNK = 10_000
 
 
 class Controller(Protocol):
-    """What steers some needles; everything has their number as its leading axis."""
+    """What steers some needles; everything has their number as its leading axis.
+
+    Attributes
+    ----------
+    measures_pitch : bool
+        Whether the tips after the first have a fourth column, the measured pitch [rad].
+    """
+
+    measures_pitch: bool
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips, (N, 3) [m]; return the rotation rates, (N,) [rad/m]."""
@@ -36,7 +51,7 @@ class Controller(Protocol):
             Insertion of the step [m].
         d_rotation : ndarray, shape (N,)
             What the bases turned [rad].
-        tips : ndarray, shape (N, 3)
+        tips : ndarray, shape (N, 3), or (N, 4) where the pitch is measured
             The measured tips [m]; NaN where missing.
         age : float
             Insertion since they were measured [m].
@@ -143,5 +158,8 @@ def _steer(
         on_progress(len(starts))
         if step < steps:
             seen = measured(needles.tips, wrong, seed, step, first)
+            if controller.measures_pitch:
+                pitch = measured_pitch(needles.pitch, wrong, seed, step, first)
+                seen = np.column_stack([seen, pitch])
             rate = controller.step(length, turned, *delay.pass_on(seen, insertion))
     return tally.outcomes()

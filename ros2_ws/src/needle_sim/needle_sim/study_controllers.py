@@ -15,6 +15,7 @@ from needle_common.errors import UserError
 from needle_controller.control_settings import PRESETS, ControlSettings
 from needle_controller.estimator import Estimator
 from needle_controller.law import StepLaw
+from needle_controller.pitch_observer import PitchObserver
 from needle_controller.presets import make_controller
 from needle_sim.se3 import FloatArray
 
@@ -39,6 +40,7 @@ class SteeredNeedles:
         self._estimator = estimator
         self._law = law
         self._insertion = 0.0
+        self.measures_pitch = isinstance(estimator, PitchObserver)
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
@@ -51,7 +53,10 @@ class SteeredNeedles:
         """Take a step and what was measured after it; see `study.Controller.step`."""
         self._insertion += d_insertion
         self._estimator.advance(d_insertion, d_rotation)
-        self._estimator.correct(tips, age=age)
+        if isinstance(self._estimator, PitchObserver):
+            self._estimator.correct(tips[:, :3], age=age, pitch=tips[:, 3])
+        else:
+            self._estimator.correct(tips, age=age)
         return self._rate()
 
     def _rate(self) -> FloatArray:

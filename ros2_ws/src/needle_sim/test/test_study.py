@@ -81,6 +81,8 @@ def test_the_last_step_ends_at_the_depth() -> None:
     seen: list[float] = []
 
     class Watching:
+        measures_pitch = False
+
         def start(self, tips: FloatArray) -> FloatArray:
             return np.zeros(len(tips))
 
