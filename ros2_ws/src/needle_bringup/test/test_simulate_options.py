@@ -2,8 +2,13 @@ from pathlib import Path
 
 import pytest
 
-from needle_bringup.simulate_options import SimulateOptions, parse
+from needle_bringup.simulate_options import CONTROLLERS, SimulateOptions, parse
 from needle_common.errors import UserError
+from needle_controller.control_settings import PRESETS
+
+
+def test_every_preset_of_the_controller_can_be_asked_for() -> None:
+    assert sorted(CONTROLLERS) == sorted(PRESETS)
 
 
 def test_the_defaults_are_the_designed_ones() -> None:
