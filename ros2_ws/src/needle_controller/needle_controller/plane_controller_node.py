@@ -103,8 +103,8 @@ class PlaneControllerNode(Node):
         self.create_subscription(DiagnosticStatus, "device/status", self._on_device, LATCHED)
         self.create_subscription(Header, "device/result", self._on_result, RELIABLE)
         self.create_subscription(PoseStamped, "target_plane", self._on_plane, LATCHED)
-        self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE)
-        self.create_subscription(
+        self._tips = self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE)
+        self._tip_poses = self.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip_pose, RELIABLE
         )
         self.create_service(Trigger, "~/start", self._on_start)
@@ -113,7 +113,7 @@ class PlaneControllerNode(Node):
         self._do([])
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        missing = self._unrecorded()
+        missing = self._missing()
         if missing:
             response.success = False
             response.message = f"waiting for {', '.join(missing)}"
@@ -129,10 +129,20 @@ class PlaneControllerNode(Node):
         response.success, response.message = reply.success, reply.message
         return response
 
-    def _unrecorded(self) -> list[str]:
-        if not self._settings.values.wait_for_recorder:
+    def _missing(self) -> list[str]:
+        """Return who must be there before a message counts, where a recorder is waited for."""
+        values = self._settings.values
+        if not values.wait_for_recorder:
             return []
-        return unrecorded(
+        sources = [self._tips]
+        if values.tip_covariance == "from_tip_pose":
+            sources.append(self._tip_poses)
+        silent = [
+            f"publisher of {source.topic_name}"
+            for source in sources
+            if source.get_publisher_count() == 0
+        ]
+        return silent + unrecorded(
             self,
             (
                 self._commands,

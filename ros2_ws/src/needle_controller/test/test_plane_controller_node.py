@@ -298,6 +298,18 @@ def test_start_says_why_not(bench: Bench) -> None:
     assert (response.success, response.message) == (False, "no device/status has come")
 
 
+def test_a_recorded_start_waits_for_the_tips_sources_too(context: Context) -> None:
+    bench = Bench(
+        context, target_offset=0.003, wait_for_recorder=True, tip_covariance="from_tip_pose"
+    )
+    said = bench.call("start").message
+    assert said.startswith("waiting for publisher of /needle/tip_pose, recorder of")
+    bench.outside.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
+    bench.until(lambda: bench.node._tip_poses.get_publisher_count() > 0)
+    assert bench.call("start").message.startswith("waiting for recorder of")
+    bench.close()
+
+
 def test_a_plane_given_at_run_time_and_planes_refused(bench: Bench) -> None:
     message = PoseStamped()
     message.header.frame_id = "rig"
