@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+
 from needle_common.errors import UserError
 
 _SEPARATOR = "=" * 80
@@ -52,6 +54,22 @@ def full_definition(type_name: str, prefixes: Iterable[Path] | None = None) -> s
         package, _, short = name.split("/")
         parts.append(text if not parts else f"{_SEPARATOR}\nMSG: {package}/{short}\n{text}")
     return "\n".join(part.rstrip("\n") for part in parts) + "\n"
+
+
+def type_hash(type_name: str, definition: str) -> str:
+    """Return the hash (`RIHS01_...`) of a full definition.
+
+    Raises
+    ------
+    UserError
+        If it cannot be parsed.
+    """
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition, type_name))
+        return store.hash_rihs01(type_name)
+    except (TypesysError, KeyError) as error:
+        raise UserError(f"the definition of {type_name} cannot be read: {error}") from error
 
 
 def _read(type_name: str, prefixes: list[Path]) -> str:

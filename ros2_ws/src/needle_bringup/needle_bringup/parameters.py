@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
@@ -148,3 +149,49 @@ class ParameterSnapshots:
     def _drop_clients(self, full_name: str) -> None:
         for client in self._clients.pop(full_name, ()):
             self._node.destroy_client(client)
+
+
+class AnsweringNodes:
+    """Which nodes have learnt of everything that this node has created.
+
+    Nodes learn of each other's publishers in the order of their creation. Who answers a question
+    by a client that was created last knows the publishers created before; a subscription that does
+    not yet know its publisher gets nothing, and neither side can tell.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks, after it has created its publishers.
+    """
+
+    ASK_AGAIN = 0.5
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._clients: dict[str, Client] = {}
+        self._asked: dict[str, float] = {}
+        self._answered: set[str] = set()
+
+    def all_of(self, names: set[str]) -> bool:
+        """Ask nodes (full names) that have not answered yet; return whether all have."""
+        for name in names - self._answered:
+            if name not in self._clients:
+                self._clients[name] = self._node.create_client(
+                    GetParameters, f"{name}/get_parameters"
+                )
+            now = time.monotonic()
+            due = now - self._asked.get(name, -self.ASK_AGAIN) >= self.ASK_AGAIN
+            if due and self._clients[name].service_is_ready():
+                self._asked[name] = now
+                future = self._clients[name].call_async(GetParameters.Request())
+                future.add_done_callback(partial(self._take_answer, name))
+        return names <= self._answered
+
+    def close(self) -> None:
+        """Drop the clients."""
+        for client in self._clients.values():
+            self._node.destroy_client(client)
+        self._clients.clear()
+
+    def _take_answer(self, name: str, _: Future) -> None:
+        self._answered.add(name)

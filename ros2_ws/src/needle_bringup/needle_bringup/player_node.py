@@ -1,0 +1,402 @@
+"""Plays a bag; nothing of it reaches a rig."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import select
+import signal
+import sys
+import termios
+import time
+import tty
+from collections.abc import Iterator
+from functools import partial
+from types import FrameType
+from typing import Any, Final, cast
+
+from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+from tqdm import tqdm
+
+from needle_bringup.bag_files import BagContents, raw_messages, read_contents
+from needle_bringup.bag_metadata import BagTopic
+from needle_bringup.conversions import recorded_offer
+from needle_bringup.message_definitions import full_definition, type_hash
+from needle_bringup.parameters import AnsweringNodes
+from needle_bringup.playback import PlaybackClock, ReadAhead
+from needle_bringup.player_options import PlayerOptions, parse_options
+from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
+from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.conversions import RELIABLE, to_stamp
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.parameters import NodeParameters
+
+CLOCK: Final = "/clock"
+# How long a rig that is there has to show itself before the first message; how much longer those
+# who listen have to learn of our publishers; and how often the graph is looked at then [s].
+DISCOVERY: Final = 2.0
+MATCHING: Final = 3.0
+LOOK_PERIOD: Final = 0.1
+ACKNOWLEDGED: Final = 5.0
+# The longest that a signal, a key or a service call waits [s].
+PATIENCE: Final = 0.02
+_NANOSECONDS: Final = 1_000_000_000
+
+Message = tuple[str, int, bytes]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayerParameters:
+    """The player has no ROS parameters of its own: it takes options."""
+
+
+class RigAppearedError(Exception):
+    """A rig came up while topics are played under their own names."""
+
+
+class Player(Node):
+    """Publishes a bag's messages when they are due."""
+
+    def __init__(self, options: PlayerOptions, contents: BagContents) -> None:
+        super().__init__("player")
+        NodeParameters(self, PlayerParameters)
+        self._options = options
+        self._contents = contents
+        self.start = contents.start + round(options.start * 1e9)
+        end = min(options.end, (contents.end - contents.start) / 1e9)
+        self.end = contents.start + round(end * 1e9)
+        if self.start > contents.end:
+            seconds = (contents.end - contents.start) / 1e9
+            raise UserError(f"--start {options.start:g} s: {options.bag} has {seconds:.1f} s")
+        self._topics = self._playable()
+        self._senders: dict[str, Publisher] = {}
+        self._diagnostics = DiagnosticsPublisher(self)
+        self.clock = PlaybackClock(
+            options.rate, self.start, time.monotonic(), paused=options.paused
+        )
+        self._clock_publisher: Publisher | None = None
+        self._next_clock = 0.0
+        self._looked_at = 0.0
+        self.beside_rig = False
+        self.messages = 0
+        self.create_service(SetBool, "~/pause", self._on_pause)
+
+    def _playable(self) -> dict[str, BagTopic]:
+        """Return the topics to play; say why others are left out."""
+        options, known = self._options, self._contents.topics
+        for name in (*options.topics, *options.remaps):
+            if name not in known:
+                raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
+        chosen = {n: t for n, t in known.items() if not options.topics or n in options.topics}
+        if options.clock is not None:
+            chosen.pop(CLOCK, None)
+        playable = {}
+        for name, topic in chosen.items():
+            why = _unplayable(topic)
+            if why:
+                self.get_logger().warning(f"{name} is not played: {why}")
+            else:
+                playable[name] = topic
+        if chosen and not playable:
+            raise UserError(f"{options.bag}: none of its topics can be played here")
+        return playable
+
+    def prepare(self, spin: partial[None]) -> None:
+        """Look for a rig, make the publishers, and wait for who listens already.
+
+        Raises
+        ------
+        UserError
+            If a ROS remapping would bring a guarded topic to a rig.
+        """
+        self._make_publishers()
+        begin = time.monotonic()
+        while time.monotonic() < begin + DISCOVERY and not self.beside_rig:
+            spin()
+            if self._rig() is not None:
+                self.get_logger().warning(f"a rig is on this graph: all is played under {REPLAY}")
+                self.beside_rig = True
+                self._make_publishers()
+                begin = time.monotonic()
+        answering = AnsweringNodes(self)
+        while time.monotonic() < begin + DISCOVERY + MATCHING:
+            if self._all_matched() and answering.all_of(self._listeners()):
+                break
+            spin()
+        answering.close()
+        self._publish_latched()
+        self.clock.restart(self.start, time.monotonic())
+
+    def _make_publishers(self) -> None:
+        for sender in self._senders.values():
+            self.destroy_publisher(sender)
+        if self._clock_publisher is not None:
+            self.destroy_publisher(self._clock_publisher)
+        self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
+        if self._options.clock is not None:
+            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", {}, beside_rig=self.beside_rig)
+            self._clock_publisher = self.create_publisher(Clock, name, RELIABLE)
+
+    def _publisher(self, topic: BagTopic) -> Publisher:
+        name = played_name(
+            topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
+        )
+        publisher = self.create_publisher(
+            _message_class(topic.type_name), name, recorded_offer(topic.offered_qos)
+        )
+        # Remappings of the ROS command line come after ours.
+        final = publisher.topic_name
+        if not final.startswith(f"{REPLAY}/") and (
+            self.beside_rig
+            or is_guarded(final, topic.type_name)
+            or is_guarded(topic.name, topic.type_name)
+        ):
+            raise UserError(f"{topic.name} may not be played as {final}: a rig would obey it")
+        return publisher
+
+    def _all_matched(self) -> bool:
+        return all(
+            publisher.get_subscription_count() >= self.count_subscribers(publisher.topic_name)
+            for publisher in self._senders.values()
+        )
+
+    def _listeners(self) -> set[str]:
+        """Return the full names of the nodes that subscribe to what is played."""
+        return {
+            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            for sender in self._senders.values()
+            for info in self.get_subscriptions_info_by_topic(sender.topic_name)
+            if not info.node_name.startswith("_")
+        } - {self.get_fully_qualified_name()}
+
+    def _publish_latched(self) -> None:
+        """Publish what late joiners would have got at the start."""
+        latched = {
+            name
+            for name, topic in self._topics.items()
+            if any(offer.durability == "transient_local" for offer in topic.offered_qos)
+        }
+        if self.start == self._contents.start or not latched:
+            return
+        last: dict[str, Message] = {}
+        for message in raw_messages(self._options.bag, latched, self._contents.start, self.start):
+            last[message[0]] = message
+        for message in sorted(last.values(), key=lambda one: one[1]):
+            self.publish(message)
+
+    def read(self) -> Iterator[Message]:
+        """Yield the messages to play, in order."""
+        return raw_messages(self._options.bag, set(self._topics), self.start, self.end + 1)
+
+    def publish(self, message: Message) -> None:
+        """Send one message."""
+        self._senders[message[0]].publish(message[2])
+        self.messages += 1
+
+    def look_around(self) -> None:
+        """Publish the clock and the state; see whether a rig has come up.
+
+        Raises
+        ------
+        RigAppearedError
+            If one has, while topics are played under their own names.
+        """
+        now = time.monotonic()
+        if self._clock_publisher is not None and now >= self._next_clock:
+            self._next_clock = now + 1.0 / cast(float, self._options.clock)
+            self._clock_publisher.publish(Clock(clock=to_stamp(self.clock.time(now))))
+        if now - self._looked_at < LOOK_PERIOD:
+            return
+        self._looked_at = now
+        rig = None if self.beside_rig else self._rig()
+        if rig is not None:
+            raise RigAppearedError(rig)
+        state = "paused" if self.clock.is_paused else "playing"
+        values = {"bag": str(self._options.bag), "messages": str(self.messages)}
+        self._diagnostics.set("playback", Diagnostic(Level.OK, state, values))
+
+    def pause(self, paused: bool) -> None:
+        """Stop or go on."""
+        self.clock.pause(paused, time.monotonic())
+
+    def finish(self) -> None:
+        """Wait until all that listen have everything."""
+        timeout = Duration(seconds=ACKNOWLEDGED)
+        for publisher in self._senders.values():
+            publisher.wait_for_all_acked(timeout)
+
+    def _rig(self) -> str | None:
+        """Return what makes a rig of this graph."""
+        for name, _ in self.get_topic_names_and_types():
+            if marks_a_rig(name):
+                for info in self.get_publishers_info_by_topic(name):
+                    if info.node_name != self.get_name():
+                        return f"{info.node_name} publishes {name}"
+        return None
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        self.pause(request.data)
+        response.success = True
+        response.message = "paused" if request.data else "playing"
+        return response
+
+
+def _unplayable(topic: BagTopic) -> str:
+    """Return why a topic cannot be played here; an empty text if it can."""
+    try:
+        installed = full_definition(topic.type_name)
+        _message_class(topic.type_name)
+        here = type_hash(topic.type_name, installed)
+        there = topic.type_hash or (
+            type_hash(topic.type_name, topic.definition) if topic.definition else here
+        )
+    except UserError as error:
+        return str(error)
+    except (ImportError, AttributeError, ValueError):
+        return f"{topic.type_name} is not installed"
+    if here != there:
+        return (
+            f"{topic.type_name} is defined otherwise in this bag than here (another ROS "
+            "distribution): play it where it was recorded"
+        )
+    return ""
+
+
+def _message_class(type_name: str) -> Any:
+    package, kind, short = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), short)
+
+
+class _Keys:
+    """The keys pressed in a terminal; none where there is no terminal."""
+
+    def __init__(self) -> None:
+        self._file = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
+        self._before: list[Any] = []
+
+    def __enter__(self) -> _Keys:
+        if self._file is not None:
+            self._before = termios.tcgetattr(self._file)
+            tty.setcbreak(self._file)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._file is not None:
+            termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
+
+    def pressed(self) -> str:
+        """Return the key pressed since the last call, or an empty text."""
+        if self._file is None or not select.select([self._file], [], [], 0.0)[0]:
+            return ""
+        return sys.stdin.read(1)
+
+
+def _play(player: Player, loop: bool, stopped: list[bool]) -> int:
+    executor = SingleThreadedExecutor()
+    executor.add_node(player)
+    bar = tqdm(
+        total=round((player.end - player.start) / _NANOSECONDS, 1),
+        unit="s",
+        disable=None,
+        leave=False,
+        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar pauses",
+    )
+    with bar, _Keys() as keys:
+        player.prepare(partial(executor.spin_once, 0.05))
+        while True:
+            with contextlib.closing(ReadAhead(player.read)) as source:
+                message = source.next()
+                while message is not None:
+                    # A turn of the executor costs more than a message: take it now and then.
+                    wait = player.clock.wait(message[1], time.monotonic())
+                    turn = time.monotonic() + PATIENCE
+                    while wait == 0.0 and message is not None and time.monotonic() < turn:
+                        player.publish(message)
+                        message = source.next()
+                        if message is not None:
+                            wait = player.clock.wait(message[1], time.monotonic())
+                    executor.spin_once(min(wait, PATIENCE))
+                    player.look_around()
+                    if stopped:
+                        return EXIT_DONE
+                    if keys.pressed() == " ":
+                        player.pause(not player.clock.is_paused)
+                    elapsed = player.clock.time(time.monotonic()) - player.start
+                    bar.n = min(bar.total, elapsed / _NANOSECONDS)
+                    bar.set_description("paused" if player.clock.is_paused else "playing")
+            if not loop:
+                player.finish()
+                return EXIT_DONE
+            player.clock.restart(player.start, time.monotonic())
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the player; returns the exit code."""
+    argv = list(sys.argv if args is None else args)
+    own, ros = _split(argv[1:])
+
+    def command() -> int:
+        options = parse_options(own)
+        contents = read_contents(options.bag)
+        stopped: list[bool] = []
+
+        def stop(_number: int, _frame: FrameType | None) -> None:
+            stopped.append(True)
+
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, stop)
+
+        def spin(node: Node) -> int:
+            player = cast(Player, node)
+            try:
+                code = _play(player, options.loop, stopped)
+            except RigAppearedError as error:
+                print(
+                    f"error: a rig came up on this graph ({error}): playing ended; give one of "
+                    "the two a ROS_DOMAIN_ID of its own",
+                    file=sys.stderr,
+                )
+                return EXIT_MISSED
+            print(f"played {player.messages} messages of {options.bag}")
+            return code
+
+        return run_node(
+            lambda: Player(options, contents),
+            help_text="",
+            parameters=PlayerParameters,
+            args=[argv[0], *ros],
+            spin=spin,
+            signal_handlers=SignalHandlerOptions.NO,
+        )
+
+    return run_command(command)
+
+
+def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Return (own arguments, those from `--ros-args` to `--`).
+
+    rclpy's own way takes every `A:=B` for a remapping of its own.
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for argument in arguments:
+        inside = (inside or argument == "--ros-args") and argument != "--"
+        if inside:
+            ros.append(argument)
+        elif argument != "--":
+            own.append(argument)
+    return own, ros
+
+
+if __name__ == "__main__":
+    sys.exit(main())
