@@ -171,3 +171,30 @@ def process_covariance(density: Array, length: npt.ArrayLike) -> Array:
     products = np.einsum("iab,bc,jdc->ijad", _POWERS, density, _POWERS)
     lengths = length**_EXPONENTS / _EXPONENTS
     return np.asarray(np.einsum("...ij,ijad->...ad", lengths, products))
+
+
+def reduced_covariance(covariance: Array, reduced: Array, curvature: npt.ArrayLike) -> Array:
+    """Return the covariance of r from that of s, by the inverse of (6)'s Jacobian.
+
+    Parameters
+    ----------
+    covariance : ndarray, shape (..., 3, 3)
+        Of s.
+    reduced : ndarray, shape (..., 3)
+        Where: x [m], pitch, roll [rad], roll off +-90 deg.
+    curvature : array_like, shape (...)
+        kappa [1/m].
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Of x [m], pitch and roll [rad].
+    """
+    pitch, roll = reduced[..., 1], reduced[..., 2]
+    jacobian = np.zeros((*pitch.shape, 3, 3))
+    jacobian[..., 0, 0] = 1.0
+    jacobian[..., 1, 1] = 1.0 / np.cos(pitch)
+    jacobian[..., 2, 1] = np.tan(pitch) * np.tan(roll) / np.cos(pitch)
+    steering = np.cos(pitch) * np.cos(roll)
+    jacobian[..., 2, 2] = 1.0 / (np.asarray(curvature, dtype=float) * steering)
+    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))

@@ -20,6 +20,7 @@ from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import (
     linearized_from_reduced,
     process_covariance,
+    reduced_covariance,
     transition,
 )
 from needle_controller.gains import checked_weights, sampled_observer_gain
@@ -288,30 +289,3 @@ class LinearObserver:
             self.settings.initial_yaw_std**2 + (curvature * self._inserted) ** 2
         )
         return covariance
-
-
-def reduced_covariance(covariance: Array, reduced: Array, curvature: npt.ArrayLike) -> Array:
-    """Return the covariance of r from that of s, by the inverse of (6)'s Jacobian.
-
-    Parameters
-    ----------
-    covariance : ndarray, shape (..., 3, 3)
-        Of s.
-    reduced : ndarray, shape (..., 3)
-        Where: x [m], pitch, roll [rad], roll off +-90 deg.
-    curvature : array_like, shape (...)
-        kappa [1/m].
-
-    Returns
-    -------
-    ndarray, shape (..., 3, 3)
-        Of x [m], pitch and roll [rad].
-    """
-    pitch, roll = reduced[..., 1], reduced[..., 2]
-    jacobian = np.zeros((*pitch.shape, 3, 3))
-    jacobian[..., 0, 0] = 1.0
-    jacobian[..., 1, 1] = 1.0 / np.cos(pitch)
-    jacobian[..., 2, 1] = np.tan(pitch) * np.tan(roll) / np.cos(pitch)
-    steering = np.cos(pitch) * np.cos(roll)
-    jacobian[..., 2, 2] = 1.0 / (np.asarray(curvature, dtype=float) * steering)
-    return np.asarray(jacobian @ covariance @ np.swapaxes(jacobian, -1, -2))

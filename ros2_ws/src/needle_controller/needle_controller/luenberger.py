@@ -13,6 +13,7 @@ from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import (
     linearized_from_reduced,
     process_covariance,
+    reduced_covariance,
     reduced_from_linearized,
     transition,
 )
@@ -219,15 +220,8 @@ class LuenbergerObserver:
     def _coordinate_covariance(self, reduced: Array) -> Array:
         """Return the covariance of q, linear in the estimate's error."""
         curvature = self._settings.curvature
-        pitch, roll = reduced[..., 1], reduced[..., 2]
-        # dr/ds, the inverse of (6)'s Jacobian.
-        jacobian = np.zeros((*pitch.shape, 3, 3))
-        jacobian[..., 0, 0] = 1.0
-        jacobian[..., 1, 1] = 1.0 / np.cos(pitch)
-        jacobian[..., 2, 1] = np.tan(pitch) * np.tan(roll) / np.cos(pitch)
-        jacobian[..., 2, 2] = 1.0 / (curvature * np.cos(pitch) * np.cos(roll))
-        of_reduced = jacobian @ self._covariance @ np.swapaxes(jacobian, -1, -2)
-        covariance = np.zeros((*pitch.shape, 6, 6))
+        of_reduced = reduced_covariance(self._covariance, reduced, curvature)
+        covariance = np.zeros((*reduced.shape[:-1], 6, 6))
         index = np.array([0, 4, 5])
         covariance[..., index[:, None], index[None, :]] = of_reduced
         covariance[..., 1:3, 1:3] = self._tip_covariance[..., 1:3, 1:3]

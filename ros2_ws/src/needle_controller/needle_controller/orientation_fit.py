@@ -27,11 +27,11 @@ from needle_controller.arc_motion import InputHistory, RelativeMotion, arc, no_m
 from needle_controller.arrays import Array
 from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import linearized_from_reduced
+from needle_controller.grid_pose import GridPoseCovariance, apply, nearest_rotation, pick
 from needle_controller.innovation_gate import InnovationGate
 from needle_controller.kinematics import angles_from_rotation, rotation_from_angles
 from needle_controller.pose_settings import (
     PoseSettings,
-    coordinate_covariance,
     start_rotation_precision,
     turned_cross,
 )
@@ -186,9 +186,9 @@ class OrientationFit:
             arm = self._motion.then(back).shift
         best = self._best
         arms = np.broadcast_to(arm, self._sums.arm.shape)
-        at_best = _pick(arms, best)
-        rotation = _pick(self._rotation, best)
-        expected = _pick(self._position, best) + _apply(rotation, at_best)
+        at_best = pick(arms, best)
+        rotation = pick(self._rotation, best)
+        expected = pick(self._position, best) + apply(rotation, at_best)
         innovation = np.where(found[..., None], tip - expected, 0.0)
         j = np.concatenate(
             [np.broadcast_to(np.eye(3), rotation.shape), turned_cross(rotation, at_best)], axis=-1
@@ -197,10 +197,10 @@ class OrientationFit:
         if len(self._grid) > 1:
             # Until the curvature is known, it is part of what the tip may be off by.
             motion_slope = np.broadcast_to(self._motion.shift_slope, self._sums.arm.shape)
-            slope = _apply(rotation, _pick(motion_slope, best))
+            slope = apply(rotation, pick(motion_slope, best))
             variance = self._curvature_variance()[..., None, None]
             spread = spread + slope[..., :, None] * slope[..., None, :] * variance
-        distance = np.sum(innovation * _apply(np.linalg.inv(spread), innovation), axis=-1)
+        distance = np.sum(innovation * apply(np.linalg.inv(spread), innovation), axis=-1)
         used = self._gate.admit(distance, found)
         weight = np.where(used, 3.0 / np.trace(noise, axis1=-2, axis2=-1), 0.0)
         self._sums.add(weight, np.where(used[..., None], tip, 0.0), arms)
@@ -210,12 +210,12 @@ class OrientationFit:
         """Return what is known now; see `Estimator.estimate`."""
         weights = self._weights()
         grid_shape = self._sums.arm.shape
-        position = self._position + _apply(
+        position = self._position + apply(
             self._rotation, np.broadcast_to(self._motion.shift, grid_shape)
         )
         rotation = self._rotation @ self._motion.rotation
         mean_position = np.sum(weights[..., None] * position, axis=-2) + self._origin
-        mean_rotation = _nearest_rotation(np.sum(weights[..., None, None] * rotation, axis=-3))
+        mean_rotation = nearest_rotation(np.sum(weights[..., None, None] * rotation, axis=-3))
         curvature = np.sum(weights * self._grid, axis=-1)
         angles = angles_from_rotation(mean_rotation)
         reduced = np.stack([mean_position[..., 0], angles[..., 1], angles[..., 2]], axis=-1)
@@ -247,8 +247,8 @@ class OrientationFit:
         arm = sums.arm / weight[..., None]
         centred = sums.cross - weight[..., None, None] * tip[..., :, None] * arm[..., None, :]
         moment = centred + self._prior_cross[..., None, :, :]
-        self._rotation = _nearest_rotation(moment)
-        self._position = tip - _apply(self._rotation, arm)
+        self._rotation = nearest_rotation(moment)
+        self._position = tip - apply(self._rotation, arm)
         # Half the weighted sum of squares, but for what no rotation changes.
         spread = sums.tip_squared - np.sum(sums.tip**2, axis=-1) / sums.weight
         arms = np.trace(sums.outer, axis1=-2, axis2=-1) - weight * np.sum(arm**2, axis=-1)
@@ -272,8 +272,8 @@ class OrientationFit:
     def _start_covariance(self, index: npt.NDArray[np.int64]) -> Array:
         """Return the covariance of (position, body rotation vector) of the start, (..., 6, 6)."""
         sums = self._sums
-        arm, outer = _pick(sums.arm, index), _pick(sums.outer, index)
-        rotation = _pick(self._rotation, index)
+        arm, outer = pick(sums.arm, index), pick(sums.outer, index)
+        rotation = pick(self._rotation, index)
         precision = np.zeros((*sums.weight.shape, 6, 6))
         precision[..., :3, :3] = sums.weight[..., None, None] * np.eye(3)
         crossed = turned_cross(rotation, arm)
@@ -287,74 +287,16 @@ class OrientationFit:
 
     def _covariance_of(
         self, weights: Array, position: Array, rotation: Array, mean_rotation: Array
-    ) -> _PoseCovariance:
+    ) -> GridPoseCovariance:
         best = self._best
         shape = self._sums.arm.shape
-        return _PoseCovariance(
+        return GridPoseCovariance(
             start=self._start_covariance(best),
-            start_rotation=_pick(self._rotation, best),
-            shift=_pick(np.broadcast_to(self._motion.shift, shape), best),
-            turned=_pick(np.broadcast_to(self._motion.rotation, (*shape, 3)), best),
+            start_rotation=pick(self._rotation, best),
+            shift=pick(np.broadcast_to(self._motion.shift, shape), best),
+            turned=pick(np.broadcast_to(self._motion.rotation, (*shape, 3)), best),
             weights=weights,
             position=position,
             rotation=rotation,
             mean_rotation=mean_rotation,
         )
-
-
-@dataclasses.dataclass(frozen=True)
-class _PoseCovariance:
-    """Computes the covariance of an estimate when it is asked for."""
-
-    start: Array
-    start_rotation: Array
-    shift: Array
-    turned: Array
-    weights: Array
-    position: Array
-    rotation: Array
-    mean_rotation: Array
-
-    def __call__(self) -> Array:
-        """Return the covariance of the coordinates: of the start, carried on, and of kappa."""
-        carry = np.zeros((*self.shift.shape[:-1], 6, 6))
-        carry[..., :3, :3] = np.eye(3)
-        carry[..., :3, 3:] = turned_cross(self.start_rotation, self.shift)
-        carry[..., 3:, 3:] = np.swapaxes(self.turned, -1, -2)
-        within = carry @ self.start @ np.swapaxes(carry, -1, -2)
-        centre = np.sum(self.weights[..., None] * self.position, axis=-2, keepdims=True)
-        off = np.swapaxes(self.mean_rotation, -1, -2)[..., None, :, :] @ self.rotation
-        turn = 0.5 * np.stack(
-            [
-                off[..., 2, 1] - off[..., 1, 2],
-                off[..., 0, 2] - off[..., 2, 0],
-                off[..., 1, 0] - off[..., 0, 1],
-            ],
-            axis=-1,
-        )
-        apart = np.concatenate([self.position - centre, turn], axis=-1)
-        weighted = self.weights[..., None] * apart
-        whole = within + np.swapaxes(weighted, -1, -2) @ apart
-        return coordinate_covariance(
-            whole[..., :3, :3], whole[..., :3, 3:], whole[..., 3:, 3:], self.mean_rotation
-        )
-
-
-def _nearest_rotation(moment: Array) -> Array:
-    """Return the rotation R that maximises trace(R^T moment), shape (..., 3, 3)."""
-    u, _, vt = np.linalg.svd(moment)
-    sign = np.linalg.det(u) * np.linalg.det(vt)
-    u[..., :, 2] *= sign[..., None]
-    return np.asarray(u @ vt)
-
-
-def _pick(values: Array, index: npt.NDArray[np.int64]) -> Array:
-    """Return the rows of a grid axis that an index names: (..., G, *) by (...)."""
-    spare = values.ndim - index.ndim - 1
-    shaped = index.reshape(*index.shape, 1, *([1] * spare))
-    picked = np.take_along_axis(values, shaped, axis=index.ndim)
-    return np.asarray(np.squeeze(picked, axis=index.ndim))
-
-
-def _apply(matrix: Array, vector: Array) -> Array:
-    return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
