@@ -27,6 +27,7 @@ class ControlSettings:
     curvature: float = 1.0 / 0.122
     step_length: float = 0.001
     max_rotation_per_length: float = math.radians(30.0) / 0.001
+    max_winding: float = 6.0 * math.pi
     tip_noise: str = "bounded"
     tip_noise_bound: float = 0.001
     flip_depths: tuple[float, ...] = ()

@@ -69,6 +69,7 @@ def make_other_controller(
         RollLawSettings(
             step_length=settings.step_length,
             max_rotation_per_length=settings.max_rotation_per_length,
+            max_winding=settings.max_winding,
         )
     )
     if not plan.depths:

@@ -77,6 +77,14 @@ class PlaneControllerParameters:
         lower=0.0,
         upper=1000.0,
     )
+    max_winding: float = parameter(
+        ControlSettings.max_winding,
+        unit="rad",
+        description="The roll law keeps rotation_joint within +- this: beyond, it turns the other "
+        "way round. (The law of [KC09] never winds up.)",
+        lower=2.0 * math.pi,
+        upper=1000.0,
+    )
     tip_timeout: float = parameter(
         2.0,
         unit="s",
@@ -138,7 +146,8 @@ class PlaneControllerParameters:
     flip_depths: tuple[float, ...] = parameter(
         ControlSettings.flip_depths,
         unit="m",
-        description="best: insertions at which the bevel is flipped within the plane, increasing.",
+        description="Insertions at which the bevel is flipped within the plane, increasing; not "
+        "with presets paper and open_loop.",
         lower=0.0,
         upper=1.0,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 
@@ -19,6 +20,8 @@ from needle_controller.target_plane import TargetPlane
 from needle_controller.tip_covariance import TipCovariance
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
+"""Of presets whose coordinates end at roll +-90 deg [rad]."""
+_ONE_SIDED = ("paper", "open_loop")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,6 +100,12 @@ class PlaneControl:
     def started(self) -> bool:
         """Whether a first tip was taken since the last restart."""
         return self._joints is not None
+
+    @property
+    def largest_start_roll(self) -> float:
+        """Largest roll in the plane that the preset can start at [rad]."""
+        one_sided = self._settings.preset in _ONE_SIDED
+        return float(LARGEST_START_ROLL) if one_sided else math.inf
 
     def start_roll(self, rotation: float) -> float:
         """Return the roll in the plane of a needle entering with its base at `rotation` [rad]."""

@@ -56,6 +56,7 @@ def best_settings(settings: ControlSettings) -> BestSettings:
         law=RollLawSettings(
             step_length=settings.step_length,
             max_rotation_per_length=settings.max_rotation_per_length,
+            max_winding=settings.max_winding,
         ),
     )
 

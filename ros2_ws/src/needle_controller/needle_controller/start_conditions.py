@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from needle_controller.joint_history import JointSample
-from needle_controller.plane_control import LARGEST_START_ROLL, PlaneControl
+from needle_controller.plane_control import PlaneControl
 from needle_controller.steering_types import DeviceStatus, SteeringSettings
 
 DEPTH_TOLERANCE = 1e-6
@@ -83,9 +83,9 @@ def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: Steer
             f"draw it out first (<= {settings.needle_out_insertion:g} m)"
         )
     roll = control.start_roll(joints.rotation)
-    if abs(roll) > LARGEST_START_ROLL:
+    if abs(roll) > control.largest_start_roll:
         return (
             f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
-            f"{joints.rotation:.4g} rad), wants within {LARGEST_START_ROLL:.3g} rad"
+            f"{joints.rotation:.4g} rad), wants within {control.largest_start_roll:.3g} rad"
         )
     return ""

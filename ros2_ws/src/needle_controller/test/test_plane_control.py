@@ -93,6 +93,16 @@ def test_a_preset_steers_into_the_plane_and_stays(preset: str) -> None:
     assert np.all(np.abs(track[-20:]) < 1e-3)
 
 
+@pytest.mark.parametrize("preset", ["best", "kalman", "extended_kalman"])
+@pytest.mark.parametrize("turned", [2.0, -3.0, 14.0])
+def test_the_base_may_be_turned_from_the_last_run(preset: str, turned: float) -> None:
+    needle = insertion(settings_of(preset))
+    needle.rotation = turned
+    start = initial_pose(np.deg2rad(2.0), np.deg2rad(15.0) + turned)
+    needle.plant = NeedlePlant(start, curvature=1 / 0.122)
+    assert np.all(np.abs(needle.run(120)[-20:]) < 1e-3)
+
+
 def test_best_takes_tips_with_normal_noise_too() -> None:
     settings = dataclasses.replace(settings_of("best"), tip_noise="normal")
     track = insertion(settings).run(120)
@@ -159,3 +169,14 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane(preset: str) -> None:
 def test_a_bad_whole_is_refused_with_what_and_why(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(UserError, match=said):
         PlaneControllerParameters(**changes)
+
+
+def test_the_base_is_kept_within_its_winding_and_unwinds() -> None:
+    settings = dataclasses.replace(settings_of("best"), max_winding=7.0)
+    needle = insertion(settings)
+    needle.rotation = 17.0
+    start = initial_pose(np.deg2rad(2.0), np.deg2rad(15.0) + 17.0)
+    needle.plant = NeedlePlant(start, curvature=1 / 0.122)
+    needle.run(60)
+    assert abs(needle.rotation) < 7.0
+    assert np.all(np.abs(needle.run(60)[-20:]) < 1e-3)

@@ -22,6 +22,7 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -38,6 +39,7 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
+from needle_controller.conversions import to_tip_covariance
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.plane_controller_node import PlaneControllerNode, main
 
@@ -275,6 +277,20 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
     bench.until(lambda: len(bench.commands) == 1)
     assert to_nanoseconds(bench.commands[0].header.stamp) == stamps[1]
     bench.close()
+
+
+def test_a_tip_pose_says_direction_and_covariance() -> None:
+    message = PoseWithCovarianceStamped()
+    turned = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    q = message.pose.pose.orientation
+    q.x, q.y, q.z, q.w = (float(part) for part in turned.as_quat())
+    message.pose.covariance = np.arange(36.0)
+    known = to_tip_covariance(message)
+    np.testing.assert_allclose(known.direction, turned.as_matrix()[:, 2], atol=1e-12)
+    np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
+    np.testing.assert_array_equal(
+        known.direction_covariance, [[21, 22, 23], [27, 28, 29], [33, 34, 35]]
+    )
 
 
 def test_every_reason_to_refuse_a_tip_is_logged(

@@ -41,9 +41,10 @@ class Rig:
         started: bool = True,
         held: bool = True,
         tip_covariance: str = "configured",
+        preset: str = "best",
     ) -> None:
         parameters = PlaneControllerParameters(
-            depth=depth, target_offset=0.003, tip_covariance=tip_covariance
+            preset=preset, depth=depth, target_offset=0.003, tip_covariance=tip_covariance
         )
         control = PlaneControl(parameters.control(), offset_plane(0.003))
         self.steering = Steering(parameters.steering(), control)
@@ -137,13 +138,23 @@ def test_start_refuses_a_needle_it_did_not_follow() -> None:
 
 
 def test_start_refuses_a_roll_its_coordinates_cannot_say() -> None:
-    rig = Rig(started=False)
+    rig = Rig(started=False, preset="paper")
     rig.rotation = 2.0
     rig.now += TICK
     rig.joints()
     reply, _ = rig.steering.on_start()
     assert not reply.success
     assert "roll" in reply.message
+
+
+@pytest.mark.parametrize("turned", [2.0, np.pi, -8.0])
+def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
+    rig = Rig(started=False)
+    rig.rotation = turned
+    rig.now += TICK
+    rig.joints()
+    assert rig.steering.on_start()[0].success
+    assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
 
 
 def test_start_twice_and_stop_twice() -> None:
