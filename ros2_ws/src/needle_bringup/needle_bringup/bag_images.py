@@ -10,7 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from needle_bringup.bag_copy import stamp_of
 from needle_bringup.bag_files import read_messages
+from needle_bringup.bag_order import raw_as_sent
 from needle_bringup.bag_reader import Run, nanoseconds
 
 SIDES = ("left", "right")
@@ -47,6 +49,19 @@ def plain_image(message: Any) -> Any:
         return PlainImage(message.header, 0, 0, str(message.format), 0, np.empty(0, np.uint8))
     height, width = pixels.shape
     return PlainImage(message.header, height, width, "mono8", width, pixels.ravel())
+
+
+def exposures(run: Run) -> Stamps:
+    """Return the stamps of the left camera's images [ns], in order.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    left = {run.namespace + topic for topic, side in TOPICS.items() if side == "left"}
+    sent = raw_as_sent(run.path, left.__contains__, left.__contains__)
+    return np.unique(np.array([stamp_of(message.data) for message in sent], np.int64))
 
 
 def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[np.uint8]]]:

@@ -19,6 +19,7 @@ Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
+RECORDING = ("recording_ended", "recovered", "messages_lost", "parameter_changes")
 _LANDMARK = "needle/controller_status"
 _TYPES = {
     "needle/tip": "geometry_msgs/msg/PointStamped",
@@ -122,8 +123,6 @@ class Run:
         v, u [rad/m] and accumulated rotation [rad], (N, 3).
     commands : Series
         Commanded insertion [m] and rotation [rad], (N, 2), stamped with the tip that caused them.
-    exposures : Series
-        Exposures of the left camera, (N, 0).
     holds : Series
         The hold pressed (0 or 1) and its speed scale, (N, 2).
     controller_status, device_status : list of Status
@@ -140,6 +139,10 @@ class Run:
         What the recorder was told about the run, and what made it.
     calibration, commit : str
         Text of the calibration file and the commit of the sources; empty where unknown.
+    recording : dict of str to str
+        What the recorder, or `recover`, had to say about the recording: keys of `RECORDING`.
+    namespace : str
+        Of the rig's topics, `/` or with one at its end.
     """
 
     path: Path
@@ -152,7 +155,6 @@ class Run:
     joints: Series
     control_input: Series
     commands: Series
-    exposures: Series
     holds: Series
     controller_status: list[Status]
     device_status: list[Status]
@@ -164,6 +166,7 @@ class Run:
     versions: dict[str, str]
     calibration: str
     commit: str
+    recording: dict[str, str]
     namespace: str
 
     @property
@@ -238,7 +241,6 @@ def read_run(path: Path) -> Run:
         joints=collected.series("joints", 2),
         control_input=collected.series("control_input", 3),
         commands=collected.series("commands", 2),
-        exposures=collected.series("exposures", 0),
         holds=collected.series("holds", 2),
         controller_status=collected.controller_status,
         device_status=collected.device_status,
@@ -250,6 +252,7 @@ def read_run(path: Path) -> Run:
         versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
         calibration=custom.get("calibration", ""),
         commit=custom.get("commit", ""),
+        recording={key: custom[key] for key in RECORDING if custom.get(key)},
         namespace=namespace,
     )
 
@@ -279,7 +282,6 @@ class _Collector:
             "needle/estimate": self._take_estimate,
             "needle/reduced_state": lambda t, m: self._add("reduced_state", t, m, _xyz(m.vector)),
             "needle/control_input": lambda t, m: self._add("control_input", t, m, _xyz(m.vector)),
-            "stereo/left/camera_info": lambda t, m: self._add("exposures", t, m, ()),
             "device/hold": self._take_hold,
             "joint_states": self._take_joints,
             "device/joint_trajectory": self._take_command,

@@ -2,49 +2,37 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from needle_bringup.bag_reader import Run, Series
+from needle_bringup.figure_style import (
+    ESTIMATE,
+    GOAL_BAND,
+    GREY,
+    MEASURED,
+    MM,
+    STYLE,
+    TEAL,
+    TRUTH,
+    VIOLET,
+    WIDTH,
+)
 from needle_bringup.run_summary import (
     GOAL,
+    finite_tips,
     reduced_states,
     target_offset,
     tip_error,
-    true_r1,
 )
 
 Floats = npt.NDArray[np.float64]
 
-TRUTH = "#1b1b1b"
-MEASURED = "#d1701b"
-ESTIMATE = "#1668b0"
-GOAL_BAND = "#2e9d55"
-MM = 1e3
-# Narrow, so that the text can still be read on a phone [inch].
-WIDTH = 6.6
-_STYLE: dict[Any, Any] = {
-    "font.size": 9.5,
-    "axes.formatter.useoffset": False,
-    "axes.grid": True,
-    "grid.color": "#e4e6ea",
-    "grid.linewidth": 0.8,
-    "axes.edgecolor": "#9aa0a8",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "legend.frameon": False,
-    "legend.fontsize": 8.5,
-}
 _MEASURED_DOTS: dict[str, Any] = {
     "marker": "o",
     "linestyle": "none",
@@ -55,15 +43,9 @@ _MEASURED_DOTS: dict[str, Any] = {
 }
 
 
-def save(figure: Figure, target: Path | BinaryIO) -> None:
-    """Write a figure as PNG."""
-    FigureCanvasAgg(figure)
-    figure.savefig(target, dpi=130, facecolor="white", metadata={"Software": ""})
-
-
 def states_figure(run: Run) -> Figure:
     """Return [KC09] figure 3's four rows: r1, r2, r3 and the accumulated rotation."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 8.8), layout="constrained")
         r1, r2, r3, rotation = figure.subplots(4, 1, sharex=True)
         _goal_band(r1)
@@ -103,19 +85,19 @@ def states_figure(run: Run) -> Figure:
         if rotation.lines:
             rotation.legend(loc="best")
         for axes in (r2, r3):
-            axes.axhline(0.0, color="#9aa0a8", lw=0.8)
+            axes.axhline(0.0, color=GREY, lw=0.8)
         return figure
 
 
 def path_figure(run: Run) -> Figure:
     """Return the needle's path: from the side against the plane, from above, and in space."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 7.0), layout="constrained")
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
         side = figure.add_subplot(grid[0, :])
         above = figure.add_subplot(grid[1, 0])
         space = figure.add_subplot(grid[1, 1], projection="3d")
-        tips = run.tips.values * MM
+        tips = finite_tips(run).values * MM
         truth = run.truth.values[:, :3] * MM
         plane = target_offset(run) * MM
         side.axhspan(plane - GOAL * MM, plane + GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
@@ -138,14 +120,15 @@ def path_figure(run: Run) -> Figure:
 
 def error_figure(run: Run) -> Figure:
     """Return the measurement's and the estimate's error against the truth."""
-    with mpl.rc_context(_STYLE):
+    with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 5.6), layout="constrained")
         tip, difference = figure.subplots(2, 1, sharex=True)
         error = tip_error(run) * MM
-        here, _ = run.tips.at(run.truth.stamps)
-        insertion = run.insertion_at(run.tips.stamps[here]) * MM
+        tips = finite_tips(run)
+        here, _ = tips.at(run.truth.stamps)
+        insertion = run.insertion_at(tips.stamps[here]) * MM
         for column, (name, color) in enumerate(
-            (("x (depth)", "#d1701b"), ("y", "#7a5ab5"), ("z", "#3f8f8b"))
+            (("x (depth)", MEASURED), ("y", VIOLET), ("z", TEAL))
         ):
             tip.plot(insertion, error[:, column], color=color, lw=1.0, label=name)
         norm = np.linalg.norm(error, axis=1)
@@ -161,8 +144,8 @@ def error_figure(run: Run) -> Figure:
         angles.spines["right"].set_visible(True)
         lines = difference.plot(insertion, off[:, 0] * MM, color=ESTIMATE, lw=1.6, label="r1 [mm]")
         wrapped = np.degrees((off[:, 1:] + np.pi) % (2 * np.pi) - np.pi)
-        lines += angles.plot(insertion, wrapped[:, 0], color="#7a5ab5", lw=1.1, label="r2 [deg]")
-        lines += angles.plot(insertion, wrapped[:, 1], color="#3f8f8b", lw=1.1, label="r3 [deg]")
+        lines += angles.plot(insertion, wrapped[:, 0], color=VIOLET, lw=1.1, label="r2 [deg]")
+        lines += angles.plot(insertion, wrapped[:, 1], color=TEAL, lw=1.1, label="r3 [deg]")
         difference.set(title="Estimate minus truth", ylabel="mm", xlabel="insertion [mm]")
         angles.set_ylabel("deg")
         difference.legend(lines, [str(line.get_label()) for line in lines], loc="best", ncols=3)
@@ -189,22 +172,16 @@ def _draw_space(axes: Any, path: Floats, plane: float) -> None:
     z, y = np.meshgrid([float(low[2]), float(high[2])], [middle - reach, middle + reach])
     axes.plot_surface(z, y, np.full_like(z, plane), color=GOAL_BAND, alpha=0.22, linewidth=0)
     axes.plot(path[:, 2], path[:, 1], path[:, 0], color=TRUTH, lw=1.9)
-    axes.plot(path[:, 2], path[:, 1], np.full(len(path), plane), color="#9aa0a8", lw=0.9)
-    axes.set(xlabel="z [mm]", ylabel="y [mm]", zlabel="x [mm]")
-    for axis in (axes.yaxis, axes.zaxis):
-        axis.set_major_locator(MaxNLocator(3))
+    axes.plot(path[:, 2], path[:, 1], np.full(len(path), plane), color=GREY, lw=0.9)
+    axes.set_xlabel("z [mm]", labelpad=9)
+    axes.set_ylabel("y [mm]", labelpad=5)
+    axes.set_zlabel("x [mm]", labelpad=2)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.set_major_locator(MaxNLocator(4))
     axes.tick_params(labelsize=8)
-    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.82)
+    axes.set_box_aspect((2.2, 1.0, 0.9), zoom=0.78)
     axes.view_init(elev=22, azim=-62)
 
 
 def _insertion_mm(run: Run, series: Series) -> Floats:
     return run.insertion_at(series.stamps) * MM
-
-
-def figures_of(run: Run) -> dict[str, Figure]:
-    """Return all line figures of a run by their file's name, without those with nothing in them."""
-    figures = {"states": states_figure(run), "path": path_figure(run)}
-    if len(true_r1(run)):
-        figures["errors"] = error_figure(run)
-    return figures

@@ -10,8 +10,9 @@ import numpy.typing as npt
 import yaml
 from matplotlib.figure import Figure
 
-from needle_bringup.bag_images import SIDES, images_at
+from needle_bringup.bag_images import SIDES, exposures, images_at
 from needle_bringup.bag_reader import Run
+from needle_bringup.run_summary import finite_tips
 from needle_common.errors import UserError
 from needle_tracker.calibration import parse_calibration
 from needle_tracker.refraction import RefractedCamera
@@ -52,7 +53,7 @@ def images_figure(run: Run) -> Figure | None:
 
 def _choose_exposures(run: Run) -> npt.NDArray[np.int64]:
     """Return stamps of measured tips, spread evenly over the part that cameras can see."""
-    stamps = run.tips.stamps
+    stamps = np.intersect1d(finite_tips(run).stamps, exposures(run))
     if not len(stamps):
         return stamps
     depth = run.insertion_at(stamps)

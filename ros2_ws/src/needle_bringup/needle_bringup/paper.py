@@ -62,7 +62,7 @@ def _paper(arguments: Sequence[str]) -> int:
     out = checkout / "docs" if given.out is None else Path(given.out).expanduser().absolute()
     _make(out / IMAGES, "--out")
     # They take a second to import: not for a command line that is refused.
-    from needle_bringup.figures import save  # noqa: PLC0415
+    from needle_bringup.figure_style import save  # noqa: PLC0415
     from needle_bringup.paper_figures import figures_of  # noqa: PLC0415
     from needle_bringup.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
     from needle_bringup.paper_results import collect  # noqa: PLC0415

@@ -1,18 +1,28 @@
-"""`report`: makes report.html, its figures and summary.json from a bag alone."""
+"""`report`: what a bag alone tells of a run, or two bags of two, as a page with figures."""
 
 from __future__ import annotations
 
 import argparse
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NoReturn
+
+from matplotlib.figure import Figure
 
 from needle_bringup.bag_reader import Run, read_run
-from needle_bringup.figures import figures_of, save
+from needle_bringup.event_figure import event_figure
+from needle_bringup.figure_style import save
+from needle_bringup.figures import error_figure, path_figure, states_figure
 from needle_bringup.image_figure import images_figure
+from needle_bringup.innovation import innovations
+from needle_bringup.pair_figures import pair_figures
+from needle_bringup.pair_page import build_pair_page, pair_values
 from needle_bringup.report_page import build_page, verdict_text
-from needle_bringup.run_summary import summarize
+from needle_bringup.run_summary import summarize, tip_error
+from needle_bringup.stage_timing import StageTiming, stage_timings
+from needle_bringup.step_figures import innovation_figure, timing_figure
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
 
@@ -20,17 +30,20 @@ PAGE = "report.html"
 
 _DESCRIPTION = """
 Shows how a recorded run went: did the tip reach the wanted plane, how far off was it on the way,
-what did the cameras see. Everything comes from the bag.
+what did the cameras see, how long did each stage take, what went wrong when. Everything comes from
+the bag.
 
 Writes into the bag's directory (or --output): report.html, one file with all figures in it that
-opens in any browser and prints; and the figures as PNG files.
+opens in any browser and prints; and the figures as PNG files. With two bags: one page that compares
+them, compared_with_<A>.html, into the second bag's directory (or --output).
 """
 _EXAMPLES = """
 examples:
   ros2 run needle_bringup report bags/2026-03-01_10-20-30_camera_paper
   ros2 run needle_bringup report BAG --json figures.json --output /tmp/report
+  ros2 run needle_bringup report bags/paper_run bags/best_run
 
-exit codes: 0 done; 2 the bag is missing, broken, unfinished, or not of a needle run
+exit codes: 0 done; 2 a bag is missing, broken, unfinished, or not of a needle run
 """
 
 
@@ -56,54 +69,131 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     UserError
         If a file cannot be written or the bag's images cannot be read.
     """
-    target = run.path if directory is None else directory
-    figures = figures_of(run)
-    images = images_figure(run)
-    if images is not None:
-        figures["images"] = images
+    timings = stage_timings(run)
+    data = {name: _png(figure) for name, figure in figures_of(run, timings).items()}
+    files = {f"{name}.png": png for name, png in data.items()}
+    files[PAGE] = build_page(run, summary, data, timings).encode()
+    return _write(run.path if directory is None else directory, files)
+
+
+def write_pair_report(
+    runs: tuple[Run, Run],
+    summaries: tuple[dict[str, JsonValue], dict[str, JsonValue]],
+    directory: Path | None = None,
+) -> Path:
+    """Write the page that compares two runs.
+
+    Parameters
+    ----------
+    runs, summaries : pairs
+        Both runs and their figures.
+    directory : Path, optional
+        Where to; the second bag's directory by default.
+
+    Returns
+    -------
+    Path
+        The page written.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    data = {name: _png(figure) for name, figure in pair_figures(*runs).items()}
+    name = f"compared_with_{runs[0].path.absolute().name}.html"
+    page = build_pair_page(runs, summaries, data).encode()
+    return _write(runs[1].path if directory is None else directory, {name: page})
+
+
+def _write(directory: Path, files: Mapping[str, bytes]) -> Path:
+    """Write files into a folder; return the path of the last."""
+    path = directory
     try:
-        target.mkdir(parents=True, exist_ok=True)
-        data: dict[str, bytes] = {}
-        for name, figure in figures.items():
-            buffer = io.BytesIO()
-            save(figure, buffer)
-            data[name] = buffer.getvalue()
-            (target / f"{name}.png").write_bytes(data[name])
-        page = target / PAGE
-        page.write_text(build_page(run, summary, data), encoding="utf-8")
+        directory.mkdir(parents=True, exist_ok=True)
+        for name, data in files.items():
+            path = directory / name
+            path.write_bytes(data)
     except OSError as error:
-        raise UserError(f"cannot write the report into {target}: {error.strerror}") from error
-    return page
+        raise UserError(f"cannot write the report into {directory}: {error.strerror}") from error
+    return path
+
+
+def _png(figure: Figure) -> bytes:
+    buffer = io.BytesIO()
+    save(figure, buffer)
+    return buffer.getvalue()
+
+
+def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure]:
+    """Return the figures of a run by their file's name, without those with nothing in them.
+
+    Parameters
+    ----------
+    run : Run
+        The recorded run.
+    timings : sequence of StageTiming
+        Its stages (`stage_timing.stage_timings`).
+    """
+    found = innovations(run)
+    figures = {
+        "states": states_figure(run),
+        "path": path_figure(run),
+        "errors": error_figure(run) if len(tip_error(run)) else None,
+        "innovation": None if found is None else innovation_figure(run, found),
+        "images": images_figure(run),
+        "timing": timing_figure(run, timings) if timings else None,
+        "events": event_figure(run),
+    }
+    return {name: figure for name, figure in figures.items() if figure is not None}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="report",
         description=_DESCRIPTION,
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
+    parser.add_argument(
+        "other", type=Path, nargs="?", metavar="OTHER_BAG", help="compare BAG with this one"
+    )
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the figures of the run as flat JSON"
     )
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="write here and not into the bag's directory"
     )
-    options = parser.parse_args(arguments)
+    return run_command(lambda: _report(parser.parse_args(arguments)))
 
-    def command() -> int:
-        run = read_run(options.bag)
-        summary = summarize(run)
-        page = write_report(run, summary, options.output)
-        if options.json is not None:
-            write_json(options.json, summary)
+
+def _report(given: argparse.Namespace) -> int:
+    first = read_run(given.bag)
+    summary = summarize(first)
+    if given.other is None:
+        page = write_report(first, summary, given.output)
         words, sentence = verdict_text(summary)
         print(f"{words}: {sentence}\n{page}")
-        return EXIT_DONE
+    else:
+        second = read_run(given.other)
+        summaries = (summary, summarize(second))
+        page = write_pair_report((first, second), summaries, given.output)
+        for letter, figures in zip("AB", summaries, strict=True):
+            words, sentence = verdict_text(figures)
+            print(f"{letter} {words}: {sentence}")
+        print(page)
+        summary = pair_values(summaries)
+    if given.json is not None:
+        write_json(given.json, summary)
+    return EXIT_DONE
 
-    return run_command(command)
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see --help")
 
 
 if __name__ == "__main__":

@@ -56,6 +56,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "insertion_final_mm": _mm(float(insertion.max())) if len(insertion) else None,
         "rotation_total_deg": _rotation_total(run),
         "tips": len(run.tips),
+        "tips_not_finite": int(np.sum(~np.isfinite(run.tips.values).all(axis=1))),
         "tips_missed": int(np.sum(~np.isfinite(run.tip_covariances.values).all(axis=1))),
         "steps_aborted": len(run.results) - steps,
         "steps_per_s": _steps_per_second(run, steps),
@@ -84,9 +85,18 @@ def true_r1(run: Run) -> Floats:
 
 
 def tip_error(run: Run) -> Floats:
-    """Return measured minus true tip in `rig` [m], (N, 3), where both have the same stamp."""
-    here, there = run.tips.at(run.truth.stamps)
-    return run.tips.values[here] - run.truth.values[there, :3]
+    """Return measured minus true tip in `rig` [m], (N, 3), where both have the same stamp.
+
+    A tip that is not finite measures nothing: it is left out here and counted in the summary.
+    """
+    here, there = finite_tips(run).at(run.truth.stamps)
+    return finite_tips(run).values[here] - run.truth.values[there, :3]
+
+
+def finite_tips(run: Run) -> Series:
+    """Return the measured tips that are numbers."""
+    finite = np.isfinite(run.tips.values).all(axis=1)
+    return Series(run.tips.stamps[finite], run.tips.values[finite], run.tips.received[finite])
 
 
 def reduced_states(poses: Series, offset: float = 0.0) -> Floats:

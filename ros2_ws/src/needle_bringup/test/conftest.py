@@ -101,6 +101,7 @@ def write_run(
     done: bool = True,
     calibration: str = "",
     namespace: str = "/",
+    bad_tip: int | None = None,
 ) -> Path:
     """A needle that goes from r1 = -3 mm to FINAL_R1 on a cosine, measured TIP_ERROR off."""
     out = SyntheticBag(directory, namespace)
@@ -149,7 +150,7 @@ def write_run(
         point = message(
             "geometry_msgs/msg/PointStamped",
             header=header(time),
-            point=vector(tip + TIP_ERROR, "Point"),
+            point=vector(tip + (np.nan if number == bad_tip else TIP_ERROR), "Point"),
         )
         out.put("needle/tip", "geometry_msgs/msg/PointStamped", point)
         reduced = message(

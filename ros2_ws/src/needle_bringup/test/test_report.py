@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 from collections.abc import Callable
@@ -8,22 +9,25 @@ from pathlib import Path
 import pytest
 
 from needle_bringup import report
-from needle_bringup.bag_reader import read_run
+from needle_bringup.bag_reader import HealthEvent, Result, read_run
+from needle_bringup.event_figure import lanes_of
 from needle_bringup.report_page import verdict_text
 from needle_bringup.run_summary import summarize
 
 MakeRun = Callable[..., Path]
+
+REGRESSION = Path(__file__).resolve().parents[4] / "bags" / "regression"
 
 
 def test_report_is_one_file_with_its_figures(make_run: MakeRun) -> None:
     bag = make_run()
     assert report.main([str(bag)]) == 0
     page = (bag / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 3
+    assert page.count("data:image/png;base64,") == 5
     assert not re.search(r"(src|href)=.(?!data:)", page)
     assert "<script" not in page
     assert "Converged" in page
-    for name in ("states", "path", "errors"):
+    for name in ("states", "path", "errors", "timing", "events"):
         assert (bag / f"{name}.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -43,7 +47,62 @@ def test_report_without_truth(make_run: MakeRun) -> None:
     assert report.main([str(bag)]) == 0
     page = (bag / "report.html").read_text()
     assert "No ground truth" in page
-    assert page.count("data:image/png;base64,") == 2
+    assert page.count("data:image/png;base64,") == 4
+
+
+def test_a_tip_that_is_not_a_number_spoils_no_figure(make_run: MakeRun) -> None:
+    bag = make_run(bad_tip=60)
+    summary = summarize(read_run(bag))
+    assert summary["tip_error_p95_mm"] == pytest.approx(0.5)
+    assert summary["tips_not_finite"] == 1
+    assert report.main([str(bag)]) == 0
+
+
+def test_the_regression_bag_shows_everything(tmp_path: Path) -> None:
+    assert report.main([str(REGRESSION), "--output", str(tmp_path)]) == 0
+    page = (tmp_path / "report.html").read_text()
+    for heading in ("What the cameras saw", "Innovation and gate", "Timing of each stage"):
+        assert f"<h2>{heading}</h2>" in page
+    rows = re.findall(r"<tr><td>(\w+)</td><td>[^<]*</td><td>(\d+)</td>", page)
+    assert [name for name, _ in rows] == ["tracker", "controller", "device", "camera"]
+    assert all(120 <= int(count) <= 121 for _, count in rows)
+
+
+def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path) -> None:
+    first, second = make_run("first"), make_run("second", steps=110, done=False)
+    figures = tmp_path / "figures.json"
+    assert report.main([str(first), str(second), "--json", str(figures)]) == 0
+    page = (second / "compared_with_first.html").read_text()
+    assert page.count("data:image/png;base64,") == 3
+    assert not re.search(r"(src|href)=.(?!data:)", page)
+    assert "Converged / Not finished" in page
+    values = json.loads(figures.read_text())
+    assert values["a_steps"] == 120
+    assert values["difference_steps"] == -10
+    assert values["difference_r1_initial_mm"] == 0.0
+
+
+def test_lanes_show_what_was_when(make_run: MakeRun) -> None:
+    run = read_run(make_run(steps=60, done=False))
+    second = 10**9
+    begin = run.controller_status[0].log_time
+    health = [
+        HealthEvent(begin + second, "stereo_tracker: track", 1, "LOST"),
+        HealthEvent(begin + 2 * second, "stereo_tracker: track", 0, "ok"),
+    ]
+    stopped = Result(begin + second, 0, "aborted: hold released")
+    lanes = {
+        lane.name: lane.spans
+        for lane in lanes_of(
+            dataclasses.replace(run, health=health, results=[*run.results, stopped])
+        )
+    }
+    assert set(lanes) == {"controller", "device", "stereo_tracker: track", "aborted steps"}
+    (warning,) = lanes["stereo_tracker: track"]
+    assert (warning.begin, warning.end) == (begin + second, begin + 2 * second)
+    assert len(lanes["aborted steps"]) == 1
+    (steering,) = lanes["controller"]
+    assert steering.begin == begin
 
 
 def test_verdicts(make_run: MakeRun) -> None:
