@@ -22,5 +22,7 @@ setup(
     maintainer_email="maintainers@needle-steering.invalid",
     description="Motion supervisor of the insertion and rotation axes: states, limits, hold, stop.",
     license="Apache-2.0",
-    entry_points={"console_scripts": []},
+    entry_points={
+        "console_scripts": ["device_driver = needle_device_driver.device_driver_node:main"]
+    },
 )

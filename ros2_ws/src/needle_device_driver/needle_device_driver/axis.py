@@ -5,9 +5,23 @@ from __future__ import annotations
 import abc
 import dataclasses
 
+from needle_device_driver.rules import Rule
+
 
 class AxisError(Exception):
-    """An axis could not take an order; the text says which axis and why."""
+    """An axis could not take an order; the text says which axis and why.
+
+    Parameters
+    ----------
+    text : str
+        One sentence.
+    rule : Rule
+        The rule behind it.
+    """
+
+    def __init__(self, text: str, rule: Rule = Rule.ONE_FAULT_STOPS_BOTH) -> None:
+        super().__init__(text)
+        self.rule = rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,6 +46,12 @@ class AxisSnapshot:
         Whether the home switch is touched.
     fault : str
         Why the axis refuses to move; empty: no fault.
+    fault_rule : Rule
+        The rule behind the fault.
+    ready : bool
+        Whether a move would begin at once: not while a powered axis still comes to rest.
+    origin : int
+        Changes whenever `position` begins to count from elsewhere.
     """
 
     time: float
@@ -42,13 +62,23 @@ class AxisSnapshot:
     moving: bool
     at_home_switch: bool
     fault: str
+    fault_rule: Rule = Rule.ONE_FAULT_STOPS_BOTH
+    ready: bool = True
+    origin: int = 0
 
 
 class Axis(abc.ABC):
     """One axis. Positions in m or rad, speeds in m/s or rad/s, never negative.
 
     No order that moves waits until it is carried out; `poll` tells. Any may raise `AxisError`.
+
+    Attributes
+    ----------
+    actuated : bool
+        Whether the axis moves by itself; one that a hand moves only says where it is.
     """
+
+    actuated = True
 
     @abc.abstractmethod
     def configure(self) -> None:
@@ -56,7 +86,7 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def power(self, on: bool) -> None:
-        """Switch the axis on, its target being where it is, or off; moves nothing."""
+        """Switch the axis on, its target being where it comes to rest, or off; moves nothing."""
 
     @abc.abstractmethod
     def home(self, speed: float) -> None:
@@ -71,7 +101,7 @@ class Axis(abc.ABC):
 
     @abc.abstractmethod
     def stop(self) -> None:
-        """Stop as fast as the axis can and forget the target."""
+        """Stop as fast as the axis can and forget the target; `power` makes it ready again."""
 
     @abc.abstractmethod
     def reset(self) -> None:

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from needle_device_driver.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.rules import Rule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,6 +26,11 @@ class PairSnapshot:
         """Whether both axes are able to move."""
         return self.insertion.powered and self.rotation.powered
 
+    @property
+    def ready(self) -> bool:
+        """Whether both axes would begin to move at once."""
+        return self.insertion.ready and self.rotation.ready
+
     def age(self, now: float) -> float:
         """Return the age of the older reply [s]."""
         return now - min(self.insertion.time, self.rotation.time)
@@ -38,6 +44,12 @@ class PairSnapshot:
         if self.rotation.fault:
             faults.append(f"rotation axis: {self.rotation.fault}")
         return "; ".join(faults)
+
+    @property
+    def fault_rule(self) -> Rule:
+        """The rule behind the first fault."""
+        axis = self.insertion if self.insertion.fault else self.rotation
+        return axis.fault_rule
 
 
 class AxisPair:
@@ -61,14 +73,14 @@ class AxisPair:
         AxisError
             What either raised, after both were tried.
         """
-        errors = []
+        errors: list[AxisError] = []
         for axis in (self.insertion, self.rotation):
             try:
                 order(axis)
             except AxisError as error:
-                errors.append(str(error))
+                errors.append(error)
         if errors:
-            raise AxisError("; ".join(errors))
+            raise AxisError("; ".join(map(str, errors)), errors[0].rule)
 
     def poll(self, now: float) -> PairSnapshot:
         """Return the newest replies; `now` is the steady time [s]."""

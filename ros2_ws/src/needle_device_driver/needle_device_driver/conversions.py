@@ -86,6 +86,7 @@ def to_diagnostic(status: DeviceStatus) -> Diagnostic:
             "needle_out_confirmed": "true" if status.needle_out_confirmed else "false",
             "watchdog_trips": str(status.watchdog_trips),
             "commands_refused": str(status.commands_refused),
+            "needs_time": "true" if status.needs_time else "false",
         },
     )
 

@@ -47,6 +47,8 @@ class SafetyLimits:
         Largest distance of an axis from its set-point [m], [rad].
     insertion_tolerance, rotation_tolerance : float
         A motion has ended when each axis is so close to its target [m], [rad].
+    settling_time : float
+        How long an axis may take for that after its last set-point [s].
     """
 
     max_depth: float = 0.2
@@ -65,6 +67,7 @@ class SafetyLimits:
     rotation_following_error: float = 0.1
     insertion_tolerance: float = 1e-6
     rotation_tolerance: float = 1e-4
+    settling_time: float = 1.0
 
     def __post_init__(self) -> None:
         """Refuse bounds that bound nothing.

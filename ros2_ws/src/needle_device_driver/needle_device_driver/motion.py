@@ -54,6 +54,23 @@ class CoordinatedMotion:
         self._progress += rate * period
         if self._progress > 1.0 - 1e-9:
             self._progress = 1.0
+        return self._set_point(rate)
+
+    def follow(self, insertion: float, max_rotation_rate: float, period: float) -> SetPoint:
+        """Return the set-point for an insertion that a hand has reached.
+
+        The rotation never goes back, and no faster than `max_rotation_rate` [rad/s] over the
+        `period` [s]: after a push that was faster it comes in late.
+        """
+        way = self.end[0] - self._start[0]
+        reached = min(max((insertion - self._start[0]) / way, self._progress), 1.0)
+        turn = abs(self.end[1] - self._start[1])
+        fastest = max_rotation_rate * period / turn if turn > 0.0 else 1.0
+        step = min(reached - self._progress, fastest)
+        self._progress += step
+        return self._set_point(step / period)
+
+    def _set_point(self, rate: float) -> SetPoint:
         insertion, rotation = (
             # Exactly the target at the end: start + (end - start) is not.
             end if self.complete else start + self._progress * (end - start)

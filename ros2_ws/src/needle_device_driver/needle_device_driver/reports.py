@@ -90,6 +90,8 @@ class DeviceStatus:
         How often a hold, tip or reply was too old.
     commands_refused : int
         How many commands were refused.
+    needs_time : bool
+        Whether something goes on when time does: a simulated clock may stand still otherwise.
     """
 
     state: State
@@ -104,6 +106,7 @@ class DeviceStatus:
     needle_out_confirmed: bool
     watchdog_trips: int
     commands_refused: int
+    needs_time: bool
 
 
 @dataclasses.dataclass(frozen=True)

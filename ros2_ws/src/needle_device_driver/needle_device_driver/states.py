@@ -30,6 +30,7 @@ class Trigger(enum.Enum):
     ESTOP = "estop"
     RESET = "reset"
     RESET_UNCONFIGURED = "reset before configuration"
+    DECONFIGURE = "deconfigure"
 
 
 class Activity(enum.Enum):
@@ -43,6 +44,7 @@ class Activity(enum.Enum):
 
 TRANSITIONS: dict[tuple[State, Trigger], State] = {
     (State.UNCONFIGURED, Trigger.CONFIGURE): State.DISABLED,
+    (State.DISABLED, Trigger.DECONFIGURE): State.UNCONFIGURED,
     (State.DISABLED, Trigger.ENABLE): State.HOLDING,
     (State.HOLDING, Trigger.DISABLE): State.DISABLED,
     (State.MOVING, Trigger.DISABLE): State.DISABLED,

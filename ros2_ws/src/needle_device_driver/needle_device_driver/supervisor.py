@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from needle_device_driver.axis import Axis, AxisError
 from needle_device_driver.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.command import Command, CommandContext, Refusal, check_command
 from needle_device_driver.hold import Hold, HoldMessage
 from needle_device_driver.limits import SafetyLimits
-from needle_device_driver.motion import CoordinatedMotion, SetPoint
+from needle_device_driver.motion_run import MotionRun
 from needle_device_driver.reports import (
     SUCCEEDED,
     DeviceStatus,
@@ -20,7 +22,7 @@ from needle_device_driver.reports import (
 from needle_device_driver.rules import Rule
 from needle_device_driver.stamp_ages import StampAges
 from needle_device_driver.states import Activity, State, Trigger, next_state
-from needle_device_driver.watch import arrived, axes_problem, following_problem
+from needle_device_driver.watch import axes_problem
 from needle_device_driver.way_out import WayOut
 
 _READY = (State.DISABLED, State.HOLDING, State.MOVING)
@@ -42,11 +44,24 @@ class MotionSupervisor:
     pause_on_lapse : bool
         A hold that falls silent pauses instead of aborting: only for a simulation in lock step,
         where the axes' own time stands still meanwhile. A release always aborts.
+    feedback_delay : int
+        How many cycles after its order a set-point shows in the axes' snapshots.
+    switching : callable, optional
+        Returns whether an axis is on its way to where it was ordered, apart from set-points.
     """
 
     def __init__(
-        self, insertion: Axis, rotation: Axis, limits: SafetyLimits, *, pause_on_lapse: bool = False
+        self,
+        insertion: Axis,
+        rotation: Axis,
+        limits: SafetyLimits,
+        *,
+        pause_on_lapse: bool = False,
+        feedback_delay: int = 0,
+        switching: Callable[[], bool] = lambda: False,
     ) -> None:
+        self._feedback_delay = feedback_delay
+        self._switching = switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._pause_on_lapse = pause_on_lapse
@@ -59,8 +74,7 @@ class MotionSupervisor:
         self._needle_out = False
         self._snapshot: PairSnapshot | None = None
         self._seen_powered = False
-        self._motion: CoordinatedMotion | None = None
-        self._set_point: SetPoint | None = None
+        self._run: MotionRun | None = None
         self._step_stamp_ns: int | None = None
         self._last_stamp_ns: int | None = None
         self._homing_time = 0.0
@@ -128,6 +142,7 @@ class MotionSupervisor:
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._watchdog_trips,
             commands_refused=self._commands_refused,
+            needs_time=self.may_move(now) or self._switching(),
         )
 
     # ---- what comes from outside --------------------------------------------------------------
@@ -139,7 +154,7 @@ class MotionSupervisor:
         try:
             self._axes.each(lambda axis: axis.configure())
         except AxisError as error:
-            self.fail(str(error))
+            self.fail(str(error), error.rule)
             return Reply(False, str(error))
         self._configured = True
         self._go(Trigger.CONFIGURE, "configured")
@@ -151,6 +166,22 @@ class MotionSupervisor:
         if self._activity is not Activity.NONE:
             self._end_motion("aborted: the device is shut down", stop=True)
         self._axes.each(lambda axis: axis.close())
+
+    def deconfigure(self) -> Reply:
+        """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
+        if self._state in (State.HOLDING, State.MOVING):
+            self._disable()
+        if self._configured:
+            self._configured = False
+            try:
+                self._axes.each(lambda axis: axis.close())
+            except AxisError as error:
+                self.fail(str(error), error.rule)
+        if self._state is not State.DISABLED:
+            return Reply(False, f"the device is {self._state.value}")
+        self._snapshot = None
+        self._go(Trigger.DECONFIGURE, "deconfigured")
+        return Reply(True, "deconfigured")
 
     def note_time(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
@@ -200,10 +231,9 @@ class MotionSupervisor:
         if isinstance(at, Refusal):
             self._refuse(command, at)
             return
-        here = (at.insertion.position, at.rotation.position)
         context = CommandContext(
-            insertion=here[0],
-            rotation=here[1],
+            insertion=at.insertion.position,
+            rotation=at.rotation.position,
             homed=at.homed,
             last_stamp_ns=self._last_stamp_ns,
             tip_age=self._ages.age(command.stamp_ns, now),
@@ -215,8 +245,7 @@ class MotionSupervisor:
             return
         self._needle_out = False
         self._last_stamp_ns = self._step_stamp_ns = command.stamp_ns
-        there = (step.insertion, step.rotation)
-        self._start(Activity.STEP, CoordinatedMotion(here, there, step.duration))
+        self._start(Activity.STEP, (step.insertion, step.rotation), step.duration, at)
 
     def count_watchdog_trip(self) -> None:
         """Count a watchdog of the supervisor's owner among its own."""
@@ -236,7 +265,7 @@ class MotionSupervisor:
         try:
             self._axes.each(lambda axis: axis.power(True))
         except AxisError as error:
-            self.fail(str(error), Rule.ONE_FAULT_STOPS_BOTH)
+            self.fail(str(error), error.rule)
             return Reply(False, str(error))
         self._hold.require_new_press()
         self._hold_refusals.clear()
@@ -262,7 +291,7 @@ class MotionSupervisor:
             self._axes.insertion.home(self._limits.homing_speed)
             self._axes.rotation.home(self._limits.homing_rotation_rate)
         except AxisError as error:
-            self.fail(str(error), Rule.ONE_FAULT_STOPS_BOTH)
+            self.fail(str(error), error.rule)
             return Reply(False, str(error))
         self._seen_powered = False
         self._homing_time = 0.0
@@ -271,7 +300,7 @@ class MotionSupervisor:
         self.observe(now)
         return Reply(True, "homing" if self._activity is Activity.HOMING else "homed")
 
-    def retract(self, now: float) -> Reply:
+    def retract(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
         """Begin to draw the needle out: insertion axis only, slowly, while the hold lasts."""
         self._watch_hold(now)
         if self._state is not State.HOLDING:
@@ -280,20 +309,18 @@ class MotionSupervisor:
             return Reply(False, "press and keep the hold first")
         if self._snapshot is None or not self._snapshot.powered:
             return Reply(False, "the axes are not powered yet")
+        if not self._axes.insertion.actuated:
+            return Reply(False, "the insertion axis is moved by hand: draw the needle out by hand")
         insertion = self._snapshot.insertion
-        rotation = self._snapshot.rotation.position
         target = self._way_out.target(insertion)
         distance = insertion.position - target
         if distance <= self._limits.insertion_tolerance or insertion.at_home_switch:
             return Reply(True, "the needle is out")
-        self._start(
-            Activity.RETRACTION,
-            CoordinatedMotion(
-                (insertion.position, rotation),
-                (target, rotation),
-                distance / self._limits.retraction_speed,
-            ),
-        )
+        end = (target, self._snapshot.rotation.position)
+        duration = distance / self._limits.retraction_speed
+        self._start(Activity.RETRACTION, end, duration, self._snapshot)
+        if self._run is None:
+            return Reply(False, self._fault)
         return Reply(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
 
     def stop(self) -> Reply:
@@ -346,23 +373,22 @@ class MotionSupervisor:
                 )
             return
         self._watch_hold(now)
-        if self._motion is None or self._snapshot is None or not self.may_move(now):
+        if self._run is None or self._snapshot is None or not self.may_move(now):
             return
-        if self._set_point is not None:
-            problem = following_problem(
-                self._set_point, self._snapshot, self._activity, self._limits
-            )
-            if problem is not None:
-                self.fail(problem[1], problem[0])
-                return
-        set_point = self._motion.advance(period, self._hold.speed_scale)
-        self._set_point = set_point
+        problem = self._run.problem(self._snapshot)
+        if problem is not None:
+            self.fail(problem[1], problem[0])
+            return
+        set_point = self._run.advance(self._snapshot, period, self._hold.speed_scale)
+        if set_point is None:
+            return
         try:
-            self._axes.insertion.start_move(set_point.insertion, set_point.insertion_speed)
+            if self._axes.insertion.actuated:
+                self._axes.insertion.start_move(set_point.insertion, set_point.insertion_speed)
             if self._activity is Activity.STEP:
                 self._axes.rotation.start_move(set_point.rotation, set_point.rotation_speed)
         except AxisError as error:
-            self.fail(str(error), Rule.ONE_FAULT_STOPS_BOTH)
+            self.fail(str(error), error.rule)
 
     def observe(self, now: float) -> None:
         """Read the axes, watch over them and the hold, and end what has ended."""
@@ -373,7 +399,7 @@ class MotionSupervisor:
         self._watch_hold(now)
         if self._activity is Activity.HOMING:
             self._end_homing(at)
-        elif self._motion is not None and arrived(self._motion, at, self._activity, self._limits):
+        elif self._run is not None and self._run.arrived(at):
             # At the switch a retraction may have a target still.
             self._end_motion(SUCCEEDED, stop=self._activity is Activity.RETRACTION)
             self._go(Trigger.MOTION_END, "")
@@ -436,22 +462,38 @@ class MotionSupervisor:
             return Reply(False, error)
         return Reply(True, "disabled")
 
-    def _start(self, activity: Activity, motion: CoordinatedMotion) -> None:
+    def _start(
+        self, activity: Activity, end: tuple[float, float], duration: float, at: PairSnapshot
+    ) -> None:
         self._activity = activity
-        self._motion = motion
-        self._set_point = None
+        self._run = MotionRun(
+            activity,
+            end,
+            duration,
+            at,
+            self._limits,
+            feedback_delay=self._feedback_delay,
+            pushed=not self._axes.insertion.actuated,
+        )
         self._go(Trigger.MOTION_START, "")
+        if at.ready:
+            return
+        try:
+            # After a stop, an axis is made ready by the order to move, never by itself.
+            self._axes.each(lambda axis: axis.power(True))
+        except AxisError as error:
+            self.fail(str(error), error.rule)
 
     def _end_motion(self, outcome: str, *, stop: bool) -> None:
         if stop:
             try:
                 self._axes.each(lambda axis: axis.stop())
             except AxisError as error:
-                self._events.append(Notice(str(error), Rule.ONE_FAULT_STOPS_BOTH))
+                self._events.append(Notice(str(error), error.rule))
         if self._activity is Activity.STEP and self._step_stamp_ns is not None:
             self._events.append(StepResult(self._step_stamp_ns, outcome))
         self._activity = Activity.NONE
-        self._motion = self._set_point = self._step_stamp_ns = None
+        self._run = self._step_stamp_ns = None
 
     def _abort(self, reason: str) -> None:
         homing = self._activity is Activity.HOMING
@@ -479,7 +521,7 @@ class MotionSupervisor:
         try:
             self._axes.each(lambda axis: axis.power(False))
         except AxisError as error:
-            self.fail(str(error), Rule.ONE_FAULT_STOPS_BOTH)
+            self.fail(str(error), error.rule)
             return str(error)
         return ""
 

@@ -15,23 +15,19 @@ class WayOut:
     """
 
     def __init__(self, max_depth: float) -> None:
-        self._max_depth = max_depth
+        self._remaining = max_depth
         self._before: AxisSnapshot | None = None
-        self._unhomed_target: float | None = None
 
     def note(self, insertion: AxisSnapshot) -> None:
         """Take each snapshot of the insertion axis."""
-        if insertion.homed:
-            self._unhomed_target = None
-        elif self._before is not None and self._before.homed:
-            # The way is as long as the needle was deep, in whatever the axis counts now.
-            self._unhomed_target = insertion.position - max(self._before.position, 0.0)
-        self._before = insertion
+        before, self._before = self._before, insertion
+        if insertion.homed or before is None:
+            return
+        if before.homed:
+            self._remaining = max(before.position, 0.0)
+        elif before.origin == insertion.origin:
+            self._remaining += insertion.position - before.position
 
     def target(self, insertion: AxisSnapshot) -> float:
         """Return where a retraction ends at the latest, in the axis' present count [m]."""
-        if insertion.homed:
-            return 0.0
-        if self._unhomed_target is not None:
-            return self._unhomed_target
-        return insertion.position - self._max_depth
+        return 0.0 if insertion.homed else insertion.position - self._remaining

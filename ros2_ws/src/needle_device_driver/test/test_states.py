@@ -16,6 +16,7 @@ from needle_device_driver.states import (
 
 WAYS = {
     "UNCONFIGURED configure DISABLED",
+    "DISABLED deconfigure UNCONFIGURED",
     "DISABLED enable HOLDING",
     "HOLDING disable DISABLED",
     "MOVING disable DISABLED",

@@ -1,0 +1,295 @@
+"""The CAN bus behind whatever adapter there is: opened, watched, named when it is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import socket
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import can
+import canopen
+from canopen.objectdictionary import ObjectDictionary
+from canopen.sdo.client import SdoClient
+
+from needle_common.errors import UserError
+from needle_device_driver.slcan_bus import SlcanBus
+
+LINKS = ("slcan", "socketcan", "socketcand", "virtual")
+_RECEIVE_WAIT = 0.05
+_JOIN_WAIT = 1.0
+_CONNECT_WAIT = 1.0
+
+# Entries are addressed by number: canopen needs to know none by name.
+_NO_DICTIONARY: Any = ObjectDictionary()  # type: ignore[no-untyped-call]
+
+Callback = Callable[[bytes, float], None]
+
+
+class LinkError(Exception):
+    """The link cannot be opened or is lost; the text says which and why."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LinkSettings:
+    """Which adapter, and where.
+
+    Attributes
+    ----------
+    kind : str
+        `slcan` (serial adapter or pseudo-terminal), `socketcan` (Linux interface), `socketcand`
+        (a remote one over TCP) or `virtual` (inside this process: tests).
+    channel : str
+        Device file or interface name.
+    bitrate : int
+        Of the CAN bus [bit/s]; slcan only, the others are set up outside.
+    tty_baudrate : int
+        Of the serial port [bit/s]; slcan only.
+    host : str
+        socketcand only.
+    port : int
+        socketcand only.
+    """
+
+    kind: str
+    channel: str
+    bitrate: int = 500_000
+    tty_baudrate: int = 115_200
+    host: str = "localhost"
+    port: int = 29536
+
+    def __post_init__(self) -> None:
+        """Refuse what names no link.
+
+        Raises
+        ------
+        UserError
+            A kind that does not exist, no channel, or a bitrate that slcan does not have.
+        """
+        if self.kind not in LINKS:
+            raise UserError(f"link = {self.kind!r} is not one of {', '.join(LINKS)}")
+        if not self.channel:
+            raise UserError(f"channel is empty: name the {self.kind} device or interface")
+        if self.kind == "slcan" and self.bitrate not in SlcanBus._BITRATES:
+            known = ", ".join(str(rate) for rate in sorted(SlcanBus._BITRATES))
+            raise UserError(f"bitrate = {self.bitrate} bit/s: slcan has {known}")
+
+    def __str__(self) -> str:
+        """Return what messages call the link."""
+        if self.kind == "socketcand":
+            return f"socketcand {self.host}:{self.port} {self.channel}"
+        return f"{self.kind} {self.channel}"
+
+
+def open_bus(settings: LinkSettings) -> can.BusABC:
+    """Open the adapter.
+
+    Raises
+    ------
+    LinkError
+        If it is not there or does not take the settings.
+    """
+    try:
+        if settings.kind == "slcan":
+            return SlcanBus(
+                settings.channel, bitrate=settings.bitrate, tty_baudrate=settings.tty_baudrate
+            )
+        if settings.kind == "socketcand":
+            # python-can would try for ten seconds without a pause.
+            socket.create_connection((settings.host, settings.port), _CONNECT_WAIT).close()
+            return can.Bus(
+                interface="socketcand",
+                channel=settings.channel,
+                host=settings.host,
+                port=settings.port,
+                tcp_tune=True,
+            )
+        return can.Bus(interface=settings.kind, channel=settings.channel)
+    except (can.CanError, OSError, ValueError) as error:
+        raise LinkError(f"cannot open {settings}: {_plainly(error)}") from error
+
+
+def _plainly(error: Exception) -> str:
+    """Return an error as a person reads it: the system's own word where it has one."""
+    for cause in (error, error.__cause__, error.__context__):
+        if isinstance(cause, OSError) and cause.errno is not None:
+            return os.strerror(cause.errno)
+    return str(error)
+
+
+class _Network(canopen.Network):
+    """canopen's network, sending through the link that watches over the adapter."""
+
+    def __init__(self, link: CanLink) -> None:
+        super().__init__()
+        self._link = link
+
+    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
+        self._link.send(can_id, bytes(data))
+
+
+class CanLink:
+    """One CAN bus, to be opened, lost and opened again.
+
+    Frames are received in a thread of their own, so that their arrival has its true time; all
+    sending is the caller's, in the control loop: a loop that hangs sends nothing.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        Which adapter.
+    clock : callable
+        Steady time [s].
+    open_bus : callable
+        Opens the adapter.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        clock: Callable[[], float],
+        open_bus: Callable[[LinkSettings], can.BusABC] = open_bus,
+    ) -> None:
+        self.settings = settings
+        self.clock = clock
+        self.arrival = threading.Condition()
+        self.lost = ""
+        self.openings = 0
+        self.frames_sent = 0
+        self.frames_received = 0
+        self.error_frames = 0
+        self._open_bus = open_bus
+        self._bus: can.BusABC | None = None
+        self._network: canopen.Network | None = None
+        self._thread: threading.Thread | None = None
+        self._callbacks: dict[int, list[Callback]] = {}
+        self._sdo: dict[int, SdoClient] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the adapter is open, as far as anybody knows."""
+        return self._bus is not None and not self.lost
+
+    @property
+    def errors(self) -> int:
+        """How many error frames, lines that are no frame and refused frames there were."""
+        bus = self._bus
+        own = bus.malformed + bus.refused if isinstance(bus, SlcanBus) else 0
+        return self.error_frames + own
+
+    def open(self) -> None:
+        """Open the adapter and begin to receive; a lost one is opened anew.
+
+        Raises
+        ------
+        LinkError
+            If that is not possible.
+        """
+        if self.is_open:
+            return
+        self.close()
+        bus = self._open_bus(self.settings)
+        # canopen's network does not outlive a lost adapter: each opening has a new one.
+        self._network = _Network(self)
+        self._sdo = {}
+        self._bus = bus
+        self.lost = ""
+        self.openings += 1
+        self._thread = threading.Thread(
+            target=self._receive, args=(bus, self._network), name="can-receive", daemon=True
+        )
+        self._thread.start()
+
+    def close(self) -> None:
+        """Let go of the adapter. May be called twice."""
+        bus, self._bus = self._bus, None
+        if self._thread is not None:
+            self._thread.join(_JOIN_WAIT)
+            self._thread = None
+        if bus is not None:
+            # What is lost cannot be told to close.
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
+            _close_port(bus)
+
+    def subscribe(self, cob_id: int, callback: Callback) -> None:
+        """Call `callback(data, time)` in the receiving thread for each frame with this COB-ID."""
+        self._callbacks.setdefault(cob_id, []).append(callback)
+
+    def send(self, cob_id: int, data: bytes = b"") -> None:
+        """Send one frame.
+
+        Raises
+        ------
+        LinkError
+            If the link is closed or lost.
+        """
+        if self.lost:
+            raise LinkError(self.lost)
+        if self._bus is None:
+            raise LinkError(f"{self.settings} is not open")
+        try:
+            self._bus.send(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+        except (can.CanError, OSError) as error:
+            self._lose(error)
+            raise LinkError(self.lost) from error
+        self.frames_sent += 1
+
+    def sdo(self, node_id: int) -> SdoClient:
+        """Return the SDO client of a node, on the present opening of the adapter.
+
+        Raises
+        ------
+        LinkError
+            If the link is closed or lost.
+        """
+        if self._network is None or not self.is_open:
+            raise LinkError(self.lost or f"{self.settings} is not open")
+        if node_id not in self._sdo:
+            node = self._network.add_node(node_id, _NO_DICTIONARY)
+            client = node.sdo
+            client.RESPONSE_TIMEOUT = 0.1
+            client.MAX_RETRIES = 3
+            self._sdo[node_id] = client
+        return self._sdo[node_id]
+
+    def _lose(self, error: Exception) -> None:
+        with self.arrival:
+            if not self.lost:
+                self.lost = f"link {self.settings} is lost: {_plainly(error)}"
+            self.arrival.notify_all()
+
+    def _receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+        while self._bus is bus and not self.lost:
+            try:
+                message = bus.recv(_RECEIVE_WAIT)
+            # python-can's adapters raise what their operating system has.
+            except Exception as error:  # noqa: BLE001
+                if self._bus is bus:
+                    self._lose(error)
+                return
+            if message is not None:
+                self._dispatch(message, network)
+
+    def _dispatch(self, message: can.Message, network: canopen.Network) -> None:
+        if message.is_error_frame:
+            self.error_frames += 1
+            return
+        if message.is_remote_frame or message.is_extended_id:
+            return
+        now = self.clock()
+        self.frames_received += 1
+        data = bytearray(message.data)
+        for callback in self._callbacks.get(message.arbitration_id, ()):
+            callback(bytes(data), now)
+        network.notify(message.arbitration_id, data, now)
+
+
+def _close_port(bus: can.BusABC) -> None:
+    # slcan's shutdown tells the adapter first and keeps the port open where that fails.
+    if isinstance(bus, SlcanBus):
+        with contextlib.suppress(OSError):
+            bus.serialPortOrig.close()

@@ -1,0 +1,179 @@
+"""The state machine of a CiA 402 drive, as the driver sees and steers it."""
+
+from __future__ import annotations
+
+import enum
+from collections import deque
+
+
+class DriveState(enum.Enum):
+    """What the statusword says: its value under its mask."""
+
+    NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
+    SWITCH_ON_DISABLED = (0x4F, 0x40)
+    READY_TO_SWITCH_ON = (0x6F, 0x21)
+    SWITCHED_ON = (0x6F, 0x23)
+    OPERATION_ENABLED = (0x6F, 0x27)
+    QUICK_STOP_ACTIVE = (0x6F, 0x07)
+    FAULT_REACTION_ACTIVE = (0x4F, 0x0F)
+    FAULT = (0x4F, 0x08)
+
+
+class DriveCommand(enum.IntEnum):
+    """What the controlword orders, as it is sent in RPDO1."""
+
+    DISABLE_VOLTAGE = 0x00
+    QUICK_STOP = 0x02
+    SHUTDOWN = 0x06
+    SWITCH_ON = 0x07
+    ENABLE_OPERATION = 0x0F
+    FAULT_RESET = 0x80
+
+
+class Mode(enum.IntEnum):
+    """Modes of operation in use."""
+
+    HOMING = 6
+    CYCLIC_SYNCHRONOUS_POSITION = 8
+
+
+class Goal(enum.Enum):
+    """What the driver wants of a drive."""
+
+    OFF = "off"
+    ON = "on"
+    STOPPED = "stopped"
+
+
+# Controlword in homing mode: begin. Statusword: bits whose meaning depends on the mode.
+START_HOMING = 1 << 4
+TARGET_REACHED = 1 << 10
+HOMING_ATTAINED = 1 << 12
+FOLLOWING_ERROR = 1 << 13
+HOMING_ERROR = 1 << 13
+# 0x6502: supported modes.
+SUPPORTS_HOMING = 1 << 5
+SUPPORTS_CYCLIC_POSITION = 1 << 7
+
+FAULTS = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
+POWERED = frozenset({DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE})
+
+# CiA 402-2, the transitions that a controlword causes; the numbers are the standard's. A drive
+# makes 0, 1 (start), 13 and 14 (fault) by itself.
+TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
+    (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 2
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.SWITCH_ON): DriveState.SWITCHED_ON,  # 3
+    (DriveState.SWITCHED_ON, DriveCommand.ENABLE_OPERATION): DriveState.OPERATION_ENABLED,  # 4
+    (DriveState.OPERATION_ENABLED, DriveCommand.SWITCH_ON): DriveState.SWITCHED_ON,  # 5
+    (DriveState.SWITCHED_ON, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 6
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 7
+    (DriveState.READY_TO_SWITCH_ON, DriveCommand.DISABLE_VOLTAGE): (
+        DriveState.SWITCH_ON_DISABLED
+    ),  # 7
+    (DriveState.OPERATION_ENABLED, DriveCommand.SHUTDOWN): DriveState.READY_TO_SWITCH_ON,  # 8
+    (DriveState.OPERATION_ENABLED, DriveCommand.DISABLE_VOLTAGE): (
+        DriveState.SWITCH_ON_DISABLED
+    ),  # 9
+    (DriveState.SWITCHED_ON, DriveCommand.QUICK_STOP): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.SWITCHED_ON, DriveCommand.DISABLE_VOLTAGE): DriveState.SWITCH_ON_DISABLED,  # 10
+    (DriveState.OPERATION_ENABLED, DriveCommand.QUICK_STOP): DriveState.QUICK_STOP_ACTIVE,  # 11
+    (DriveState.QUICK_STOP_ACTIVE, DriveCommand.DISABLE_VOLTAGE): (
+        DriveState.SWITCH_ON_DISABLED
+    ),  # 12
+    (DriveState.FAULT, DriveCommand.FAULT_RESET): DriveState.SWITCH_ON_DISABLED,  # 15
+    (DriveState.QUICK_STOP_ACTIVE, DriveCommand.ENABLE_OPERATION): (
+        DriveState.OPERATION_ENABLED
+    ),  # 16
+}
+
+# The next command on the way to a goal. A fault is never acknowledged on the way.
+_ON = {
+    DriveState.NOT_READY_TO_SWITCH_ON: DriveCommand.DISABLE_VOLTAGE,
+    DriveState.SWITCH_ON_DISABLED: DriveCommand.SHUTDOWN,
+    DriveState.READY_TO_SWITCH_ON: DriveCommand.SWITCH_ON,
+    DriveState.SWITCHED_ON: DriveCommand.ENABLE_OPERATION,
+    DriveState.OPERATION_ENABLED: DriveCommand.ENABLE_OPERATION,
+    DriveState.QUICK_STOP_ACTIVE: DriveCommand.ENABLE_OPERATION,
+}
+# Off comes after a quick stop, never by letting a moving axis coast.
+_OFF_MOVING = {
+    DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP,
+    DriveState.QUICK_STOP_ACTIVE: DriveCommand.QUICK_STOP,
+}
+_OFF_AT_REST = {DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP}
+
+
+def drive_state(statusword: int) -> DriveState | None:
+    """Return the state that a statusword tells; None for a pattern that the standard lacks."""
+    for state in DriveState:
+        mask, value = state.value
+        if statusword & mask == value:
+            return state
+    return None
+
+
+def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> DriveCommand:
+    """Return the command that leads from a state towards a goal.
+
+    Parameters
+    ----------
+    goal : Goal
+        What is wanted.
+    state : DriveState or None
+        What the drive said last; None: nothing that is understood.
+    at_rest : bool
+        Whether the axis stands still.
+
+    Returns
+    -------
+    DriveCommand
+        A quick stop for STOPPED, whatever the state: a statusword may be older than a command.
+    """
+    if goal is Goal.STOPPED:
+        return DriveCommand.QUICK_STOP
+    if state is None:
+        return DriveCommand.DISABLE_VOLTAGE
+    if goal is Goal.ON:
+        if state is DriveState.QUICK_STOP_ACTIVE and not at_rest:
+            return DriveCommand.QUICK_STOP
+        return _ON.get(state, DriveCommand.DISABLE_VOLTAGE)
+    return (_OFF_AT_REST if at_rest else _OFF_MOVING).get(state, DriveCommand.DISABLE_VOLTAGE)
+
+
+class TransitionWatch:
+    """Tells a change of state that no command of the driver explains.
+
+    Commands and statuswords cross on the bus, so the last few commands count, in their order.
+    """
+
+    def __init__(self) -> None:
+        self._sent: deque[DriveCommand] = deque(maxlen=6)
+        self._seen: DriveState | None = None
+
+    def forget(self) -> None:
+        """Begin anew, after a reset or set-up."""
+        self._sent.clear()
+        self._seen = None
+
+    def sent(self, command: DriveCommand) -> None:
+        """Take a command that goes out."""
+        self._sent.append(command)
+
+    def unexplained(self, state: DriveState) -> str:
+        """Take the state now; return what the drive did by itself, empty when nothing.
+
+        Faults have a name of their own and are not told here.
+        """
+        before, self._seen = self._seen, state
+        if before is None or before is state or state in FAULTS or before in FAULTS:
+            return ""
+        if before is DriveState.NOT_READY_TO_SWITCH_ON:
+            return ""
+        reachable: set[DriveState] = {before}
+        for command in self._sent:
+            reachable |= {
+                TRANSITIONS[s, command] for s in tuple(reachable) if (s, command) in TRANSITIONS
+            }
+        if state in reachable:
+            return ""
+        return f"went from {before.name} to {state.name} by itself"

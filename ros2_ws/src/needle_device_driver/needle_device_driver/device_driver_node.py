@@ -1,0 +1,296 @@
+"""The `device_driver` executable: the `device/...` interface on real drives."""
+
+from __future__ import annotations
+
+import logging
+import signal
+import sys
+import time
+from types import FrameType
+from typing import Any
+
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
+
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.cli import EXIT_DONE
+from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.parameters import NodeParameters
+from needle_device_driver.can_link import CanLink
+from needle_device_driver.cia402_axis import Cia402Axis
+from needle_device_driver.device_interface_node import DeviceInterface
+from needle_device_driver.drive_cycle import DriveCycle
+from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.states import State
+from needle_device_driver.supervisor import MotionSupervisor
+
+HELP = """\
+device_driver: moves the needle's stepper stage and rotation servo, CiA 402 drives on a CAN bus.
+
+Publishes   joint_states (50 Hz), device/status, device/result
+Subscribes  device/joint_trajectory, device/hold, device/estop; /clock with use_sim_time
+Services    device/{home,retract,stop,reset}, device/{enable,confirm_needle_out}
+
+Nothing moves at start. To move: device/confirm_needle_out true, device/home, device/enable true,
+then press the hold and send steps. docs/hardware.md: wiring, adapters, bringing up new drives;
+docs/safety.md: every rule that stops or refuses a motion.
+
+It is a lifecycle node: `autostart` (default) configures and activates it, waiting up to
+`connect_timeout` for adapter and drives. Ctrl-C stops the axes and switches them off.
+Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
+"""
+
+PERIOD_NS = 20_000_000
+PERIOD = PERIOD_NS / NANOSECONDS
+# On a running clock the next cycle must come; a simulated one waits for this one's answers.
+_REPLY_WAIT = PERIOD / 2.0
+_RETRY = 0.25
+_LATE = 1.5 * PERIOD
+
+
+class DeviceDriverNode(LifecycleNode):
+    """Runs the cycle: set-points, SYNC, answers, supervision.
+
+    Parameters
+    ----------
+    node_arguments : dict
+        Passed on to rclpy's Node (a context of its own, parameter overrides).
+    """
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("device_driver", **node_arguments)
+        values = NodeParameters(self, DeviceDriverParameters).values
+        self._settings = values
+        self._sim_time = bool(self.get_parameter("use_sim_time").value)
+        if values.lock_step and not self._sim_time:
+            raise UserError(f"{self.get_fully_qualified_name()}: lock_step wants use_sim_time")
+        self._link = CanLink(values.link_settings, time.monotonic)
+        insertion, rotation = (
+            Cia402Axis(
+                name, values.drive(name), self._link, period=PERIOD, watchdog=values.watchdog
+            )
+            for name in ("insertion", "rotation")
+        )
+        self._drives = DriveCycle(self._link, (insertion, rotation))
+        self._supervisor = MotionSupervisor(
+            insertion,
+            rotation,
+            values.limits,
+            pause_on_lapse=values.lock_step,
+            feedback_delay=1,
+            switching=lambda: self._drives.needs_cycles,
+        )
+        self._active = False
+        self.ended = False
+        self._waiting_for = "the driver to be activated"
+        self._give_up_at = time.monotonic() + values.connect_timeout
+        self._retry_at = 0.0
+        self._cycle_ns: int | None = None
+        self._cycled_at: float | None = None
+        self._late_cycles = 0
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._device = DeviceInterface(
+            self,
+            self._supervisor,
+            self._diagnostics,
+            refuse=lambda: "" if self._active else f"waiting for {self._waiting_for}",
+        )
+        self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
+        self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
+        if self._sim_time:
+            self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+
+    # ---- the cycle ----------------------------------------------------------------------------
+
+    def _on_timer(self) -> None:
+        if self._supervisor.state is State.UNCONFIGURED:
+            self._start_by_itself()
+            return
+        if self._sim_time:
+            # Simulated time may stand still; watchdogs do not.
+            self._drives.beat()
+            self._supervisor.observe(time.monotonic())
+            self._device.report()
+            return
+        # A cycle that comes late is never made up for: set-points sent faster than the drives take
+        # them would be a speed that nobody asked for.
+        self._timer.reset()
+        now = time.monotonic()
+        self._late_cycles += self._cycled_at is not None and now - self._cycled_at > _LATE
+        self._cycled_at = now
+        self._cycle(self.get_clock().now().nanoseconds, _REPLY_WAIT)
+
+    def _on_clock(self, message: Clock) -> None:
+        ros_ns = to_nanoseconds(message.clock)
+        if self._supervisor.state is State.UNCONFIGURED:
+            return
+        if self._cycle_ns is not None and ros_ns < self._cycle_ns:
+            # Time was set back: another simulation.
+            self._cycle_ns = None
+        if self._cycle_ns is None or ros_ns >= self._cycle_ns + PERIOD_NS:
+            self._cycle_ns = ros_ns
+            self._cycle(ros_ns, self._settings.reply_age_limit)
+            return
+        self._supervisor.note_time(ros_ns, time.monotonic())
+        if ros_ns == self._cycle_ns:
+            # A clock that stands still is repeated for whoever comes late; so are the joints.
+            self._device.publish_joint_states(ros_ns)
+
+    def _cycle(self, ros_ns: int, wait: float) -> None:
+        now = time.monotonic()
+        self._supervisor.note_time(ros_ns, now)
+        self._supervisor.drive(PERIOD, now)
+        self._drives.exchange(wait)
+        self._supervisor.observe(time.monotonic())
+        self._device.report()
+        # Last: whoever waits for this cycle's joints has heard all that came of it.
+        self._device.publish_joint_states(ros_ns)
+
+    def _tell_health(self) -> None:
+        link = self._link
+        values = {
+            "link": str(link.settings),
+            "frames_sent": str(link.frames_sent),
+            "frames_received": str(link.frames_received),
+            "bus_errors": str(link.errors),
+            "late_cycles": str(self._late_cycles),
+            "unanswered_syncs": str(self._drives.unanswered),
+        }
+        level, message = Level.OK, "connected"
+        if link.lost:
+            level, message = Level.ERROR, link.lost
+        elif not link.is_open:
+            level, message = Level.WARN, f"waiting for {self._waiting_for}"
+        self._diagnostics.set("can", Diagnostic(level, message, values))
+
+    # ---- lifecycle ----------------------------------------------------------------------------
+
+    def _start_by_itself(self) -> None:
+        now = time.monotonic()
+        if not self._settings.autostart or now < self._retry_at or self.ended:
+            return
+        self._retry_at = now + _RETRY
+        why_not = self._drives.probe()
+        if not why_not:
+            self.trigger_configure()
+            self.trigger_activate()
+            return
+        if now > self._give_up_at:
+            raise UserError(f"{self.get_fully_qualified_name()}: {why_not}")
+        if not self._waiting_for.endswith(why_not):
+            self._waiting_for = f"the drives: {why_not}"
+            self.get_logger().info(f"waiting for {self._waiting_for}")
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Open the link and set both drives up; moves nothing."""
+        del state
+        now = time.monotonic()
+        if self._supervisor.state is not State.UNCONFIGURED:
+            # A fault from before the configuration; an emergency stop that is pressed stays.
+            self._supervisor.reset(now)
+        why_not = self._drives.probe()
+        if not why_not:
+            reply = self._supervisor.configure(time.monotonic())
+            why_not = "" if reply.success else reply.message
+        self._device.report()
+        if why_not:
+            self.get_logger().error(f"not configured: {why_not}")
+            return TransitionCallbackReturn.FAILURE
+        self._tell_health()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Answer to services from now on."""
+        del state
+        self._active = True
+        self.get_logger().info(f"both drives are there on {self._link.settings}")
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Stop and switch off."""
+        del state
+        self._active = False
+        self._waiting_for = "the driver to be activated"
+        self._supervisor.enable(False, time.monotonic())
+        self._device.report()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Switch off and let go of drives and link."""
+        del state
+        self._let_go()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Do as `on_cleanup` does, and end."""
+        del state
+        self._let_go()
+        self.ended = True
+        return TransitionCallbackReturn.SUCCESS
+
+    def _LifecycleNodeMixin__change_state(  # noqa: N802 - rclpy's own name for it
+        self, transition: int
+    ) -> TransitionCallbackReturn:
+        """Refuse a transition that the present state does not have; rclpy would end the node."""
+        try:
+            return super()._LifecycleNodeMixin__change_state(transition)
+        except RCLError as error:
+            self.get_logger().warning(f"transition refused: {error}")
+            return TransitionCallbackReturn.FAILURE
+
+    def close(self) -> None:
+        """Stop both axes, switch them off, let go of the link."""
+        self._active = False
+        self._let_go()
+
+    def _let_go(self) -> None:
+        self._active = False
+        self._supervisor.deconfigure()
+        self._device.report()
+        self._link.close()
+
+
+def main() -> int:
+    """Run device_driver; returns its exit code."""
+    # What canopen and python-can have to say comes as faults of the axes.
+    for name in ("canopen", "can"):
+        logging.getLogger(name).addHandler(logging.NullHandler())
+    ended = False
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        nonlocal ended
+        ended = True
+
+    # rclpy's own handlers would shut the context down before the axes are off.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, on_signal)
+
+    def spin(node: Node) -> int:
+        assert isinstance(node, DeviceDriverNode)
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            while not (ended or node.ended):
+                executor.spin_once(timeout_sec=0.1)
+        finally:
+            node.close()
+            executor.shutdown()
+        return EXIT_DONE
+
+    return run_node(
+        DeviceDriverNode,
+        help_text=HELP,
+        parameters=DeviceDriverParameters,
+        spin=spin,
+        signal_handlers=SignalHandlerOptions.NO,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,84 @@
+"""One cycle of all drives on a bus: commands and set-points, SYNC, answers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from needle_device_driver.axis import AxisError
+from needle_device_driver.can_link import CanLink, LinkError
+from needle_device_driver.cia402_axis import Cia402Axis
+from needle_device_driver.object_access import send_heartbeat
+from needle_device_driver.objects import SYNC
+
+
+class DriveCycle:
+    """Sends the cycle's frames and takes the answers.
+
+    Parameters
+    ----------
+    link : CanLink
+        The bus.
+    axes : sequence of Cia402Axis
+        All its drives.
+    """
+
+    def __init__(self, link: CanLink, axes: Sequence[Cia402Axis]) -> None:
+        self._link = link
+        self._axes = tuple(axes)
+        self.unanswered = 0
+
+    @property
+    def needs_cycles(self) -> bool:
+        """Whether a drive is on its way to where it was ordered, apart from set-points."""
+        return any(axis.needs_cycles for axis in self._axes)
+
+    def probe(self) -> str:
+        """Open the link and ask every drive who it is; return why that is not possible."""
+        try:
+            self._link.open()
+            for axis in self._axes:
+                axis.probe()
+        except (AxisError, LinkError) as error:
+            return str(error)
+        return ""
+
+    def beat(self) -> None:
+        """Tell the drives' watchdogs that the loop runs."""
+        if self._link.is_open:
+            # The link remembers its loss, and the axes report it.
+            try:
+                send_heartbeat(self._link)
+            except LinkError:
+                return
+
+    def exchange(self, wait: float) -> None:
+        """Run one cycle.
+
+        Parameters
+        ----------
+        wait : float
+            How long to wait for the drives' answers at most [s].
+        """
+        if not self._link.is_open:
+            return
+        try:
+            send_heartbeat(self._link)
+            for axis in self._axes:
+                axis.transmit()
+            for axis in self._axes:
+                axis.monitor.expect_answer()
+            self._link.send(SYNC)
+        except LinkError:
+            return
+        with self._link.arrival:
+            self._link.arrival.wait_for(
+                lambda: (
+                    bool(self._link.lost) or all(axis.monitor.answered() for axis in self._axes)
+                ),
+                wait,
+            )
+        for axis in self._axes:
+            axis.update()
+
+    def _answered(self) -> bool:
+        return all(axis.monitor.answered() for axis in self._axes)

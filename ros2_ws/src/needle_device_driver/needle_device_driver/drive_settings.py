@@ -1,0 +1,109 @@
+"""One drive's settings in SI, and how they become counts."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from needle_common.errors import OutOfBoundsError, UserError
+
+# Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
+HERE = (35, 37)
+SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
+HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveSettings:
+    """One axis' drive; lengths in m or rad.
+
+    Attributes
+    ----------
+    node_id : int
+        CANopen node id, 1..126.
+    counts_per_unit : float
+        Position counts a metre or radian, not negative.
+    reverse : bool
+        Whether positive counts are the negative direction.
+    speed, acceleration, quick_stop_deceleration : float
+        Fastest motion [unit/s]; ramps [unit/s^2].
+    homing_method : int
+        CiA 402 homing method.
+    following_error : float
+        The drive's own bound.
+    following_error_time : float
+        How long the drive lets it be exceeded [s].
+    max_torque : float
+        Share of the rated torque; 0: as the drive has it.
+    lower, upper : float
+        Software limits in the drive, from home.
+    tolerance : float
+        An axis that moves less in a cycle stands still.
+    actuated : bool
+        False: a hand moves it, the drive only says where it is.
+    """
+
+    node_id: int
+    counts_per_unit: float
+    reverse: bool
+    speed: float
+    acceleration: float
+    quick_stop_deceleration: float
+    homing_method: int
+    following_error: float
+    following_error_time: float
+    max_torque: float
+    lower: float
+    upper: float
+    tolerance: float
+    actuated: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what no drive can be set to.
+
+        Raises
+        ------
+        UserError
+            A value that is not finite, not positive where it must be, or no homing method.
+        """
+        if not 1 <= self.node_id <= 126:
+            raise OutOfBoundsError("node_id", self.node_id, 1, 126, "-")
+        for name in (
+            "counts_per_unit",
+            "speed",
+            "acceleration",
+            "quick_stop_deceleration",
+            "following_error",
+            "following_error_time",
+            "tolerance",
+        ):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise OutOfBoundsError(name, value, 0.0, math.inf, "SI")
+        if self.homing_method not in HOMING_METHODS:
+            raise UserError(f"homing_method = {self.homing_method} is none of CiA 402's")
+        if not self.lower < self.upper:
+            raise OutOfBoundsError("lower", self.lower, -math.inf, self.upper, "SI")
+
+    @property
+    def direction(self) -> int:
+        """1, or -1 where the drive counts the other way."""
+        return -1 if self.reverse else 1
+
+    def counts(self, position: float) -> int:
+        """Return the nearest count to a position; positions are absolute, so rounding stays."""
+        return self.direction * round(position * self.counts_per_unit)
+
+    def position(self, counts: int) -> float:
+        """Return the position of a count [m or rad]."""
+        return self.direction * counts / self.counts_per_unit
+
+    def magnitude(self, value: float) -> int:
+        """Return a distance, speed or ramp in counts, at least 1: 0 often means "no limit"."""
+        return max(1, round(value * self.counts_per_unit))
+
+    @property
+    def limits_counts(self) -> tuple[int, int]:
+        """Software limits in counts, lower first."""
+        limits = sorted((self.counts(self.lower), self.counts(self.upper)))
+        return limits[0], limits[1]

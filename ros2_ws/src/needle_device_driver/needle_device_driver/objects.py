@@ -1,0 +1,181 @@
+"""The entries of a CiA 402 drive's object dictionary that the driver reads and writes."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+
+from needle_common.errors import OutOfBoundsError
+
+
+@dataclasses.dataclass(frozen=True)
+class Entry:
+    """One entry: where it is and what it holds.
+
+    Attributes
+    ----------
+    index, subindex : int
+        Its address.
+    format : str
+        `struct` format, little-endian.
+    name : str
+        As in CiA 301 and CiA 402.
+    """
+
+    index: int
+    subindex: int
+    format: str
+    name: str
+
+    def __str__(self) -> str:
+        """Return address and name as messages have them."""
+        return f"0x{self.index:04X}:{self.subindex} {self.name}"
+
+    @property
+    def mapping(self) -> int:
+        """The entry as a PDO's mapping parameter names it."""
+        return self.index << 16 | self.subindex << 8 | 8 * struct.calcsize(self.format)
+
+    def pack(self, value: int) -> bytes:
+        """Return a value as bytes.
+
+        Raises
+        ------
+        OutOfBoundsError
+            If the entry cannot hold it.
+        """
+        try:
+            return struct.pack(self.format, value)
+        except struct.error:
+            bits = 8 * struct.calcsize(self.format)
+            signed = self.format[-1].islower()
+            lower = -(2 ** (bits - 1)) if signed else 0
+            upper = 2 ** (bits - signed) - 1
+            raise OutOfBoundsError(str(self), value, lower, upper, "counts") from None
+
+    def unpack(self, data: bytes) -> int:
+        """Return the value of bytes, which may be longer than the entry, as some drives send.
+
+        Raises
+        ------
+        ValueError
+            If they are shorter.
+        """
+        size = struct.calcsize(self.format)
+        if len(data) < size:
+            raise ValueError(f"{self}: {len(data)} bytes, wanted {size}")
+        value: int = struct.unpack(self.format, data[:size])[0]
+        return value
+
+
+U8, U16, U32, I8, I16, I32 = "<B", "<H", "<I", "<b", "<h", "<i"
+
+DEVICE_TYPE = Entry(0x1000, 0, U32, "device type")
+CYCLE_PERIOD = Entry(0x1006, 0, U32, "communication cycle period [us]")
+CONSUMER_HEARTBEAT = Entry(0x1016, 1, U32, "consumer heartbeat time")
+PRODUCER_HEARTBEAT = Entry(0x1017, 0, U16, "producer heartbeat time [ms]")
+ERROR_BEHAVIOUR = Entry(0x1029, 1, U8, "communication error behaviour")
+ABORT_CONNECTION_OPTION = Entry(0x6007, 0, I16, "abort connection option")
+ERROR_CODE = Entry(0x603F, 0, U16, "error code")
+CONTROLWORD = Entry(0x6040, 0, U16, "controlword")
+STATUSWORD = Entry(0x6041, 0, U16, "statusword")
+QUICK_STOP_OPTION = Entry(0x605A, 0, I16, "quick stop option")
+SHUTDOWN_OPTION = Entry(0x605B, 0, I16, "shutdown option")
+DISABLE_OPTION = Entry(0x605C, 0, I16, "disable operation option")
+FAULT_REACTION_OPTION = Entry(0x605E, 0, I16, "fault reaction option")
+MODE_OF_OPERATION = Entry(0x6060, 0, I8, "mode of operation")
+MODE_DISPLAY = Entry(0x6061, 0, I8, "mode of operation display")
+POSITION_ACTUAL = Entry(0x6064, 0, I32, "position actual value")
+FOLLOWING_WINDOW = Entry(0x6065, 0, U32, "following error window")
+FOLLOWING_TIMEOUT = Entry(0x6066, 0, U16, "following error time-out [ms]")
+MAX_TORQUE = Entry(0x6072, 0, U16, "max torque [1/1000 of rated]")
+TARGET_POSITION = Entry(0x607A, 0, I32, "target position")
+HOME_OFFSET = Entry(0x607C, 0, I32, "home offset")
+LOWER_LIMIT = Entry(0x607D, 1, I32, "software position limit, lower")
+UPPER_LIMIT = Entry(0x607D, 2, I32, "software position limit, upper")
+MAX_PROFILE_VELOCITY = Entry(0x607F, 0, U32, "max profile velocity")
+PROFILE_VELOCITY = Entry(0x6081, 0, U32, "profile velocity")
+PROFILE_ACCELERATION = Entry(0x6083, 0, U32, "profile acceleration")
+PROFILE_DECELERATION = Entry(0x6084, 0, U32, "profile deceleration")
+QUICK_STOP_DECELERATION = Entry(0x6085, 0, U32, "quick stop deceleration")
+HOMING_METHOD = Entry(0x6098, 0, I8, "homing method")
+HOMING_SPEED_SWITCH = Entry(0x6099, 1, U32, "homing speed towards the switch")
+HOMING_SPEED_ZERO = Entry(0x6099, 2, U32, "homing speed towards zero")
+HOMING_ACCELERATION = Entry(0x609A, 0, U32, "homing acceleration")
+INTERPOLATION_PERIOD = Entry(0x60C2, 1, U8, "interpolation period")
+INTERPOLATION_EXPONENT = Entry(0x60C2, 2, I8, "interpolation period's power of ten")
+DIGITAL_INPUTS = Entry(0x60FD, 0, U32, "digital inputs")
+SUPPORTED_MODES = Entry(0x6502, 0, U32, "supported drive modes")
+
+CIA402 = 402
+# Bits of the digital inputs.
+NEGATIVE_LIMIT_SWITCH = 1 << 0
+POSITIVE_LIMIT_SWITCH = 1 << 1
+HOME_SWITCH = 1 << 2
+
+NO_LOWER_LIMIT, NO_UPPER_LIMIT = -(2**31), 2**31 - 1
+
+# Addresses of the predefined connection set: function code plus node id.
+NMT = 0x000
+SYNC = 0x080
+EMCY = 0x080
+TPDO1, TPDO2 = 0x180, 0x280
+RPDO1, RPDO2 = 0x200, 0x300
+HEARTBEAT = 0x700
+
+# The computer's own node id, whose heartbeat the drives' watchdogs listen to.
+MASTER_NODE_ID = 127
+
+NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
+NMT_BOOT_UP, NMT_OPERATIONAL = 0x00, 0x05
+
+# Transmission types: at once; at the next SYNC.
+ASYNCHRONOUS, SYNCHRONOUS = 255, 1
+PDO_OFF = 1 << 31
+
+
+@dataclasses.dataclass(frozen=True)
+class Pdo:
+    """A process data object as the driver sets it up.
+
+    Attributes
+    ----------
+    communication, mapping : int
+        Indices of its two records.
+    function_code : int
+        Its COB-ID without the node id.
+    transmission : int
+        Transmission type.
+    entries : tuple of Entry
+        What it carries.
+    """
+
+    communication: int
+    mapping: int
+    function_code: int
+    transmission: int
+    entries: tuple[Entry, ...]
+
+    def pack(self, *values: int) -> bytes:
+        """Return the values as the PDO's bytes."""
+        return b"".join(e.pack(v) for e, v in zip(self.entries, values, strict=True))
+
+    def unpack(self, data: bytes) -> tuple[int, ...]:
+        """Return the values in a PDO's bytes.
+
+        Raises
+        ------
+        ValueError
+            If the length is wrong.
+        """
+        formats = "<" + "".join(entry.format[-1] for entry in self.entries)
+        if len(data) != struct.calcsize(formats):
+            raise ValueError(f"PDO of {len(data)} bytes, wanted {struct.calcsize(formats)}")
+        return struct.unpack(formats, data)
+
+
+# The order to stop acts when it arrives, the set-point with the SYNC of all axes.
+COMMAND = Pdo(0x1400, 0x1600, RPDO1, ASYNCHRONOUS, (CONTROLWORD, MODE_OF_OPERATION))
+SET_POINT = Pdo(0x1401, 0x1601, RPDO2, SYNCHRONOUS, (TARGET_POSITION,))
+STATUS = Pdo(0x1800, 0x1A00, TPDO1, SYNCHRONOUS, (STATUSWORD, MODE_DISPLAY, DIGITAL_INPUTS))
+POSITION = Pdo(0x1801, 0x1A01, TPDO2, SYNCHRONOUS, (POSITION_ACTUAL,))

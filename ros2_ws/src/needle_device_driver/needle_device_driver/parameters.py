@@ -1,0 +1,228 @@
+"""The parameters of device_driver."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from needle_common.errors import UserError
+from needle_common.parameter_fields import check_fields, parameter
+from needle_device_driver.can_link import LINKS, LinkSettings
+from needle_device_driver.drive_settings import DriveSettings
+from needle_device_driver.limits import HARD_SPEED_CAP, HARD_STEP_LENGTH_CAP, SafetyLimits
+
+# Beyond the supervisor's own limits, a drive's limits leave room for its following error.
+_LIMIT_MARGIN = 2.0
+
+
+def _fixed(default: Any, unit: str, description: str, *bounds: float, **more: Any) -> Any:
+    lower, upper = bounds or (-math.inf, math.inf)
+    return parameter(
+        default,
+        unit=unit,
+        description=description,
+        lower=lower,
+        upper=upper,
+        read_only=True,
+        **more,
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class _RigParameters:
+    link: str = _fixed(
+        "slcan",
+        "-",
+        "slcan: serial adapter or pseudo-terminal; socketcan: Linux CAN interface; socketcand: one "
+        "over TCP; virtual: inside one process.",
+        choices=LINKS,
+    )
+    channel: str = _fixed("/dev/ttyACM0", "-", "Device file (slcan) or name of the interface.")
+    bitrate: int = _fixed(500_000, "bit/s", "Of the CAN bus; slcan only.", 10_000, 1_000_000)
+    tty_baudrate: int = _fixed(
+        115_200, "bit/s", "Of the serial port; slcan only, USB adapters ignore it.", 9600, 4_000_000
+    )
+    host: str = _fixed("localhost", "-", "Where socketcand runs.")
+    port: int = _fixed(29536, "-", "Where socketcand listens.", 1, 65535)
+    autostart: bool = _fixed(
+        True, "-", "Configure and activate at start; false: a lifecycle manager does."
+    )
+    connect_timeout: float = _fixed(
+        10.0, "s", "Autostart: how long adapter and drives may take to be there.", 0.0, 3600.0
+    )
+    lock_step: bool = _fixed(
+        False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
+    )
+    watchdog: float = _fixed(
+        0.1, "s", "A drive stops without the computer's heartbeat for so long.", 0.05, 0.5
+    )
+    reply_age_limit: float = _fixed(
+        SafetyLimits.reply_age_limit, "s", "A drive silent for longer has failed.", 0.05, 0.5
+    )
+    hold_timeout: float = _fixed(
+        SafetyLimits.hold_timeout, "s", "A hold message counts so long.", 0.05, 0.5
+    )
+    tip_age_limit: float = _fixed(
+        SafetyLimits.tip_age_limit, "s", "An older tip moves nothing.", 0.05, 60.0
+    )
+    max_depth: float = _fixed(SafetyLimits.max_depth, "m", "Deepest insertion.", 0.001, 0.5)
+    max_step_length: float = _fixed(
+        SafetyLimits.max_step_length,
+        "m",
+        "Longest insertion of one command.",
+        1e-5,
+        HARD_STEP_LENGTH_CAP,
+    )
+    max_speed: float = _fixed(
+        SafetyLimits.max_speed, "m/s", "Fastest insertion.", 1e-5, HARD_SPEED_CAP
+    )
+    max_rotation_step: float = _fixed(
+        SafetyLimits.max_rotation_step,
+        "rad",
+        "Largest rotation of one command.",
+        0.01,
+        2 * math.pi,
+    )
+    max_rotation_rate: float = _fixed(
+        SafetyLimits.max_rotation_rate, "rad/s", "Fastest rotation.", 0.01, 20.0
+    )
+    max_turns: float = _fixed(
+        SafetyLimits.max_turns, "turns", "Largest rotation either way from home.", 0.1, 1000.0
+    )
+    retraction_speed: float = _fixed(
+        SafetyLimits.retraction_speed, "m/s", "When the needle is drawn out.", 1e-5, HARD_SPEED_CAP
+    )
+    homing_speed: float = _fixed(
+        SafetyLimits.homing_speed, "m/s", "Towards the insertion switch.", 1e-5, HARD_SPEED_CAP
+    )
+    homing_rotation_rate: float = _fixed(
+        SafetyLimits.homing_rotation_rate, "rad/s", "Towards the rotation switch.", 0.01, 20.0
+    )
+    settling_time: float = _fixed(
+        SafetyLimits.settling_time, "s", "To reach the target after the last set-point.", 0.1, 10.0
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises
+        ------
+        UserError
+            A parameter out of bounds, two drives with one node id, or a link that is none.
+        """
+        check_fields(self)
+        if self.drive("insertion").node_id == self.drive("rotation").node_id:
+            raise UserError("insertion_node_id and rotation_node_id are the same")
+        if not self.drive("rotation").actuated:
+            raise UserError("rotation_actuated = False: nobody would turn the needle")
+        _ = self.link_settings, self.limits
+
+    @property
+    def link_settings(self) -> LinkSettings:
+        """The CAN link."""
+        names = {field.name for field in dataclasses.fields(LinkSettings)} - {"kind"}
+        return LinkSettings(kind=self.link, **{name: getattr(self, name) for name in names})
+
+    @property
+    def limits(self) -> SafetyLimits:
+        """The motion supervisor's limits."""
+        own = {field.name for field in dataclasses.fields(self)}
+        shared = {
+            f.name: getattr(self, f.name) for f in dataclasses.fields(SafetyLimits) if f.name in own
+        }
+        for axis in ("insertion", "rotation"):
+            for name in ("following_error", "tolerance"):
+                shared[f"{axis}_{name}"] = getattr(self, f"{axis}_{name}")
+        return SafetyLimits(**shared)
+
+    def drive(self, axis: str) -> DriveSettings:
+        """Return the settings of the `insertion` or `rotation` drive."""
+        limits = self.limits
+        names = {field.name for field in dataclasses.fields(DriveSettings)}
+        own = {name: getattr(self, f"{axis}_{name}", None) for name in names}
+        values = {name: value for name, value in own.items() if value is not None}
+        margin = _LIMIT_MARGIN * values["following_error"]
+        if axis == "insertion":
+            values |= {"speed": limits.max_speed, "lower": -margin}
+            values["upper"] = limits.max_depth + margin
+        else:
+            values |= {"speed": limits.max_rotation_rate}
+            values |= {
+                "lower": -limits.max_rotation - margin,
+                "upper": limits.max_rotation + margin,
+            }
+        return DriveSettings(**values)
+
+
+def _axis(
+    axis: str,
+    unit: str,
+    *,
+    node_id: int,
+    counts_per_unit: float,
+    acceleration: float,
+    quick_stop: float,
+    homing_method: int,
+    following_error: float,
+    tolerance: float,
+) -> list[tuple[str, type, Any]]:
+    ramp = f"{unit}/s^2"
+    fields = {
+        "node_id": _fixed(node_id, "-", "CANopen node id of the drive.", 1, 126),
+        "counts_per_unit": _fixed(
+            counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
+        ),
+        "reverse": _fixed(False, "-", "Whether the drive counts the other way."),
+        "acceleration": _fixed(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
+        "quick_stop_deceleration": _fixed(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
+        "homing_method": _fixed(
+            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 where it stands.", 1, 37
+        ),
+        "following_error": _fixed(
+            following_error, unit, "Largest distance from the set-point.", 1e-6, 10.0
+        ),
+        "following_error_time": _fixed(
+            0.05, "s", "How long the drive itself lets that be exceeded.", 0.001, 10.0
+        ),
+        "max_torque": _fixed(0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0),
+        "tolerance": _fixed(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
+        "actuated": _fixed(
+            True, "-", "False: a hand moves the axis, its drive only says where it is."
+        ),
+    }
+    return [(f"{axis}_{name}", type(f.default), f) for name, f in fields.items()]
+
+
+DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
+    "DeviceDriverParameters",
+    [
+        # A lead screw of 1 mm, 20000 counts a turn.
+        *_axis(
+            "insertion",
+            "m",
+            node_id=1,
+            counts_per_unit=20_000_000.0,
+            acceleration=0.05,
+            quick_stop=0.5,
+            homing_method=17,
+            following_error=SafetyLimits.insertion_following_error,
+            tolerance=5e-6,
+        ),
+        # An encoder of 16384 lines, four counts a line, on the needle's own shaft.
+        *_axis(
+            "rotation",
+            "rad",
+            node_id=2,
+            counts_per_unit=65536.0 / (2.0 * math.pi),
+            acceleration=20.0,
+            quick_stop=100.0,
+            homing_method=37,
+            following_error=SafetyLimits.rotation_following_error,
+            tolerance=1e-3,
+        ),
+    ],
+    bases=(_RigParameters,),
+    frozen=True,
+)
+DeviceDriverParameters.__doc__ = "Parameters of device_driver, fixed at start."
