@@ -6,6 +6,7 @@ The format: https://mcap.dev/spec.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import struct
 import zlib
 from collections.abc import Iterator
@@ -26,7 +27,6 @@ SIZE: Final = struct.Struct("<Q")
 # What bytes that are not what they should be make a parser raise.
 UNREADABLE: Final = (ValueError, struct.error, McapError, IndexError)
 _MESSAGE: Final = struct.Struct("<HIQQ")
-_LOG_TIME: Final = RECORD_HEADER.size + 6  # within a message's record
 
 Definition = Schema | Channel
 
@@ -40,8 +40,8 @@ class ChunkContent:
     index : ChunkIndex
         As the summary has it.
     entries : dict of int to list of (int, int)
-        Channel to (log time [ns], offset in the chunk) of its messages; emptied for all chunks
-        but the last, whose index may have to be written again.
+        Channel to (log time [ns], offset in the chunk) of its messages; emptied where the file has
+        them, so that only what has to be written again is kept.
     counts : dict of int to int
         Messages for each channel.
     """
@@ -49,6 +49,31 @@ class ChunkContent:
     index: ChunkIndex
     entries: dict[int, list[tuple[int, int]]]
     counts: dict[int, int]
+
+    @property
+    def end(self) -> int:
+        """Where the chunk's record ends, and its message index begins."""
+        return int(self.index.chunk_start_offset + self.index.chunk_length)
+
+    @property
+    def is_indexed(self) -> bool:
+        """Whether the file has the whole message index."""
+        return set(self.index.message_index_offsets) == set(self.counts)
+
+    def write_index(self, start: int) -> bytes:
+        """Return the message index, and take note that it is at an offset of the file."""
+        records = {c: index_record(c, entries) for c, entries in self.entries.items()}
+        position = start
+        for channel, record in records.items():
+            self.index.message_index_offsets[channel] = position
+            position += len(record)
+        self.index.message_index_length = position - start
+        return b"".join(records.values())
+
+    def count(self, channel: int, time: int, offset: int) -> None:
+        """Count a message of the chunk."""
+        self.entries.setdefault(channel, []).append((time, offset))
+        self.counts[channel] = self.counts.get(channel, 0) + 1
 
 
 @dataclasses.dataclass
@@ -103,7 +128,8 @@ def read_chunk(data: Any, position: int, length: int) -> tuple[ChunkContent, lis
     end = 0
     for opcode, offset, end in _records(content):  # noqa: B007  (end is used below)
         if opcode == Opcode.MESSAGE:
-            _count_message(chunk, content, offset)
+            channel, _, time, _ = _MESSAGE.unpack_from(content, offset + RECORD_HEADER.size)
+            chunk.count(channel, time, offset)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
             definitions.append(read_definition(content, offset))
     if end != size:
@@ -114,7 +140,7 @@ def read_chunk(data: Any, position: int, length: int) -> tuple[ChunkContent, lis
 def read_half_chunk(
     data: Any, position: int, length: int
 ) -> tuple[HalfChunk | None, list[Definition]]:
-    """Return what is whole in a chunk that the file's end cuts, and the definitions in it.
+    """Return what is whole in the file's last chunk if the chunk is not, and its definitions.
 
     None if nothing is, or if it is compressed: then its beginning cannot be checked.
     """
@@ -125,18 +151,18 @@ def read_half_chunk(
     first, last, size, _, name_length = CHUNK_HEADER.unpack_from(data, start)
     if name_length or position + length != data_start + size:
         return None, []
-    part = bytes(data[data_start:])
+    part = bytes(data[data_start : position + length])
     content = ChunkContent(ChunkIndex(0, position, "", 0, 0, 0, {}, 0, 0), {}, {})
     definitions: list[Definition] = []
-    times: list[int] = []
+    found: list[tuple[int, int, int]] = []  # channel, log time, offset of each message
     whole = 0
     try:
         for opcode, offset, end in _records(part):
             if opcode == Opcode.MESSAGE:
-                (time,) = SIZE.unpack_from(part, offset + _LOG_TIME)
+                channel, _, time, _ = _MESSAGE.unpack_from(part, offset + RECORD_HEADER.size)
                 if not first <= time <= last:
                     break
-                times.append(_count_message(content, part, offset))
+                found.append((channel, time, offset))
             elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 definitions.append(read_definition(part, offset))
             else:
@@ -144,8 +170,13 @@ def read_half_chunk(
             whole = end
     except UNREADABLE:
         pass  # what came before it is whole
-    if not times:
+    if found and _is_completed_by_zeros(part, whole):
+        whole = found.pop()[2]
+    if not found:
         return None, definitions
+    for channel, time, offset in found:
+        content.count(channel, time, offset)
+    times = [time for _, time, _ in found]
     index = content.index
     index.message_start_time, index.message_end_time = min(times), max(times)
     index.compressed_size = index.uncompressed_size = whole
@@ -174,12 +205,18 @@ def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
         position = end
 
 
-def _count_message(chunk: ChunkContent, content: bytes, offset: int) -> int:
-    """Count a message of a chunk; return its log time [ns]."""
-    channel, _, time, _ = _MESSAGE.unpack_from(content, offset + RECORD_HEADER.size)
-    chunk.entries.setdefault(channel, []).append((time, offset))
-    chunk.counts[channel] = chunk.counts.get(channel, 0) + 1
-    return int(time)
+def _is_completed_by_zeros(part: bytes, whole: int) -> bool:
+    """Return whether the last message before `whole` may end in what a power cut left as zeros."""
+    return whole < len(part) and not part[whole - 1] and not any(part[whole:])
+
+
+def index_record(channel: int, entries: list[tuple[int, int]]) -> bytes:
+    """Return the message index of one channel in a chunk."""
+    numbers = itertools.chain.from_iterable(entries)
+    size = 2 * SIZE.size * len(entries)
+    return RECORD_HEADER.pack(Opcode.MESSAGE_INDEX, 6 + size) + struct.pack(
+        f"<HI{2 * len(entries)}Q", channel, size, *numbers
+    )
 
 
 def read_definition(content: bytes, offset: int) -> Definition:

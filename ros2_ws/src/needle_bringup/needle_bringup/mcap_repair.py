@@ -25,14 +25,13 @@ from mcap.records import (
     Footer,
     Header,
     McapRecord,
-    MessageIndex,
     Statistics,
     SummaryOffset,
 )
 from mcap.writer import MCAP0_MAGIC
 
-from needle_bringup.mcap_chunk import CHUNK_HEADER, RECORD_HEADER
-from needle_bringup.mcap_scan import PRIVATE, McapScan, scan
+from needle_bringup.mcap_chunk import CHUNK_HEADER, RECORD_HEADER, ChunkContent
+from needle_bringup.mcap_scan import PRIVATE, Damage, McapScan, scan
 
 # What a disk without room, a quota and a limit on file sizes answer.
 NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -99,7 +98,8 @@ def repair(path: Path, found: McapScan, *, profile: str = "ros2", library: str) 
     OSError
         If the disk refuses the index even when all chunks are given up.
     """
-    if not found.damage and found.finished and is_indexed(path, sum(found.counts.values())):
+    sound = not found.damage and not found.reindex
+    if sound and found.finished and is_indexed(path, sum(found.counts.values())):
         return FileRecovery(True, sum(found.counts.values()))
     lost = sum(damage.end - damage.start for damage in found.damage)
     if not found.finished:
@@ -109,14 +109,15 @@ def repair(path: Path, found: McapScan, *, profile: str = "ros2", library: str) 
         if not found.end:
             _write_beginning(stream, profile, library, found)
         for damage in found.damage:
-            stream.seek(damage.start)
-            length = damage.end - damage.start - RECORD_HEADER.size
-            stream.write(RECORD_HEADER.pack(_DAMAGED, length))
+            _hide(stream, damage)
+        for chunk, place in found.reindex:
+            _write_index(stream, chunk, place)
         if found.half_chunk is not None:
             salvaged = _cut_half_chunk(stream, found)
         else:
+            if found.lacks_last_index:
+                found.end = found.chunks[-1].end
             stream.truncate(found.end)
-            _drop_partial_index(stream, found)
         given_back = 0
         while not _append_summary(stream, found):
             give_back_chunk(stream, found)
@@ -170,6 +171,29 @@ def _write_beginning(stream: IO[bytes], profile: str, library: str, found: McapS
     found.end = stream.write(MCAP0_MAGIC + _bytes(builder))
 
 
+def _hide(stream: IO[bytes], place: Damage) -> None:
+    """Have readers pass over some bytes."""
+    stream.seek(place.start)
+    length = place.end - place.start - RECORD_HEADER.size
+    stream.write(RECORD_HEADER.pack(_DAMAGED, length))
+
+
+def _write_index(stream: IO[bytes], chunk: ChunkContent, place: Damage) -> None:
+    """Write a chunk's message index again where it was."""
+    room = place.end - place.start
+    index = chunk.write_index(place.start)
+    rest = room - len(index)
+    if rest < 0 or 0 < rest < RECORD_HEADER.size:
+        # Cannot be unless the file was made so: the chunk can be read without its index, too.
+        chunk.index.message_index_offsets, chunk.index.message_index_length = {}, 0
+        _hide(stream, place)
+        return
+    stream.seek(place.start)
+    stream.write(index)
+    if rest:
+        _hide(stream, Damage(place.start + len(index), place.end))
+
+
 def _cut_half_chunk(stream: IO[bytes], found: McapScan) -> int:
     """End the chunk that was being written behind its last whole message."""
     half = found.half_chunk
@@ -187,26 +211,13 @@ def _cut_half_chunk(stream: IO[bytes], found: McapScan) -> int:
     found.chunks.append(half.content)
     found.end = half.data_end
     found.half_chunk = None
-    _drop_partial_index(stream, found)
     return sum(half.content.counts.values())
-
-
-def _drop_partial_index(stream: IO[bytes], found: McapScan) -> None:
-    """Have the last chunk's message index written again where it is not whole."""
-    if not found.chunks:
-        return
-    last = found.chunks[-1]
-    if set(last.index.message_index_offsets) == set(last.counts):
-        return
-    last.index.message_index_offsets = {}
-    last.index.message_index_length = 0
-    found.end = last.index.chunk_start_offset + last.index.chunk_length
-    stream.truncate(found.end)
 
 
 def _append_summary(stream: IO[bytes], found: McapScan) -> bool:
     """Write what follows the data; False if there is no room for it."""
-    data = _message_index(found)
+    lacks_index = bool(found.chunks) and found.end == found.chunks[-1].end
+    data = found.chunks[-1].write_index(found.end) if lacks_index else b""
     records = RecordBuilder()
     DataEnd(0).write(records)
     tail = data + _bytes(records)
@@ -222,22 +233,6 @@ def _append_summary(stream: IO[bytes], found: McapScan) -> bool:
         stream.truncate(found.end)
         return False
     return True
-
-
-def _message_index(found: McapScan) -> bytes:
-    """Return the message index that the last chunk lacks."""
-    if not found.chunks or found.chunks[-1].index.message_index_offsets:
-        return b""
-    last, builder = found.chunks[-1], RecordBuilder()
-    offsets: dict[int, int] = {}
-    for channel, entries in last.entries.items():
-        offsets[channel] = found.end + builder.count
-        MessageIndex(channel, entries).write(builder)
-    data = _bytes(builder)
-    # Set only here: without room they are computed again for a shorter file.
-    last.index.message_index_offsets = offsets if data else {}
-    last.index.message_index_length = len(data)
-    return data
 
 
 def _summary(found: McapScan, start: int) -> bytes:

@@ -32,6 +32,7 @@ from needle_bringup.mcap_chunk import (
     ChunkContent,
     Definition,
     HalfChunk,
+    index_record,
     read_chunk,
     read_definition,
     read_half_chunk,
@@ -91,6 +92,10 @@ class McapScan:
         As the summary has them.
     damage : list of Damage
         What was passed over.
+    reindex : list of (ChunkContent, Damage)
+        Chunks whose message index is not whole, and where it was.
+    lacks_last_index : bool
+        Whether the data ends in a chunk without its whole message index.
     half_chunk : HalfChunk or None
         The chunk that the file's end cuts, if something in it is whole.
     loose_first, loose_last : int or None, int
@@ -108,6 +113,8 @@ class McapScan:
     metadata_indexes: list[MetadataIndex] = dataclasses.field(default_factory=list)
     attachment_indexes: list[AttachmentIndex] = dataclasses.field(default_factory=list)
     damage: list[Damage] = dataclasses.field(default_factory=list)
+    reindex: list[tuple[ChunkContent, Damage]] = dataclasses.field(default_factory=list)
+    lacks_last_index: bool = False
     half_chunk: HalfChunk | None = None
     loose_first: int | None = None
     loose_last: int = 0
@@ -156,6 +163,7 @@ class _Scanner:
         self._size = len(data)
         self._progress = progress
         self._reported = 0
+        self._is_index_open = False
         self.found = McapScan(self._size, 0)
 
     def run(self) -> McapScan:
@@ -182,6 +190,7 @@ class _Scanner:
             self._report(position)
         if found.finished:
             self._read_definitions_of_summary()
+        found.lacks_last_index = self._is_index_open and not found.chunks[-1].is_indexed
         self._name_unknown_channels()
         return found
 
@@ -193,9 +202,7 @@ class _Scanner:
             found = self._next_chunk(position + 1)
             if found is None:
                 if opcode == Opcode.CHUNK and length is not None:
-                    half, definitions = read_half_chunk(self._data, position, length)
-                    self.found.half_chunk = half
-                    self._define(definitions)
+                    self._take_half_chunk(position, length)
                 return None
             self._pass_over(position, found)
             return found
@@ -206,17 +213,25 @@ class _Scanner:
             self._read(opcode, position, length)
         # Struct errors, texts that are not UTF-8, lengths that point outside, bad checksums.
         except UNREADABLE:
+            # A power cut leaves zeros where the file was made longer and nothing was written.
+            if opcode == Opcode.CHUNK and not any(self._data[position + length :]):
+                self._take_half_chunk(position, length)
+                half = self.found.half_chunk
+                if half is not None and not any(self._data[half.data_end : position + length]):
+                    return None
+                self.found.half_chunk = None
             self._pass_over(position, position + length)
         return position + length
 
     def _read(self, opcode: int, position: int, length: int) -> None:
         found = self.found
+        if opcode != Opcode.MESSAGE_INDEX:
+            self._close_index(position)
         if opcode == Opcode.CHUNK:
             content, definitions = read_chunk(self._data, position, length)
             self._define(definitions)
-            if found.chunks:
-                found.chunks[-1].entries = {}
             found.chunks.append(content)
+            self._is_index_open = True
         elif opcode == Opcode.MESSAGE_INDEX:
             self._take_message_index(position, length)
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
@@ -234,16 +249,38 @@ class _Scanner:
         elif opcode == Opcode.ATTACHMENT:
             found.attachment_indexes.append(self._attachment(position, length))
 
+    def _take_half_chunk(self, position: int, length: int) -> None:
+        half, definitions = read_half_chunk(self._data, position, length)
+        self.found.half_chunk = half
+        self._define(definitions)
+
     def _take_message_index(self, position: int, length: int) -> None:
         damaged = self.found.damage
         if damaged and damaged[-1].end == position:
             # The index of a chunk that could not be read goes with it.
             self._pass_over(position, position + length)
-        elif self.found.chunks:
+        elif self._is_index_open:
             (channel,) = struct.unpack_from("<H", self._data, position + RECORD_HEADER.size)
-            index = self.found.chunks[-1].index
-            index.message_index_offsets[channel] = position
-            index.message_index_length += length
+            chunk = self.found.chunks[-1]
+            record = self._data[position : position + length]
+            if record != index_record(channel, chunk.entries.get(channel, [])):
+                raise ValueError("the message index does not fit the chunk")
+            chunk.index.message_index_offsets[channel] = position
+            chunk.index.message_index_length += length
+
+    def _close_index(self, end: int) -> None:
+        """Take note if the last chunk's message index, which ends here, is not whole."""
+        if not self._is_index_open:
+            return
+        self._is_index_open = False
+        found = self.found
+        chunk = found.chunks[-1]
+        start = chunk.end
+        if chunk.is_indexed or end == start:
+            chunk.entries = {}
+            return
+        found.reindex.append((chunk, Damage(start, end)))
+        found.damage = [damage for damage in found.damage if damage.end <= start]
 
     def _define(self, definitions: Iterable[Definition]) -> None:
         for record in definitions:
