@@ -23,12 +23,15 @@ from needle_controller.control_settings import ControlSettings
 from needle_controller.gains import sampled_observer_gain
 from needle_controller.joint_history import JointSample
 from needle_controller.plane_control import PlaneControl
+from needle_controller.reachability import reachability
 from needle_controller.target_plane import offset_plane
 from needle_sim import study_noise
 from needle_sim.disturbances import Disturbances
+from needle_sim.needle_batch import NeedleBatch
+from needle_sim.se3 import FloatArray
 from needle_sim.start_grids import GRIDS, Bounds
 from needle_sim.study import StudySettings, run_study
-from needle_sim.study_controllers import SteeredNeedles, controller_factory
+from needle_sim.study_controllers import controller_factory
 
 DESCRIPTION = """\
 Measure what is fast enough and what is not, each figure beside a reference in the same run: the
@@ -39,6 +42,7 @@ references:
   plain Python     the same loop, needle by needle, with numbers and `math` (few needles, scaled)
   python-control   the same loop as interconnected systems of python-control (fewer, scaled); its
                    time of one update holds the needle's simulation, too
+  one at a time    the same code as the study's, in a loop over needles (few needles, scaled)
 
 exit codes: 0 measured, 2 bad input, 130 interrupted.
 """
@@ -47,6 +51,7 @@ STEPS = 120
 NEEDLES = 10_000
 PLAIN_NEEDLES = 40
 CONTROL_NEEDLES = 3
+ALONE_NEEDLES = 20
 UPDATES = 2_000
 SETTINGS = ControlSettings()
 STARTS = GRIDS["endpoint"](Bounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 10, 1)
@@ -138,10 +143,12 @@ def studies() -> Iterator[Row]:
         what = f"{name}, {NEEDLES:,} x {STEPS} steps"
         yield Row(f"study_{name}", what, "s", seconds, "paper in plain Python", plain)
         yield Row(f"study_{name}", what, "s", seconds, "paper in python-control", with_control)
+        alone = _study_one_by_one(name)
+        yield Row(f"study_{name}", what, "s", seconds, f"{name}, one needle at a time", alone)
 
 
 def updates() -> Iterator[Row]:
-    """One update of the node's controller."""
+    """One update of the node's controller: estimate with covariance, command, reach."""
     d = design()
     s, errors = (-0.003, 0.0, 0.0), study_noise.uniform(1, 1, 0, 0, UPDATES)[:, 0] * NOISE
     plain = _least_time(
@@ -152,25 +159,9 @@ def updates() -> Iterator[Row]:
         3,
     )
     with_control = _control_study() / NEEDLES / STEPS * 1e6
-    tips = np.zeros((UPDATES, 3))
-    tips[:, 0] = errors
-    tips[:, 2] = np.arange(UPDATES) * 1e-4
-
-    def steer_paper() -> None:
-        control = PlaneControl(SETTINGS, offset_plane(0.003))
-        for k, tip in enumerate(tips):
-            control.update(tip, JointSample(k, 1e-4 * k, 1e-3 * k))
-
-    def steer_best() -> None:
-        needle = _best()
-        needle.start(tips[:1])
-        turned = np.full(1, 1e-3)
-        for k in range(1, STEPS):
-            needle.step(1e-3, turned, tips[k : k + 1] * [1.0, 1.0, 10.0], 0.0)
-
-    for name, steer, count in (("paper", steer_paper, UPDATES), ("best", steer_best, STEPS)):
-        steer()  # compiles
-        seconds = _least_time(steer, 3) / count * 1e6
+    for name in ("paper", "best"):
+        taken = _tips_of_a_run(name)
+        seconds = _least_time(partial(_update_all, name, taken), 5) / len(taken) * 1e6
         for against, reference in (
             ("paper in plain Python", plain / UPDATES * 1e6),
             ("paper in python-control", with_control),
@@ -274,8 +265,39 @@ def _peak_memory(name: str, depth: float) -> float:
     return peak / 1e6
 
 
-def _best() -> SteeredNeedles:
-    return controller_factory("best", NOISE)()
+def _study_one_by_one(name: str) -> float:
+    """Return the time of the study with the same code in a loop over needles, each alone."""
+    factory = controller_factory(name, NOISE)
+    chosen = range(0, NEEDLES, NEEDLES // ALONE_NEEDLES)
+    return (
+        _least_time(lambda: [run_study(STARTS[k : k + 1], factory, STUDY) for k in chosen], 1)
+        * NEEDLES
+        / len(chosen)
+    )
+
+
+def _tips_of_a_run(preset: str) -> list[tuple[FloatArray, JointSample]]:
+    """Return what the node takes over a whole closed-loop run."""
+    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset), offset_plane(0.003))
+    needle = NeedleBatch(np.array([[0.0, np.deg2rad(2.0), np.deg2rad(15.0)]]))
+    length, rotation = SETTINGS.step_length, 0.0
+    taken = []
+    for step in range(STEPS + 1):
+        off = study_noise.uniform(1, study_noise.NOISE, step, 0, 1)[0, :3]
+        tip = needle.tips[0] + NOISE * (2.0 * off - 1.0)
+        taken.append((tip, JointSample(step, step * length, rotation)))
+        turn = float(control.update(*taken[-1]).command.rotation_rate) * length
+        needle.advance(length, turn, SETTINGS.curvature)
+        rotation += turn
+    return taken
+
+
+def _update_all(preset: str, taken: Sequence[tuple[FloatArray, JointSample]]) -> None:
+    control = PlaneControl(dataclasses.replace(SETTINGS, preset=preset), offset_plane(0.003))
+    for tip, joints in taken:
+        estimate = control.update(tip, joints).estimate
+        estimate.covariance  # noqa: B018 - lazy, and published
+        reachability(estimate.reduced, estimate.curvature, insertion=joints.insertion, end=0.12)
 
 
 def _least_time(work: Callable[[], object], times: int) -> float:
