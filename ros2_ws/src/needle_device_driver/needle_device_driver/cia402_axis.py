@@ -95,6 +95,7 @@ class Cia402Axis(Axis):
         self._goal = Goal.OFF
         self._goal_cycles = 0
         self._recovering = False
+        self._stopping = False
         self._mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self._homing = Homing.NONE
@@ -193,6 +194,7 @@ class Cia402Axis(Axis):
         self._homing = Homing.NONE
         if self._goal is not Goal.OFF:
             self._want(Goal.STOPPED)
+        self._stopping = True
         try:
             self._command(DriveCommand.QUICK_STOP)
         except LinkError as error:
@@ -202,6 +204,7 @@ class Cia402Axis(Axis):
         """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
         self._want(Goal.OFF)
         self._homing = Homing.NONE
+        self._stopping = False
         try:
             self._link.open()
             survived = self._survived()
@@ -295,9 +298,11 @@ class Cia402Axis(Axis):
         if odd:
             self._latch(odd)
         follows = at.mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
-        if not (follows and state is DriveState.OPERATION_ENABLED):
+        if self._stopping or not (follows and state is DriveState.OPERATION_ENABLED):
             # Whatever switches on or changes mode begins where the axis stands.
             self._target = at.position
+        # Until the drive has said that it took the stop, it counts as on its way there.
+        self._stopping = self._stopping and state is DriveState.OPERATION_ENABLED
         self._goal_cycles += 1
         self._watch_switching(state)
         if self._homing is not Homing.NONE:
@@ -327,6 +332,8 @@ class Cia402Axis(Axis):
 
     def _next_command(self) -> DriveCommand:
         state = self._state
+        if self._stopping:
+            return DriveCommand.QUICK_STOP
         if self._goal is not Goal.ON:
             at_rest = self._still >= _REST or self._goal_cycles > _LONGEST_REST
             return next_command(self._goal, state, at_rest=at_rest)
@@ -402,6 +409,7 @@ class Cia402Axis(Axis):
     def _ready(self) -> bool:
         return (
             self._goal is Goal.ON
+            and not self._stopping
             and self._state is DriveState.OPERATION_ENABLED
             and self._at.mode == self._mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
         )

@@ -16,7 +16,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_common.diagnostics import Diagnostic, Level
@@ -99,12 +99,27 @@ class DeviceDriverNode(LifecycleNode):
             self,
             self._supervisor,
             self._diagnostics,
-            refuse=lambda: "" if self._active else f"waiting for {self._waiting_for}",
+            refuse=self._why_not_ready,
         )
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
         if self._sim_time:
             self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+
+    def _why_not_ready(self) -> str:
+        if not self._active:
+            return f"waiting for {self._waiting_for}"
+        missing = []
+        publishers = [self._device.joint_states, self._device.results, self._device.statuses]
+        if self._settings.lock_step:
+            missing += [
+                f"subscriber of {publisher.topic_name}"
+                for publisher in publishers
+                if publisher.get_subscription_count() == 0
+            ]
+        if self._settings.wait_for_recorder:
+            missing += unrecorded(self, publishers)
+        return f"waiting for {', '.join(missing)}" if missing else ""
 
     # ---- the cycle ----------------------------------------------------------------------------
 

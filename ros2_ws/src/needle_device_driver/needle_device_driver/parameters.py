@@ -54,6 +54,9 @@ class _RigParameters:
     lock_step: bool = _fixed(
         False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
     )
+    wait_for_recorder: bool = _fixed(
+        False, "-", "Refuse services until a node named recorder listens to everything."
+    )
     watchdog: float = _fixed(
         0.1, "s", "A drive stops without the computer's heartbeat for so long.", 0.05, 0.5
     )

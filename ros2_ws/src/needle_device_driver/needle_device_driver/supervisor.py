@@ -25,6 +25,7 @@ from needle_device_driver.states import Activity, State, Trigger, next_state
 from needle_device_driver.watch import axes_problem
 from needle_device_driver.way_out import WayOut
 
+_SWITCHING = "waiting for the axes to switch off"
 _READY = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
@@ -261,6 +262,8 @@ class MotionSupervisor:
             return Reply(True, "already enabled")
         if self._state is not State.DISABLED:
             return self._not_in(State.DISABLED)
+        if self._switching():
+            return Reply(False, _SWITCHING)
         self._seen_powered = False
         try:
             self._axes.each(lambda axis: axis.power(True))
@@ -286,6 +289,8 @@ class MotionSupervisor:
             return self._not_in(State.DISABLED)
         if not self._needle_out:
             return Reply(False, "confirm first that the needle is out (confirm_needle_out)")
+        if self._switching():
+            return Reply(False, _SWITCHING)
         try:
             self._axes.each(lambda axis: axis.power(True))
             self._axes.insertion.home(self._limits.homing_speed)
@@ -307,18 +312,19 @@ class MotionSupervisor:
             return self._not_in(State.HOLDING)
         if self._hold.owner is None:
             return Reply(False, "press and keep the hold first")
-        if self._snapshot is None or not self._snapshot.powered:
+        at = self._poll(now)
+        if not at.powered:
             return Reply(False, "the axes are not powered yet")
         if not self._axes.insertion.actuated:
             return Reply(False, "the insertion axis is moved by hand: draw the needle out by hand")
-        insertion = self._snapshot.insertion
+        insertion = at.insertion
         target = self._way_out.target(insertion)
         distance = insertion.position - target
         if distance <= self._limits.insertion_tolerance or insertion.at_home_switch:
             return Reply(True, "the needle is out")
-        end = (target, self._snapshot.rotation.position)
+        end = (target, at.rotation.position)
         duration = distance / self._limits.retraction_speed
-        self._start(Activity.RETRACTION, end, duration, self._snapshot)
+        self._start(Activity.RETRACTION, end, duration, at)
         if self._run is None:
             return Reply(False, self._fault)
         return Reply(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
@@ -532,11 +538,13 @@ class MotionSupervisor:
             )
         if self._hold.owner is None:
             return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
-        if self._snapshot is None or self._snapshot.age(now) > self._limits.reply_age_limit:
+        # Not the last cycle's: a stop since then must be known.
+        at = self._poll(now)
+        if at.age(now) > self._limits.reply_age_limit:
             return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
-        if not self._snapshot.powered:
+        if not at.powered:
             return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
-        return self._snapshot
+        return at
 
     def _refuse(self, command: Command, refusal: Refusal) -> None:
         self._commands_refused += 1
