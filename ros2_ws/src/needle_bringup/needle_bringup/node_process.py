@@ -34,6 +34,8 @@ class NodeProcess:
         File that takes its output.
     pass_fds : sequence of int
         Open files that it keeps.
+    takes_input : bool
+        Whether `say` reaches it; else its input is empty.
     """
 
     def __init__(
@@ -44,6 +46,7 @@ class NodeProcess:
         environment: Mapping[str, str],
         log: Path,
         pass_fds: Sequence[int] = (),
+        takes_input: bool = False,
     ) -> None:
         self.name = name
         self.log = log
@@ -58,13 +61,24 @@ class NodeProcess:
             self._process = subprocess.Popen(
                 list(command),
                 env=dict(environment),
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if takes_input else subprocess.DEVNULL,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 pass_fds=pass_fds,
                 start_new_session=True,
                 preexec_fn=end_with_parent,  # noqa: PLW1509
             )
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    def say(self, line: str) -> None:
+        """Write a line to its input."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n".encode())
+        self._process.stdin.flush()
 
     @property
     def exit_code(self) -> int | None:

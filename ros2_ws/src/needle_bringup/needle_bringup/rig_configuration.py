@@ -17,15 +17,17 @@ from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 
 RIG_FILE = "config/rig.yaml"
-NODES = (
-    "recorder",
-    "sim_rig",
-    "drive_emulator",
-    "device_driver",
-    "stereo_tracker",
-    "plane_controller",
-    "operator",
-)
+# Node -> its package, in the order in which they start.
+PACKAGES = {
+    "recorder": "needle_bringup",
+    "sim_rig": "needle_sim",
+    "drive_emulator": "needle_sim",
+    "device_driver": "needle_device_driver",
+    "stereo_tracker": "needle_tracker",
+    "plane_controller": "needle_controller",
+    "operator": "needle_bringup",
+}
+NODES = tuple(PACKAGES)
 # Nodes that not every level runs -> the levels that do.
 _LEVELS = {
     "drive_emulator": ("drive",),
@@ -55,6 +57,9 @@ OPTIONS = {
     "preset": "--controller",
     "depth": "--depth-mm",
 }
+
+# The longest that the driver lets its drives and itself wait for each other [s].
+PATIENT_WATCHDOG = 0.5
 
 Parameters = dict[str, dict[str, Any]]
 
@@ -132,17 +137,22 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     }
     if options.noise_mm is not None:
         sim_rig["tip_noise"] = options.noise_mm * 1e-3
+    driver: dict[str, Any] = {
+        "link": "slcan",
+        "channel": str(can_adapter()),
+        "autostart": True,
+        "lock_step": options.real_time_factor == 0.0,
+        "wait_for_recorder": True,
+    }
+    if driver["lock_step"]:
+        # Motors stand still while nobody sends SYNC: a starved machine may take its time.
+        driver["watchdog"] = driver["reply_age_limit"] = PATIENT_WATCHDOG
     parameters: Parameters = {
         "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
         "sim_rig": sim_rig,
         # Motors that move by a SYNC period with every SYNC repeat a run to the count.
         "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},
-        "device_driver": {
-            "link": "slcan",
-            "channel": str(can_adapter()),
-            "lock_step": options.real_time_factor == 0.0,
-            "autostart": True,
-        },
+        "device_driver": driver,
         "stereo_tracker": {},
         "plane_controller": {
             "preset": options.controller,

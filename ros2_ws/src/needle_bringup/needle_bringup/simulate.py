@@ -18,6 +18,7 @@ from needle_bringup.installed import find_executable, find_shared
 from needle_bringup.node_process import NodeProcess, stop, wait_for
 from needle_bringup.progress import PROGRESS_FD
 from needle_bringup.rig_configuration import (
+    PACKAGES,
     Parameters,
     command_line_parameters,
     merge,
@@ -39,15 +40,6 @@ from needle_common.cli import (
 )
 from needle_common.errors import UserError
 
-PACKAGES = {
-    "recorder": "needle_bringup",
-    "sim_rig": "needle_sim",
-    "drive_emulator": "needle_sim",
-    "device_driver": "needle_device_driver",
-    "stereo_tracker": "needle_tracker",
-    "plane_controller": "needle_controller",
-    "operator": "needle_bringup",
-}
 LOGS = "logs"
 PARAMETERS = "parameters.yaml"
 METADATA = "metadata.yaml"

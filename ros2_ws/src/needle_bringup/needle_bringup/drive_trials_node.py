@@ -1,0 +1,58 @@
+"""Trials of the device driver against the emulated drives, each printed as one JSON object.
+
+`python -m needle_bringup.drive_trials_node steps 10000`, `... faults 50 cut_bus unplug`,
+`... kills 50 operator`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import rclpy
+
+from needle_bringup.drive_faults_node import FAULTS, fault_trials
+from needle_bringup.drive_steps_node import random_steps
+from needle_bringup.graph_kills_node import KILLED, kill_trials
+from needle_bringup.ros_domain import own_domain
+from needle_common.cli import EXIT_DONE, run_command
+
+
+def main() -> int:
+    """Run trials; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("trial", choices=("steps", "faults", "kills"))
+    parser.add_argument("count", type=int)
+    parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
+    parser.add_argument("--seed", type=int, default=1)
+    given = parser.parse_args()
+
+    def run() -> int:
+        with own_domain() as domain, tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
+            rclpy.init(args=[], domain_id=domain)
+            try:
+                for outcome in _outcomes(given, Path(name), domain):
+                    print(json.dumps(outcome), flush=True)
+            finally:
+                rclpy.try_shutdown()
+        return EXIT_DONE
+
+    return run_command(run)
+
+
+def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Iterator[dict[str, Any]]:
+    if given.trial == "steps":
+        yield random_steps(folder, domain, given.count, given.seed)
+    elif given.trial == "faults":
+        yield from fault_trials(folder, domain, given.kinds or FAULTS, given.count, given.seed)
+    else:
+        yield from kill_trials(folder, domain, given.kinds or KILLED, given.count, given.seed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

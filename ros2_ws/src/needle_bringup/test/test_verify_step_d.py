@@ -1,0 +1,58 @@
+"""A sample of what `scripts/verify D` runs at full size; distances in time are not judged here."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from needle_bringup import verify_step_d
+from needle_bringup.verification import Workbench
+
+
+def outcome(**changes: Any) -> dict[str, Any]:
+    """A trial that went well."""
+    return {
+        "words": "cut_bus",
+        "speed_mm_s": 5.0,
+        "turn_rate_rad_s": 1.0,
+        "distance_mm": 0.2,
+        "state": "FAULT",
+        "reason": "no reply",
+        "logged": True,
+        "drives_faulted": 2,
+        "moved_by_itself_mm": 0.0,
+        "trouble_after": "",
+        **changes,
+    }
+
+
+def test_random_steps_add_up(tmp_path: Path) -> None:
+    findings = list(verify_step_d.many_steps(Workbench(["simulate"], tmp_path), 12))
+    # Twelve steps are too few to see memory grow.
+    assert [f for f in findings if not f.passed and f.key != "steps_memory"] == []
+
+
+def test_faults_are_named_and_need_a_command_to_go_on() -> None:
+    outcomes = verify_step_d._trials("faults", 1, "cut_bus", "emcy", "kill_driver")
+    assert [found["fault"] for found in outcomes] == ["cut_bus", "emcy", "kill_driver"]
+    for found in outcomes:
+        findings = list(verify_step_d.judge_recovery(found["fault"], [found]))
+        assert [finding for finding in findings if not finding.passed] == []
+
+
+@pytest.mark.parametrize(
+    ("change", "missed"),
+    [
+        ({}, set()),
+        ({"distance_mm": 0.46}, {"cut_bus_bound"}),
+        ({"state": "HOLDING"}, {"cut_bus_named"}),
+        ({"logged": False}, {"cut_bus_named"}),
+        ({"moved_by_itself_mm": 1e-4}, {"cut_bus_recovery"}),
+        ({"trouble_after": "aborted: x"}, {"cut_bus_recovery"}),
+    ],
+)
+def test_what_falls_short_is_a_miss(change: dict[str, Any], missed: set[str]) -> None:
+    findings = verify_step_d.judge("cut_bus", [outcome(), outcome(**change)])
+    assert {finding.key for finding in findings if not finding.passed} == missed
