@@ -2,28 +2,21 @@
 
 from __future__ import annotations
 
-import enum
-
 from needle_device_driver import objects as od
 from needle_device_driver.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402 import (
     FAULTS,
     FOLLOWING_ERROR,
-    HOMING_ATTAINED,
-    HOMING_ERROR,
     POWERED,
     START_HOMING,
-    TARGET_REACHED,
     DriveCommand,
-    DriveState,
     Goal,
     Mode,
-    TransitionWatch,
     drive_state,
-    next_command,
 )
-from needle_device_driver.drive_monitor import DriveMonitor, Feedback
+from needle_device_driver.drive_machine import LONGEST_REST, DriveMachine
+from needle_device_driver.drive_monitor import DriveMonitor
 from needle_device_driver.drive_settings import HERE, DriveSettings
 from needle_device_driver.drive_setup import (
     arm_watchdog,
@@ -33,29 +26,17 @@ from needle_device_driver.drive_setup import (
     write_limits,
 )
 from needle_device_driver.emergency import HEARTBEAT_LOST, describe_error
+from needle_device_driver.homing_run import HomingRun, HomingStep
 from needle_device_driver.object_access import DriveError, ObjectAccess, send_heartbeat
 from needle_device_driver.rules import Rule
 
-# In cycles.
-_REST = 3
-_LONGEST_REST = 50
-_LONGEST_SWITCHING = 100
-_LONGEST_REENABLE = 10
-_INSTANT_HOMING = 5
-_SILENT = 5
 # In seconds.
 _HEARTBEAT_WAIT = 0.3
 _FAULT_RESET_WAIT = 1.0
+# In cycles without an answer: a drive that is switched off at the end is given up.
+_SILENT = 5
 
 Fault = tuple[Rule, str]
-
-
-class Homing(enum.Enum):
-    """How far a homing is."""
-
-    NONE = "none"
-    PREPARING = "preparing"
-    RUNNING = "running"
 
 
 class Cia402Axis(Axis):
@@ -89,26 +70,16 @@ class Cia402Axis(Axis):
         self._period = period
         self._watchdog = watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
-        self._watch = TransitionWatch()
+        self._machine = DriveMachine(
+            settings.magnitude(settings.tolerance), period, self.monitor.feedback
+        )
+        self._homing: HomingRun | None = None
         self._configured = False
         self._opening = 0
-        self._goal = Goal.OFF
-        self._goal_cycles = 0
-        self._recovering = False
-        self._stopping = False
-        self._mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-        self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-        self._homing = Homing.NONE
-        self._homing_cycles = 0
-        self._stale_attained = False
         self._homed = False
         self._origin = 0
         self._zero = 0
-        self._target = 0
-        self._at: Feedback = self.monitor.feedback
         self._velocity = 0.0
-        self._still = 0
-        self._latched: Fault | None = None
 
     def probe(self) -> None:
         """Ask the drive whether it is there.
@@ -141,32 +112,32 @@ class Cia402Axis(Axis):
         if on:
             self._refuse_fault()
         else:
-            self._homing = Homing.NONE
-            self._mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
-        self._want(Goal.ON if on else Goal.OFF)
+            self._homing = None
+            self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+        self._machine.want(Goal.ON if on else Goal.OFF)
 
     def home(self, speed: float) -> None:
         """Begin to home; an axis that a hand moves takes where it is as 0."""
         self._refuse_fault()
         if not self.actuated:
-            self._zero = self._at.position
+            self._zero = self._machine.at.position
             self._count_from_home()
             return
         self._homed = False
         try:
-            access = ObjectAccess(self._link, self._settings.node_id)
-            write_limits(access, self._settings, homed=False)
-            write_homing(access, self._settings, speed)
+            write_limits(self._access, self._settings, homed=False)
+            write_homing(self._access, self._settings, speed)
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
-        self._mode = Mode.HOMING
-        self._homing = Homing.PREPARING
-        self._homing_cycles = 0
+        self._machine.mode = Mode.HOMING
+        self._homing = HomingRun(
+            here=self._settings.homing_method in HERE, tolerance_counts=self._rest_counts
+        )
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; `speed` follows from the cycle's length."""
         self._refuse_fault()
-        if not self._ready:
+        if not self._machine.ready:
             raise AxisError(f"{self._name} axis is not ready to move")
         settings = self._settings
         counts = settings.counts(target)
@@ -177,7 +148,7 @@ class Cia402Axis(Axis):
                 f"[{settings.lower:.6g}, {settings.upper:.6g}]",
                 Rule.SOFTWARE_LIMITS,
             )
-        step = abs(counts - self._target)
+        step = abs(counts - self._machine.target)
         bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
         if step > bound:
             raise AxisError(
@@ -185,53 +156,48 @@ class Cia402Axis(Axis):
                 f"cycle at {speed:.6g}/s, at most {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
-        self._target = counts
+        self._machine.target = counts
 
     def stop(self) -> None:
         """Order a quick stop now, without waiting for the next cycle."""
         if not self.actuated or not self._configured:
             return
-        self._homing = Homing.NONE
-        if self._goal is not Goal.OFF:
-            self._want(Goal.STOPPED)
-        self._stopping = True
+        self._homing = None
+        self._machine.stop()
         try:
-            self._command(DriveCommand.QUICK_STOP)
+            self._send_order()
         except LinkError as error:
             raise self._error(error) from error
 
     def reset(self) -> None:
         """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
-        self._want(Goal.OFF)
-        self._homing = Homing.NONE
-        self._stopping = False
+        self._machine.want(Goal.OFF)
+        self._homing = None
         try:
             self._link.open()
-            survived = self._survived()
+            survived = self._await_operational() and not self.monitor.rebooted
             if not survived or self._opening != self._link.openings:
                 self._set_up(survived=survived)
             self._reset_fault()
-            self._latched = None
-            self._watch.forget()
             self._refresh()
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest reply."""
-        at = self._at
+        machine = self._machine
         fault = self._fault
         return AxisSnapshot(
             time=self.monitor.fresh_time,
-            position=self._settings.position(at.position - self._zero),
+            position=self._settings.position(machine.at.position - self._zero),
             velocity=self._velocity,
-            powered=not self.actuated or self._is_powered,
+            powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,
-            moving=self._homing is not Homing.NONE,
-            at_home_switch=bool(at.inputs & self._outer_switches),
+            moving=self._homing is not None,
+            at_home_switch=bool(machine.at.inputs & self._outer_switches),
             fault="" if fault is None else fault[1],
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
-            ready=not self.actuated or self._ready,
+            ready=not self.actuated or machine.ready,
             origin=self._origin,
         )
 
@@ -239,9 +205,9 @@ class Cia402Axis(Axis):
         """Stop, switch off and release the drive's watchdog; the link is its owner's to close."""
         if not self._configured:
             return
-        self._homing = Homing.NONE
+        self._homing = None
         try:
-            self._want(Goal.OFF)
+            self._machine.want(Goal.OFF)
             self._switch_off_now()
             disarm_watchdog(self._link, self._settings)
         except (LinkError, DriveError) as error:
@@ -253,14 +219,10 @@ class Cia402Axis(Axis):
 
     @property
     def needs_cycles(self) -> bool:
-        """Whether the drive is on its way to a goal."""
+        """Whether the drive is on its way to where it was ordered, apart from set-points."""
         if not self.actuated or self._fault is not None:
             return False
-        if self._goal is Goal.ON:
-            return not self._ready or self._homing is not Homing.NONE
-        return self._state in POWERED and not (
-            self._goal is Goal.STOPPED and self._state is DriveState.QUICK_STOP_ACTIVE
-        )
+        return self._machine.switching or self._homing is not None
 
     def transmit(self) -> None:
         """Send this cycle's command and set-point.
@@ -272,153 +234,62 @@ class Cia402Axis(Axis):
         """
         if not self.actuated or not self._configured:
             return
-        self._command(self._next_command())
+        self._send_order()
         self._link.send(
-            od.SET_POINT.function_code + self._settings.node_id, od.SET_POINT.pack(self._target)
+            od.SET_POINT.function_code + self._settings.node_id,
+            od.SET_POINT.pack(self._machine.target),
         )
 
     def update(self) -> None:
         """Take what the drive answered to the SYNC; nothing new where nothing came."""
-        before, at = self._at, self.monitor.feedback
+        before, at = self._machine.at, self.monitor.feedback
         if at.number == before.number or not self._configured:
             return
-        self._at = at
         self._velocity = self._settings.position(at.position - before.position) / self._period
         if not self.actuated:
+            self._machine.at = at
             return
-        still = abs(at.position - before.position) <= self._settings.magnitude(
-            self._settings.tolerance
-        )
-        self._still = self._still + 1 if still else 0
-        state = self._state
-        if state is None:
-            self._latch(f"statusword 0x{at.statusword:04X} is none of CiA 402's")
-            return
-        odd = self._watch.unexplained(state)
-        if odd:
-            self._latch(odd)
-        follows = at.mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
-        if self._stopping or not (follows and state is DriveState.OPERATION_ENABLED):
-            # Whatever switches on or changes mode begins where the axis stands.
-            self._target = at.position
-        # Until the drive has said that it took the stop, it counts as on its way there.
-        self._stopping = self._stopping and state is DriveState.OPERATION_ENABLED
-        self._goal_cycles += 1
-        self._watch_switching(state)
-        if self._homing is not Homing.NONE:
-            self._go_home(state)
+        self._machine.update(at)
+        if self._homing is not None:
+            self._homing.update(at)
+            if self._homing.step is HomingStep.DONE:
+                self._end_homing()
 
-    def _watch_switching(self, state: DriveState) -> None:
-        if self._ready or self._homing is Homing.RUNNING:
-            self._goal_cycles = 0
-            self._recovering = False
-            return
-        if self._goal is Goal.ON:
-            stuck = state is DriveState.QUICK_STOP_ACTIVE and self._still > _REST
-            if stuck and self._goal_cycles > _LONGEST_REENABLE + _REST:
-                # Transition 16 is optional: where it is lacking, through SWITCH ON DISABLED.
-                self._recovering = True
-            switching = True
-        else:
-            switching = state is DriveState.OPERATION_ENABLED or (
-                self._goal is Goal.OFF and state in POWERED
-            )
-        if switching and self._goal_cycles > _LONGEST_SWITCHING:
-            seconds = _LONGEST_SWITCHING * self._period
-            self._latch(
-                f"is not {self._goal.value} after {seconds:g} s: state {state.name}, "
-                f"mode {self._at.mode}"
-            )
-
-    def _next_command(self) -> DriveCommand:
-        state = self._state
-        if self._stopping:
-            return DriveCommand.QUICK_STOP
-        if self._goal is not Goal.ON:
-            at_rest = self._still >= _REST or self._goal_cycles > _LONGEST_REST
-            return next_command(self._goal, state, at_rest=at_rest)
-        at_rest = self._still >= _REST
-        if state is DriveState.QUICK_STOP_ACTIVE and self._recovering:
-            return DriveCommand.DISABLE_VOLTAGE
-        if self._at.mode != self._mode:
-            if state in POWERED:
-                return next_command(Goal.OFF, state, at_rest=at_rest)
-            if state is DriveState.SWITCHED_ON:
-                return DriveCommand.SWITCH_ON
-        return next_command(Goal.ON, state, at_rest=at_rest)
-
-    def _command(self, command: DriveCommand) -> None:
-        # The mode of a powered drive stays: its set-point may be of another mode's making.
-        if self._state not in POWERED:
-            self._sent_mode = self._mode
+    def _send_order(self) -> None:
+        command, mode = self._machine.next_order()
         word = int(command)
-        if self._homing is Homing.RUNNING and command is DriveCommand.ENABLE_OPERATION:
+        running = self._homing is not None and self._homing.step is HomingStep.RUNNING
+        if running and command is DriveCommand.ENABLE_OPERATION:
             word |= START_HOMING
-        self._watch.sent(command)
         self._link.send(
-            od.COMMAND.function_code + self._settings.node_id,
-            od.COMMAND.pack(word, self._sent_mode),
+            od.COMMAND.function_code + self._settings.node_id, od.COMMAND.pack(word, mode)
         )
-
-    def _go_home(self, state: DriveState) -> None:
-        at = self._at
-        attained = bool(at.statusword & HOMING_ATTAINED)
-        self._homing_cycles += 1
-        if self._homing is Homing.PREPARING:
-            if state is DriveState.OPERATION_ENABLED and at.mode == Mode.HOMING:
-                # A drive may still say that it attained the homing before.
-                self._stale_attained = attained
-                self._homing = Homing.RUNNING
-                self._homing_cycles = 0
-            return
-        if at.statusword & HOMING_ERROR:
-            self._latch("homing failed")
-            return
-        self._stale_attained = self._stale_attained and attained
-        done = attained and bool(at.statusword & TARGET_REACHED) and not self._stale_attained
-        if self._stale_attained and self._settings.homing_method in HERE:
-            near = abs(at.position) <= self._settings.magnitude(self._settings.tolerance)
-            done = near and self._homing_cycles >= _INSTANT_HOMING
-        if done:
-            self._end_homing()
 
     def _end_homing(self) -> None:
         try:
-            write_limits(
-                ObjectAccess(self._link, self._settings.node_id), self._settings, homed=True
-            )
+            write_limits(self._access, self._settings, homed=True)
         except LinkError:
+            # The link's loss has its own name.
             return
         except DriveError as error:
-            self._latch(str(error))
+            self._machine.trouble = str(error)
             return
         self._count_from_home()
 
     def _count_from_home(self) -> None:
-        self._homing = Homing.NONE
+        self._homing = None
         self._homed = True
         self._origin += 1
 
     # ---- what is the matter -------------------------------------------------------------------
 
     @property
-    def _state(self) -> DriveState | None:
-        return drive_state(self._at.statusword)
+    def _access(self) -> ObjectAccess:
+        return ObjectAccess(self._link, self._settings.node_id)
 
     @property
-    def _ready(self) -> bool:
-        return (
-            self._goal is Goal.ON
-            and not self._stopping
-            and self._state is DriveState.OPERATION_ENABLED
-            and self._at.mode == self._mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
-        )
-
-    @property
-    def _is_powered(self) -> bool:
-        # A drive that is still on from before, on its way off or to another mode, is not.
-        on = self._state in POWERED and self._at.mode == self._mode
-        return self._goal is not Goal.OFF and (on or self._recovering)
+    def _rest_counts(self) -> int:
+        return self._settings.magnitude(self._settings.tolerance)
 
     @property
     def _outer_switches(self) -> int:
@@ -432,28 +303,24 @@ class Cia402Axis(Axis):
             return None
         if self._link.lost:
             return Rule.LINK_LOSS, self._link.lost
-        monitor = self.monitor
+        monitor, machine = self.monitor, self._machine
         if monitor.rebooted:
             return Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost"
         code = monitor.emergency
         if code is not None:
             rule = Rule.DRIVE_WATCHDOG if code == HEARTBEAT_LOST else Rule.DRIVE_EMERGENCY
             return rule, f"the drive reports {describe_error(code)}"
-        state = self._state
-        if state in FAULTS:
-            return Rule.DRIVE_EMERGENCY, f"the drive is in {state.name}"
+        if machine.state in FAULTS and self.actuated:
+            return Rule.DRIVE_EMERGENCY, f"the drive is in {machine.state.name}"
         if monitor.left_operational:
             return Rule.DRIVE_REBOOT, "the drive left the operational state"
-        if self._latched is not None:
-            return self._latched
-        following = self._at.statusword & FOLLOWING_ERROR and self._ready
-        if following:
+        if machine.trouble:
+            return Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.trouble}"
+        if self._homing is not None and self._homing.step is HomingStep.FAILED:
+            return Rule.ONE_FAULT_STOPS_BOTH, "the drive reports that homing failed"
+        if machine.ready and machine.at.statusword & FOLLOWING_ERROR:
             return Rule.FOLLOWING_ERROR, "the drive reports a following error"
         return None
-
-    def _latch(self, text: str) -> None:
-        if self._latched is None:
-            self._latched = (Rule.ONE_FAULT_STOPS_BOTH, f"the drive {text}")
 
     def _refuse_fault(self) -> None:
         if not self._configured:
@@ -466,12 +333,6 @@ class Cia402Axis(Axis):
         rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
         return AxisError(f"{self._name} axis: {error}", rule)
 
-    def _want(self, goal: Goal) -> None:
-        if goal is not self._goal:
-            self._goal = goal
-            self._goal_cycles = 0
-            self._recovering = False
-
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 
     def _set_up(self, *, survived: bool) -> None:
@@ -479,19 +340,12 @@ class Cia402Axis(Axis):
             self._homed = False
             self._origin += 1
         self.monitor.begin_set_up()
-        set_up(
-            self._link,
-            self._settings,
-            period=self._period,
-            homed=self._homed,
-        )
+        set_up(self._link, self._settings, period=self._period, homed=self._homed)
         if not self._await_operational():
             raise DriveError(f"node {self._settings.node_id} did not become operational")
         arm_watchdog(self._link, self._settings, self._watchdog)
         self.monitor.end_set_up()
         self._opening = self._link.openings
-        self._watch.forget()
-        self._latched = None
         self._refresh()
 
     def _await_operational(self) -> bool:
@@ -502,11 +356,8 @@ class Cia402Axis(Axis):
                 return True
         return False
 
-    def _survived(self) -> bool:
-        return self._await_operational() and not self.monitor.rebooted
-
     def _reset_fault(self) -> None:
-        access = ObjectAccess(self._link, self._settings.node_id)
+        access = self._access
         self.monitor.emergency = None
         if drive_state(access.read(od.STATUSWORD)) not in FAULTS:
             return
@@ -521,26 +372,25 @@ class Cia402Axis(Axis):
         access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
 
     def _refresh(self) -> None:
-        access = ObjectAccess(self._link, self._settings.node_id)
+        """Ask for what the next SYNC would bring, and forget what was before."""
+        access = self._access
         self.monitor.take(
             access.read(od.STATUSWORD),
             access.read(od.MODE_DISPLAY),
-            self._at.inputs,
+            self._machine.at.inputs,
             access.read(od.POSITION_ACTUAL),
         )
-        self._at = self.monitor.feedback
-        self._target = self._at.position
+        self._machine.begin_anew(self.monitor.feedback)
         self._velocity = 0.0
-        self._still = 0
 
     def _switch_off_now(self) -> None:
         """Run cycles of its own until the drive is off: nobody else will."""
         if not self.actuated:
             return
         silent = 0
-        for _ in range(_LONGEST_REST + _REST):
+        for _ in range(LONGEST_REST + _SILENT):
             send_heartbeat(self._link)
-            self._command(self._next_command())
+            self._send_order()
             self.monitor.expect_answer()
             self._link.send(od.SYNC)
             with self._link.arrival:
@@ -549,5 +399,5 @@ class Cia402Axis(Axis):
                 self._link.arrival.wait_for(lambda: bool(self._link.lost), self._period / 2.0)
             self.update()
             silent = 0 if answered else silent + 1
-            if self._state not in POWERED or silent > _SILENT:
+            if self._machine.state not in POWERED or silent > _SILENT:
                 return
