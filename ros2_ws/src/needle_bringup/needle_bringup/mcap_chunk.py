@@ -27,6 +27,7 @@ SIZE: Final = struct.Struct("<Q")
 # What bytes that are not what they should be make a parser raise.
 UNREADABLE: Final = (ValueError, struct.error, McapError, IndexError)
 _MESSAGE: Final = struct.Struct("<HIQQ")
+_MESSAGE_HEADER: Final = RECORD_HEADER.size + _MESSAGE.size
 
 Definition = Schema | Channel
 
@@ -170,8 +171,11 @@ def read_half_chunk(
             whole = end
     except UNREADABLE:
         pass  # what came before it is whole
-    if found and _is_completed_by_zeros(part, whole):
-        whole = found.pop()[2]
+    ends_in_zeros = whole < len(part) and not any(part[whole + _MESSAGE_HEADER :])
+    if position + length <= len(data) and not ends_in_zeros:
+        return None, []  # it is not cut but damaged, nobody knows where
+    if found and ends_in_zeros and not part[whole - 1]:
+        whole = found.pop()[2]  # the message may end in what a power cut left as zeros
     if not found:
         return None, definitions
     for channel, time, offset in found:
@@ -203,11 +207,6 @@ def _records(content: bytes) -> Iterator[tuple[int, int, int]]:
             return
         yield opcode, position, end
         position = end
-
-
-def _is_completed_by_zeros(part: bytes, whole: int) -> bool:
-    """Return whether the last message before `whole` may end in what a power cut left as zeros."""
-    return whole < len(part) and not part[whole - 1] and not any(part[whole:])
 
 
 def index_record(channel: int, entries: list[tuple[int, int]]) -> bytes:

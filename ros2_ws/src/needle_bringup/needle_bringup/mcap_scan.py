@@ -216,10 +216,8 @@ class _Scanner:
             # A power cut leaves zeros where the file was made longer and nothing was written.
             if opcode == Opcode.CHUNK and not any(self._data[position + length :]):
                 self._take_half_chunk(position, length)
-                half = self.found.half_chunk
-                if half is not None and not any(self._data[half.data_end : position + length]):
+                if self.found.half_chunk is not None:
                     return None
-                self.found.half_chunk = None
             self._pass_over(position, position + length)
         return position + length
 

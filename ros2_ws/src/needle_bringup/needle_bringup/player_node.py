@@ -31,7 +31,7 @@ from needle_bringup.conversions import recorded_offer
 from needle_bringup.message_definitions import full_definition, type_hash
 from needle_bringup.parameters import AnsweringNodes
 from needle_bringup.playback import PlaybackClock, ReadAhead
-from needle_bringup.player_options import PlayerOptions, parse_options
+from needle_bringup.player_options import PlayerOptions, parse_options, require_fits
 from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
 from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
@@ -74,9 +74,6 @@ class Player(Node):
         self.start = contents.start + round(options.start * 1e9)
         end = min(options.end, (contents.end - contents.start) / 1e9)
         self.end = contents.start + round(end * 1e9)
-        if self.start > contents.end:
-            seconds = (contents.end - contents.start) / 1e9
-            raise UserError(f"--start {options.start:g} s: {options.bag} has {seconds:.1f} s")
         self._topics = self._playable()
         self._senders: dict[str, Publisher] = {}
         self._diagnostics = DiagnosticsPublisher(self)
@@ -93,9 +90,6 @@ class Player(Node):
     def _playable(self) -> dict[str, BagTopic]:
         """Return the topics to play; say why others are left out."""
         options, known = self._options, self._contents.topics
-        for name in (*options.topics, *options.remaps):
-            if name not in known:
-                raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
         chosen = {n: t for n, t in known.items() if not options.topics or n in options.topics}
         if options.clock is not None:
             chosen.pop(CLOCK, None)
@@ -347,6 +341,7 @@ def main(args: list[str] | None = None) -> int:
     def command() -> int:
         options = parse_options(own)
         contents = read_contents(options.bag)
+        require_fits(options, contents)
         stopped: list[bool] = []
 
         def stop(_number: int, _frame: FrameType | None) -> None:

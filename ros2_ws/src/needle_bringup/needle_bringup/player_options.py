@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from needle_bringup.bag_files import BagContents
 from needle_common.errors import OutOfBoundsError, UserError
 
 _DESCRIPTION = """\
@@ -130,6 +131,17 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         given.paused,
         given.clock,
     )
+
+
+def require_fits(options: PlayerOptions, contents: BagContents) -> None:
+    """Raise a `UserError` if the options ask for what the bag does not have."""
+    known = contents.topics
+    for name in (*options.topics, *options.remaps):
+        if name not in known:
+            raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
+    seconds = (contents.end - contents.start) / 1e9
+    if options.start > seconds:
+        raise UserError(f"--start {options.start:g} s: {options.bag} has {seconds:.1f} s only")
 
 
 def _remap(text: str) -> tuple[str, str]:

@@ -6,6 +6,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NoReturn
 
 from tqdm import tqdm
 
@@ -29,21 +30,27 @@ is still being recorded, or the disk refuses the changes; 130 interrupted (run i
 """
 
 
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see --help")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="recover",
         description=_DESCRIPTION,
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write what was done as flat JSON"
     )
-    options = parser.parse_args(arguments)
 
     def command() -> int:
+        options = parser.parse_args(arguments)
         if options.json is not None and not options.json.absolute().parent.is_dir():
             raise UserError(f"--json {options.json}: its folder must exist")
         with _Bar() as bar:
