@@ -18,6 +18,7 @@ from needle_controller.feedback_linearization import (
     transition,
 )
 from needle_controller.gains import sampled_observer_gain
+from needle_controller.innovation_gate import InnovationGate
 from needle_controller.kinematics import YAW, angles_from_rotation, rotation_from_angles
 from needle_controller.luenberger_steps import advance_states, correct_states
 from needle_controller.saturation import saturate
@@ -41,6 +42,9 @@ class LuenbergerSettings:
         Distance of the estimate from the border of (6)'s region, in [0, 1).
     initial_yaw_std, initial_pitch_std, initial_roll_std : float
         How well the orientation at the entry is known [rad]; enters the covariance only.
+    gate : float
+        A tip is refused whose squared innovation is above this times its variance; infinite, as
+        in the paper, takes every tip.
     """
 
     curvature: float
@@ -51,6 +55,7 @@ class LuenbergerSettings:
     initial_yaw_std: float
     initial_pitch_std: float
     initial_roll_std: float
+    gate: float = math.inf
 
 
 class LuenbergerObserver:
@@ -84,6 +89,7 @@ class LuenbergerObserver:
         self._inserted: Array = np.zeros(())
         self._covariance: Array = np.zeros((3, 3))
         self._saturated: npt.NDArray[np.bool_] = np.zeros((), dtype=bool)
+        self._gate = InnovationGate(settings.gate)
 
     @property
     def settings(self) -> LuenbergerSettings:
@@ -94,11 +100,13 @@ class LuenbergerObserver:
     def settings(self, settings: LuenbergerSettings) -> None:
         reduced = reduced_from_linearized(self._s, self._settings.curvature)
         self._settings = settings
+        self._gate = InnovationGate(settings.gate)
         self._take(linearized_from_reduced(reduced, settings.curvature))
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement; see `Estimator.reset`."""
         settings = self._settings
+        self._gate.reset()
         tip, joints = np.asarray(tip, dtype=float), np.asarray(joints, dtype=float)
         turned = np.zeros((*joints.shape[:-1], 3))
         turned[..., 2] = joints[..., 1]
@@ -152,30 +160,39 @@ class LuenbergerObserver:
         tip, age = np.asarray(tip, dtype=float), np.asarray(age, dtype=float)
         settings = self._settings
         found = np.isfinite(tip[..., 0]) & np.isfinite(tip[..., 1]) & np.isfinite(tip[..., 2])
-        all_found = bool(np.all(found))
+        noise = np.asarray(settings.measurement_std**2)
+        if covariance is not None:
+            covariance = np.asarray(covariance, dtype=float)
+            found = found & np.isfinite(covariance[..., 0, 0])
+            noise = np.where(np.isfinite(covariance[..., 0, 0]), covariance[..., 0, 0], noise)
+        row = transition(-age)[..., 0, :]
+        used = found
+        if math.isfinite(settings.gate):
+            spread = np.einsum("...i,...ij,...j->...", row, self._covariance, row) + noise
+            innovation = tip[..., 0] - np.sum(row * self._s, axis=-1)
+            used = self._gate.admit(innovation**2 / spread, found)
+        all_used = bool(np.all(used))
         gain = sampled_observer_gain(settings.observer_poles, self._since_correction)
-        shape = np.broadcast_shapes(self._s.shape[:-1], found.shape, age.shape, gain.shape[:-1])
+        shape = np.broadcast_shapes(self._s.shape[:-1], used.shape, age.shape, gain.shape[:-1])
         states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
-        x = np.where(found, tip[..., 0], np.nan)
+        x = tip[..., 0] if all_used else np.where(used, tip[..., 0], np.nan)
         measured = np.broadcast_to(x, shape).flatten(), np.broadcast_to(age, shape).flatten()
         gains = gain.reshape(1, 3) if gain.ndim == 1 else _rows(gain, shape)
         region = settings.curvature, settings.saturation_margin
         correct_states(states, saturated, measured, gains, region)
         self._s, self._saturated = states.reshape(*shape, 3), saturated.reshape(shape)
-        self._tip = tip.copy() if all_found else np.where(found[..., None], tip, self._tip)
-        noise = np.asarray(self._settings.measurement_std**2)
+        self._tip = tip.copy() if all_used else np.where(used[..., None], tip, self._tip)
         if covariance is not None:
-            self._tip_covariance = np.asarray(covariance, dtype=float)
-            noise = self._tip_covariance[..., 0, 0]
-        # Only what was found narrows the covariance; one shape for all needles while all were.
-        used = gain if all_found else gain * found[..., None]
-        keep = np.eye(3) - used[..., :, None] * np.array([1.0, 0.0, 0.0])
+            self._tip_covariance = np.where(used[..., None, None], covariance, self._tip_covariance)
+        # Only what was used narrows the covariance; one shape for all needles while all were.
+        taken = gain if all_used else gain * used[..., None]
+        keep = np.eye(3) - taken[..., :, None] * row[..., None, :]
         self._covariance = (
             keep @ self._covariance @ np.swapaxes(keep, -1, -2)
-            + used[..., :, None] * used[..., None, :] * noise[..., None, None]
+            + taken[..., :, None] * taken[..., None, :] * noise[..., None, None]
         )
         self._since_correction = (
-            np.zeros(()) if all_found else np.where(found, 0.0, self._since_correction)
+            np.zeros(()) if all_used else np.where(used, 0.0, self._since_correction)
         )
 
     def estimate(self) -> Estimate:
@@ -185,9 +202,9 @@ class LuenbergerObserver:
         x, pitch, roll = (reduced[..., i] for i in range(3))
         parts = (x, self._tip[..., 1], self._tip[..., 2], self._yaw, pitch, roll)
         coordinates = np.stack(np.broadcast_arrays(*parts), axis=-1)
-        warnings: tuple[str, ...] = ()
+        warnings = self._gate.warnings()
         if np.any(self._saturated):
-            warnings = (
+            warnings += (
                 "the estimate was saturated: the roll it wants is beyond what its coordinates say",
             )
         return Estimate(

@@ -79,12 +79,14 @@ def tip(plant: NeedlePlant) -> Array:
 # One side.
 
 
-def test_steady_gain_is_the_papers_observer() -> None:
-    """Beside `luenberger`, step for step, noise and missed tips included."""
+@pytest.mark.parametrize("gate", [math.inf, 3.0])
+def test_steady_gain_is_the_papers_observer(gate: float) -> None:
+    """Beside `luenberger`, step for step, noise, missed and refused tips included."""
     rng = default_rng(1)
+    settings = observer_settings(CONTROL, CONTROL.gains())
     one, other = (
-        steady(gate=math.inf),
-        LuenbergerObserver(observer_settings(CONTROL, CONTROL.gains())),
+        steady(gate=gate),
+        LuenbergerObserver(dataclasses.replace(settings, gate=gate)),
     )
     tips = rng.normal(0.0, 1e-3, (40, 7, 3))
     tips[5, 2] = np.nan
