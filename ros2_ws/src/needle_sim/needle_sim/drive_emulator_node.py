@@ -14,11 +14,12 @@ from typing import Any
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
-from needle_common.conversions import JOINT_STATES, to_stamp
+from needle_common.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
@@ -50,6 +51,8 @@ Publishes   sim/drive_positions: where the motors really are, from the home swit
 _WAIT = 0.005
 _PERIOD = 0.02
 _LOOK_AROUND = 0.05
+_PATIENCE = 0.05
+_UNCLEAR = 2
 
 
 class DriveEmulatorNode(Node):
@@ -69,8 +72,13 @@ class DriveEmulatorNode(Node):
         self._bus = EmulatedBus(values.insertion, values.rotation, clock, time.monotonic())
         self._states = {name: drive.state for name, drive in self._bus.drives.items()}
         self._syncs_told = 0
-        self._told_ns = -1
+        self._synced_at = 0.0
         self._told_at = 0.0
+        # The newest simulated time, and how many there were since positions were told.
+        self._time_ns = 0
+        self._times_since = _UNCLEAR
+        if self._steps_with_sync:
+            self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
         self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
         self._diagnostics = DiagnosticsPublisher(self)
         port: Port
@@ -95,7 +103,7 @@ class DriveEmulatorNode(Node):
         self._server.turn(_WAIT if not self._waits_for_time else 0.0)
         now = time.monotonic()
         if self._steps_with_sync:
-            self._tell_synced_positions()
+            self._tell_synced_positions(now)
         elif now - self._told_at >= _PERIOD:
             self._told_at = max(self._told_at + _PERIOD, now - _PERIOD)
             self._tell_positions(self.get_clock().now().nanoseconds)
@@ -117,23 +125,36 @@ class DriveEmulatorNode(Node):
         self._server.close()
 
     @property
+    def times_heard(self) -> int:
+        """How many new simulated times were heard since positions were told."""
+        return self._times_since
+
+    @property
     def _waits_for_time(self) -> bool:
         return self._steps_with_sync and self._bus.syncs > self._syncs_told
 
-    def _tell_synced_positions(self) -> None:
-        """Tell the positions of the last SYNC.
+    def _on_clock(self, message: Clock) -> None:
+        time_ns = to_nanoseconds(message.clock)
+        if time_ns != self._time_ns:
+            self._time_ns = time_ns
+            self._times_since += 1
 
-        A SYNC is sent once the time that it belongs to is known to its sender, and that may be
-        before it is known here: the stamp is the first time after that of the SYNC before.
+    def _tell_synced_positions(self, now: float) -> None:
+        """Tell the positions of the last SYNC, with the simulated time that it belongs to.
+
+        Its sender may know that time before it is known here. One new time since the SYNC before
+        is it; where it is not as clear (at the start, after SYNCs that failed to come), or without
+        simulated time, a moment's patience decides.
         """
-        now_ns = self.get_clock().now().nanoseconds
-        behind = self._bus.syncs - self._syncs_told
-        if behind and (now_ns > self._told_ns or behind > 1):
+        if not self._waits_for_time:
+            self._synced_at = now
+        elif self._times_since == 1 or now - self._synced_at > _PATIENCE:
             self._syncs_told = self._bus.syncs
-            self._tell_positions(now_ns)
+            self._times_since = 0
+            self._synced_at = now
+            self._tell_positions(self._time_ns or self.get_clock().now().nanoseconds)
 
     def _tell_positions(self, stamp_ns: int) -> None:
-        self._told_ns = stamp_ns
         axes = self._bus.axes()
         message = JointState(
             name=[f"{name}_joint" for name in axes],
@@ -191,7 +212,11 @@ def main() -> int:
                 # A look at ROS costs more than serving a frame: only where there is a reason.
                 if waits or now - looked_at >= _LOOK_AROUND:
                     looked_at = now
-                    executor.spin_once(timeout_sec=_WAIT if waits else 0.0)
+                    times = -1
+                    while node.times_heard != times:
+                        # All that is there counts: a stamp that came late must not be taken twice.
+                        times = node.times_heard
+                        executor.spin_once(timeout_sec=_WAIT if waits and times == 0 else 0.0)
         finally:
             node.close()
             executor.shutdown()

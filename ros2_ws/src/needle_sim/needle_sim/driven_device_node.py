@@ -171,7 +171,7 @@ class DrivenDevice:
 
     def _on_positions(self, message: JointState) -> None:
         self._tick.heard()
-        self._tick.drives_at(to_nanoseconds(message.header.stamp))
+        self._tick.drives_moved()
         self._motors_turn = any(velocity != 0.0 for velocity in message.velocity)
         at = dict(zip(message.name, message.position, strict=True))
         self._bench.move_to(at["insertion_joint"], at["rotation_joint"])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 # So many looks in a row in which nothing more was heard: topics have no order among each other.
-_QUIET_LOOKS = 2
+_QUIET_LOOKS = 1
 
 
 class DrivenTick:
@@ -21,25 +21,24 @@ class DrivenTick:
         self._time_ns: int | None = None
         self._begun_at = 0.0
         self._driver_ns = -1
-        self._drives_ns = -1
+        self._drives_moved = False
         self._quiet = 0
 
     @property
     def answered(self) -> bool:
         """Whether both sides have answered; what they said before may still be on its way."""
-        return self._time_ns is not None and min(self._driver_ns, self._drives_ns) >= self._time_ns
+        return self._driver_is_done and self._drives_moved
 
     @property
     def silent(self) -> str:
         """Who has not answered."""
-        time_ns = self._time_ns or 0
         names = [
             name
-            for name, at in (
-                ("the driver (joint_states)", self._driver_ns),
-                ("the drives (sim/drive_positions)", self._drives_ns),
+            for name, done in (
+                ("the driver (joint_states)", self._driver_is_done),
+                ("the drives (sim/drive_positions)", self._drives_moved),
             )
-            if at < time_ns
+            if not done
         ]
         return " and ".join(names)
 
@@ -47,15 +46,16 @@ class DrivenTick:
         """Take that time is `time_ns` [ns] from now [s] on."""
         self._time_ns = time_ns
         self._begun_at = now
+        self._drives_moved = False
         self._quiet = 0
 
     def driver_at(self, time_ns: int) -> None:
         """Take that the driver has done its cycle of `time_ns` [ns]."""
         self._driver_ns = time_ns
 
-    def drives_at(self, time_ns: int) -> None:
-        """Take that the drives have moved up to `time_ns` [ns]."""
-        self._drives_ns = time_ns
+    def drives_moved(self) -> None:
+        """Take that the drives have told where they are; they do for each SYNC."""
+        self._drives_moved = True
 
     def heard(self) -> None:
         """Take that something was heard."""
@@ -73,3 +73,7 @@ class DrivenTick:
             return False
         self.unanswered += 1
         return True
+
+    @property
+    def _driver_is_done(self) -> bool:
+        return self._time_ns is not None and self._driver_ns >= self._time_ns
