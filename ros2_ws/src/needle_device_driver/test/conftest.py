@@ -420,6 +420,7 @@ class DriveBench:
     """Driver and supervisor on two scripted drives, cycle by cycle."""
 
     period = PERIOD
+    command = staticmethod(Bench.step_command)
 
     def __init__(self, **parameters: Any) -> None:
         self.insertion, self.rotation = ScriptedDrive(1), ScriptedDrive(2)
