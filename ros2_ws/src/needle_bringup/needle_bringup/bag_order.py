@@ -19,7 +19,13 @@ from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.bag_files import raw_messages, read_contents, readable, require_bag
+from needle_bringup.bag_files import (
+    BagContents,
+    raw_messages,
+    read_contents,
+    readable,
+    require_bag,
+)
 from needle_bringup.bag_metadata import METADATA_FILE
 
 # A topic whose fastest message took less or more than this [ns] was sent by another clock.
@@ -48,19 +54,25 @@ class SentMessage(NamedTuple):
     data: bytes
 
 
+Reorder = Callable[[list[SentMessage]], list[SentMessage]]
+
+
 def messages_as_sent(
-    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool]
+    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool], reorder: Reorder
 ) -> Iterator[tuple[str, int, Any]]:
     """Yield (topic, log time [ns], message) in the order of sending; as `raw_as_sent` otherwise."""
     require_bag(path)
     store = get_typestore(Stores.ROS2_JAZZY)
     with readable(path), AnyReader([path], default_typestore=store) as reader:
-        for sent in raw_as_sent(path, wanted, is_large):
+        for sent in raw_as_sent(path, wanted, is_large, reorder):
             yield sent.topic, sent.log_time, reader.deserialize(sent.data, sent.type_name)
 
 
 def raw_as_sent(
-    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool]
+    path: Path,
+    wanted: Callable[[str], bool],
+    is_large: Callable[[str], bool],
+    reorder: Reorder | None = None,
 ) -> Iterator[SentMessage]:
     """Yield the messages of the wanted topics in the order of sending.
 
@@ -73,6 +85,8 @@ def raw_as_sent(
     is_large : callable
         Whether a topic's messages are not to be kept in memory, such as images; such topics are
         expected in order.
+    reorder : callable, optional
+        Gives the messages that are not large other times.
 
     Raises
     ------
@@ -85,11 +99,19 @@ def raw_as_sent(
     with readable(path):
         files = _plain_mcap_files(path)
         small = list(_read(files, topics - large))
-        if files and _clocks_agree(small):
-            small.sort(key=lambda sent: (sent.time, sent.log_time))
-            yield from heapq.merge(small, _read(files, large), key=lambda sent: sent.time)
-            return
-    for topic, log_time, data in raw_messages(path, topics, contents.start, contents.end + 1):
+        streamed: Iterable[SentMessage] = _read(files, large)
+        if not files or not _clocks_agree(small):
+            small = list(_as_received(contents, topics - large))
+            streamed = _as_received(contents, large)
+        if reorder is not None:
+            small = reorder(small)
+        small.sort(key=lambda sent: (sent.time, sent.log_time))
+        yield from heapq.merge(small, streamed, key=lambda sent: sent.time)
+
+
+def _as_received(contents: BagContents, topics: set[str]) -> Iterator[SentMessage]:
+    end = contents.end + 1
+    for topic, log_time, data in raw_messages(contents.path, topics, contents.start, end):
         yield SentMessage(log_time, log_time, topic, contents.topics[topic].type_name, data)
 
 

@@ -13,13 +13,17 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
+from needle_bringup.bag_hearing import as_heard
 from needle_bringup.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bringup.bag_order import messages_as_sent
 from needle_bringup.bag_reader import Run, Series, nanoseconds
 from needle_bringup.comparison import Record, members
 from needle_bringup.run_summary import reduced_states, target_offset
 
-TIP_TOPICS = ("needle/tip", "needle/tip_pose")
+POSE = "needle/tip_pose"
+TIP_TOPICS = ("needle/tip", POSE)
+# Tells when the tips were heard.
+HEARD = "needle/estimate"
 TYPES: Mapping[str, str] = {
     "needle/tip": "geometry_msgs/msg/PointStamped",
     "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -165,8 +169,8 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     if tracker is not None:
         outputs += tracker.finish(last_time)
         kept = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
-        without_images = sum(record.topic == "needle/tip_pose" for record in recorded) - sum(
-            record.topic == "needle/tip_pose" for record in kept
+        without_images = sum(record.topic == POSE for record in recorded) - sum(
+            record.topic == POSE for record in kept
         )
         recorded = kept
     today = [Record(o.topic, o.stamp, dict(members(o.message))) for o in outputs]
@@ -190,17 +194,21 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
     list of Output
         What the controller puts out.
     """
-    stamps = {answer.stamp for answer in answers}
-    waiting = sorted(answers, key=lambda answer: answer.log_time)
+    today = {(answer.topic, answer.stamp): answer.message for answer in answers}
+    answered = {answer.stamp for answer in answers}
+    recorded = set(run.tips.stamps.tolist())
     outputs: list[Output] = []
-    for topic, log_time, message in _inputs(run, set(), [controller]):
-        while waiting and waiting[0].log_time <= log_time:
-            answer = waiting.pop(0)
-            outputs += controller.take(answer.topic, answer.log_time, answer.message)
-        if topic not in TIP_TOPICS or nanoseconds(message.header.stamp) not in stamps:
-            outputs += controller.take(topic, log_time, message)
-    for answer in waiting:
-        outputs += controller.take(answer.topic, answer.log_time, answer.message)
+    for topic, log_time, message in _inputs(run, {HEARD}, [controller]):
+        stamp = nanoseconds(message.header.stamp) if topic in TIP_TOPICS else 0
+        if topic not in TIP_TOPICS or stamp not in answered:
+            taken = {topic: message}
+        elif topic == POSE and stamp not in recorded:
+            taken = {name: today.get((name, stamp)) for name in TIP_TOPICS}
+        else:
+            taken = {topic: today.get((topic, stamp))}
+        for name, content in taken.items():
+            if name in controller.topics and content is not None:
+                outputs += controller.take(name, log_time, content)
     return outputs
 
 
@@ -239,7 +247,10 @@ def _inputs(run: Run, watched: set[str], stages: Sequence[Stage]) -> Iterator[tu
     relative = watched.union(*(stage.topics for stage in stages))
     names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
     messages = messages_as_sent(
-        run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS
+        run.path,
+        lambda name: name in names,
+        lambda name: names[name] in IMAGE_TOPICS,
+        lambda sent: as_heard(sent, run.namespace),
     )
     bar = tqdm(
         messages,

@@ -26,6 +26,7 @@ def write_rerun(
     target: Path,
     outputs: Sequence[Output],
     parameters: Mapping[str, Mapping[str, Any]],
+    calibration: str,
 ) -> None:
     """Write the copy, and `outputs.txt` beside it: today's outputs to be read, and diffed.
 
@@ -40,6 +41,8 @@ def write_rerun(
         stamps that are in none (their images are not in the bag).
     parameters : mapping
         Full node name to the parameters that were used.
+    calibration : str
+        The calibration that was used.
 
     Raises
     ------
@@ -52,7 +55,7 @@ def write_rerun(
     topics = {output.topic for output in outputs}
     answered = {output.stamp for output in outputs if output.topic in TIP_TOPICS}
     contents = read_contents(run.path)
-    custom = contents.custom_data
+    custom = {**contents.custom_data, "calibration": calibration}
     copy = BagCopy(target, contents.distribution, {**custom, **_changed(run, custom, parameters)})
     is_image = {run.namespace + name for name in IMAGE_TOPICS}.__contains__
     for message in raw_as_sent(run.path, lambda _: True, is_image):

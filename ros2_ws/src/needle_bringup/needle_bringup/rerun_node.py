@@ -29,7 +29,7 @@ from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
 from needle_controller.control_settings import PRESETS
 from needle_controller.parameters import PlaneControllerParameters
-from needle_tracker.calibration import load_calibration, parse_calibration
+from needle_tracker.calibration import parse_calibration
 from needle_tracker.parameters import StereoTrackerParameters
 
 DESCRIPTION = """\
@@ -54,6 +54,7 @@ tolerances: a value may differ by absolute + relative x recorded
 
 exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 130 interrupted.
 """
+FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
 # What rclpy declares on every node.
 _OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -122,11 +123,22 @@ def _run(words: Sequence[str]) -> int:
     run = read_run(given.bag)
     tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
     controller_node = _node(run, CONTROLLER, changes)
-    tracker = None if tracker_node is None else _tracker(run, tracker_node)
+    calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
+    tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
     controller = _controller(controller_node)
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
 
+    if given.json is not None:
+        write_json(given.json, flat(run, comparison, rerun.outputs))
+    if given.output is not None:
+        outputs = rerun.outputs
+        answers = [output for output in outputs if output.topic in TIP_TOPICS]
+        if answers:
+            outputs = [*answers, *run_tips(run, _controller(controller_node), answers)]
+        nodes = [node for node in (tracker_node, controller_node) if node is not None]
+        used = {node.name: node.values for node in nodes}
+        write_rerun(run, given.output, outputs, used, calibration)
     print(f"{run.path}: {_summary(tracker, controller, controller_node)}")
     for note in controller.notes:
         print(f"note: {note}")
@@ -136,15 +148,7 @@ def _run(words: Sequence[str]) -> int:
     for text in (describe(run, comparison), errors_text(run, rerun.outputs)):
         if text:
             print(text)
-    if given.json is not None:
-        write_json(given.json, flat(run, comparison, rerun.outputs))
     if given.output is not None:
-        outputs = rerun.outputs
-        answers = [output for output in outputs if output.topic in TIP_TOPICS]
-        if answers:
-            outputs = [*answers, *run_tips(run, _controller(controller_node), answers)]
-        nodes = [node for node in (tracker_node, controller_node) if node is not None]
-        write_rerun(run, given.output, outputs, {n.name: n.values for n in nodes})
         print(f"written: {given.output}")
     return EXIT_MISSED if comparison.changed else EXIT_DONE
 
@@ -183,21 +187,29 @@ def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node
     return Node(full_name, {**run.parameters.get(full_name, {}), **given}, frozenset(given))
 
 
-def _tracker(run: Run, node: Node) -> TrackerStage:
-    parameters = node.parameters(StereoTrackerParameters)
-    if "calibration_file" in node.given:
-        calibration = load_calibration(Path(parameters.calibration_file))
-    elif run.calibration:
+def _calibration(run: Run, node: Node) -> str:
+    """Return the text of the calibration: that of --params, or the recorded one."""
+    if FILE in node.given:
+        path = Path(str(node.values[FILE]))
         try:
-            calibration = parse_calibration(yaml.safe_load(run.calibration))
-        except (UserError, yaml.YAMLError) as error:
-            raise UserError(f"{run.path}: the calibration in the bag is broken: {error}") from error
-    else:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"--params: {FILE}: cannot read {path}: {error}") from error
+    if not run.calibration:
         raise UserError(
             f"{run.path} has images but no calibration: name one with --params "
-            f"({TRACKER}: {{ros__parameters: {{calibration_file: FILE}}}})"
+            f"({TRACKER}: {{ros__parameters: {{{FILE}: ...}}}})"
         )
-    return TrackerStage(calibration, parameters)
+    return run.calibration
+
+
+def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
+    try:
+        calibration = parse_calibration(yaml.safe_load(text))
+    except (UserError, yaml.YAMLError) as error:
+        lines = str(error).splitlines()
+        raise UserError(f"{run.path}: the calibration is broken: {lines[0]}") from error
+    return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
 
 
 def _controller(node: Node) -> ControllerStage:
