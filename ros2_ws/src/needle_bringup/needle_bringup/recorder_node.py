@@ -289,7 +289,7 @@ class Recorder(Node):
         if not topic.described:
             self._describe(topic)
         number = info["publication_sequence_number"] or 0
-        if number:
+        if number and topic.publishers == 1:
             topic.gaps.take(number)
         received = info["received_timestamp"] or time.time_ns()
         self.recording.append(topic.name, data, received, sent or received, number)

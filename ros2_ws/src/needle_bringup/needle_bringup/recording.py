@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import Final
 
 from needle_bringup.bag_metadata import BagTopic
-from needle_bringup.bag_writer import BagWriteError, BagWriter, refuse_existing_bag
+from needle_bringup.bag_writer import (
+    CHUNK_SIZE,
+    BagWriteError,
+    BagWriter,
+    refuse_existing_bag,
+)
 from needle_bringup.free_space import FreeSpace, megabytes
 from needle_common.errors import UserError
 
@@ -167,7 +172,7 @@ class Recording:
 
     def _empty_queue(self) -> None:
         next_flush = time.monotonic() + FLUSH_PERIOD
-        looked_at = 0
+        looked_at = flushed = 0
         while True:
             try:
                 job = self._jobs.get(timeout=max(0.0, next_flush - time.monotonic()))
@@ -179,12 +184,14 @@ class Recording:
             is_due = time.monotonic() >= next_flush
             if is_due or self._bytes_done - looked_at >= _LOOK_EVERY:
                 looked_at = self._bytes_done
-                if self.space.usable() < 0:
+                unwritten = min(CHUNK_SIZE, self._bytes_done - flushed)
+                if self.space.usable() < unwritten:
                     left = megabytes(self.space.usable() + self.space.reserve)
                     self.error = f"the disk of {self._bag.directory} has only {left} left"
                     return
             if is_due:
                 self._bag.flush()
+                flushed = self._bytes_done
                 next_flush = time.monotonic() + FLUSH_PERIOD
 
     def _discard(self) -> None:

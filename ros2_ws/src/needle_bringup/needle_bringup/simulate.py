@@ -235,6 +235,9 @@ def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
     warnings += stop([driver]) if driver else []
     warnings += stop(rest)
     warnings += stop([recorder], RECORDER_GRACE) if recorder else []
+    if recorder is not None and recorder.exit_code == EXIT_MISSED:
+        said = [line for line in recorder.tail(3) if line.startswith("error: ")]
+        warnings += [line.removeprefix("error: ") for line in said] or [recorder.describe_end()]
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
 

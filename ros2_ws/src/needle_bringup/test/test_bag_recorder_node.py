@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -12,10 +13,12 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
@@ -75,12 +78,13 @@ def source(domain: int) -> Iterator[Source]:
     one.close()
 
 
-def start(domain: int, *parameters: str) -> subprocess.Popen[str]:
+def start(domain: int, *parameters: str, largest_file: int = 0) -> subprocess.Popen[str]:
     arguments = ["--ros-args"]
     for parameter in parameters:
         arguments += ["-p", parameter]
+    limit = ["prlimit", f"--fsize={largest_file}:unlimited"] if largest_file else []
     return subprocess.Popen(
-        [*RECORDER, *arguments],
+        [*limit, *RECORDER, *arguments],
         env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -153,6 +157,75 @@ def test_nothing_is_lost(domain: int, source: Source, tmp_path: Path) -> None:
     assert custom["calibration"] == "phantom: {}\n"
     assert custom["run_info"] == "seed: 4"
     assert yaml.safe_load(custom["parameters"])["/source"]["ros__parameters"]["gain"] == 1.5
+
+
+def test_a_disk_that_fills_ends_the_recording_and_nothing_else(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    """The kernel's limit on file sizes stands in for the disk."""
+    bag = tmp_path / "bag"
+    health: list[DiagnosticStatus] = []
+    source.node.create_subscription(
+        DiagnosticArray, "/diagnostics", lambda m: health.extend(m.status), 10
+    )
+    numbered = source.publisher(Int32, "numbered", 1000)
+    texts = source.publisher(String, "texts", 1000)
+    process = start(domain, f"bag:={bag}", largest_file=300_000)
+    source.wait_matched(numbered, texts)
+    sent = 0
+
+    def refused() -> bool:
+        nonlocal sent
+        numbered.publish(Int32(data=sent))
+        texts.publish(String(data="x" * 5000))
+        sent += 1
+        return any(status.level == DiagnosticStatus.ERROR for status in health)
+
+    source.wait(refused, "the reason in /diagnostics")
+    last = health[-1].message
+    assert f"cannot write {bag}/bag_0.mcap: File too large" in last
+    assert process.poll() is None
+    code, _, errors = end(process)
+    assert code == 1
+    assert "the bag is whole up to there" in errors
+    assert "messages lost" in errors
+    kept = numbers(bag, "/numbered")
+    assert 20 < len(kept) < sent
+    assert kept == list(range(len(kept)))
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+    custom = metadata["rosbag2_bagfile_information"]["custom_data"]
+    assert "File too large" in custom["recording_ended"]
+    assert json.loads(custom["messages_lost"])["/texts"] > 0
+
+
+def test_split_compressed_and_parameters_that_change(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    texts = source.publisher(String, "texts", 1000)
+    numbered = source.publisher(Int32, "numbered", 1000)
+    process = start(domain, f"bag:={bag}", "max_file_size:=100000", "compression:=zstd")
+    source.wait_matched(texts, numbered)
+    for number in range(100):
+        texts.publish(String(data="x" * 5000))
+        numbered.publish(Int32(data=number))
+    assert texts.wait_for_all_acked(Duration(seconds=PATIENCE))
+
+    def in_bag(text: bytes) -> bool:
+        return any(text in file.read_bytes() for file in bag.glob("*.mcap"))
+
+    source.wait(lambda: in_bag(b"gain: 1.5"), "the parameters to be recorded")
+    source.node.set_parameters([Parameter("gain", value=2.5)])
+    source.wait(lambda: in_bag(b"parameter_change"), "the change to be recorded")
+    assert end(process)[0] == 0
+    assert len(list(bag.glob("*.mcap"))) >= 5
+    assert sum(file.stat().st_size for file in bag.glob("*.mcap")) < 300_000
+    assert numbers(bag, "/numbered") == list(range(100))
+    metadata = yaml.safe_load((bag / "metadata.yaml").read_text())
+    custom = metadata["rosbag2_bagfile_information"]["custom_data"]
+    assert yaml.safe_load(custom["parameters"])["/source"]["ros__parameters"]["gain"] == 1.5
+    (change,) = yaml.safe_load(custom["parameter_changes"])
+    assert (change["node"], change["name"], change["value"]) == ("/source", "gain", 2.5)
 
 
 def test_topics_with_subscribers_only_are_recorded_from_the_first_message(
