@@ -11,6 +11,7 @@ shortened, aborted and resumed.
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import numpy.typing as npt
@@ -19,6 +20,9 @@ from scipy import linalg
 from needle_common.errors import UserError
 from needle_controller.arrays import Array
 from needle_controller.feedback_linearization import A, B, C, transition
+
+_SAME_LENGTH = 12
+"""Digits to which lengths of steps agree."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +129,20 @@ def sampled_observer_gain(poles: npt.NDArray[np.complex128], length: npt.ArrayLi
         Gain on w - C s: (-, 1/m, 1/m^2).
     """
     length = np.asarray(length, dtype=float)
+    if length.ndim == 0:
+        # Steps are alike but for rounding, and this is done at every one.
+        return _gain_of_one(tuple(poles.tolist()), float(f"{float(length):.{_SAME_LENGTH}g}"))
+    return _observer_gain_at(poles, length)
+
+
+@functools.lru_cache(maxsize=256)
+def _gain_of_one(poles: tuple[complex, ...], length: float) -> Array:
+    gain = _observer_gain_at(np.array(poles), np.asarray(length))
+    gain.setflags(write=False)
+    return gain
+
+
+def _observer_gain_at(poles: npt.NDArray[np.complex128], length: Array) -> Array:
     q1, q2, q3 = np.moveaxis(-np.expm1(poles * length[..., None]), -1, 0)
     e1 = np.real(q1 + q2 + q3)
     e2 = np.real(q1 * q2 + q1 * q3 + q2 * q3)

@@ -11,7 +11,7 @@ import numpy as np
 from needle_controller.arrays import Array
 from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import virtual_input
-from needle_controller.kinematics import PITCH, ROLL
+from needle_controller.kinematics import ROLL
 from needle_controller.luenberger_steps import demand_states
 
 
@@ -78,9 +78,12 @@ class LinearizingLaw:
         held = length, self.demand_margin
         demand_states(s.reshape(-1, 3), v.reshape(-1), curvatures, held, (sine, cosine))
         wanted_roll = np.arctan2(sine, cosine).reshape(v.shape)
-        pitch, roll = estimate.coordinates[..., PITCH], estimate.coordinates[..., ROLL]
-        # The roll's own drift, (5).
-        drift = -curvature * np.cos(roll) * np.tan(pitch)
+        roll = estimate.coordinates[..., ROLL]
+        # The roll's own drift, (5): cos(roll) tan(pitch), by (6) without their slow functions.
+        squared = s[..., 1] ** 2
+        steered = np.maximum(1.0 - squared - (s[..., 2] / curvature) ** 2, 0.0)
+        cosines = np.copysign(np.sqrt(steered), 0.5 * np.pi - np.abs(roll))
+        drift = -curvature * cosines * s[..., 1] / (1.0 - squared)
         limit = self.max_rotation_per_length
         rate = np.clip((wanted_roll - roll) / length - drift, -limit, limit)
         return Command(v, np.asarray(rate))
