@@ -572,3 +572,8 @@ def make_drive_bench() -> Iterator[Callable[..., DriveBench]]:
 @pytest.fixture
 def drive_bench(make_drive_bench: Callable[..., DriveBench]) -> DriveBench:
     return make_drive_bench()
+
+
+@pytest.fixture(scope="session")
+def scripted_drive() -> type[ScriptedDrive]:
+    return ScriptedDrive

@@ -36,6 +36,10 @@ class Adapter:
     def say(self, data: bytes) -> None:
         os.write(self.master, data)
 
+    def say_all(self, pieces: list[bytes]) -> None:
+        for piece in pieces:
+            self.say(piece)
+
     def unplug(self) -> None:
         for fd in (self.master, self.slave):
             if fd >= 0:
@@ -114,9 +118,8 @@ def test_slcan_a_flood_of_frames_is_taken_whole(adapter: Adapter, make_link: Mak
     frames = received(link, 0x181)
     link.open()
     wanted = [number.to_bytes(4, "little") for number in range(2000)]
-    sender = threading.Thread(
-        target=lambda: [adapter.say(b"t1814" + d.hex().upper().encode() + b"\r") for d in wanted]
-    )
+    data = [b"t1814" + frame.hex().upper().encode() + b"\r" for frame in wanted]
+    sender = threading.Thread(target=lambda: adapter.say_all(data))
     sender.start()
     wait_for(link, lambda: len(frames) == len(wanted))
     sender.join()

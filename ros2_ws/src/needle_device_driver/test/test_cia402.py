@@ -96,7 +96,7 @@ def test_the_way_to_every_goal_ends_there(state: DriveState) -> None:
         Goal.STOPPED: {DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCH_ON_DISABLED},
     }
     for goal, wanted in ends.items():
-        at = state
+        at: DriveState = state
         for _ in range(5):
             at = TRANSITIONS.get((at, next_command(goal, at, at_rest=True)), at)
         assert at in wanted, goal
