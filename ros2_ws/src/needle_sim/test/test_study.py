@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -115,3 +117,11 @@ def test_best_steers_every_needle_to_the_plane(flips: int) -> None:
     noisy = settings(disturbances=Disturbances(noise=0.001), seed=7)
     found = run_study(STARTS, controller_factory("best", 0.001, depths), noisy)
     assert np.mean(found.converged_at_end) >= 0.98
+
+
+def test_the_readme_s_own_law_runs_as_it_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    exec(compile(code, "README.md", "exec"), {})
+    share = float(capsys.readouterr().out)
+    assert f"It prints {share:.3f}" in text
