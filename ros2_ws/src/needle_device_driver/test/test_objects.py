@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import hypothesis.strategies as st
 import pytest
+import yaml
 from hypothesis import given
 
 from needle_common.errors import OutOfBoundsError, UserError
@@ -140,3 +142,11 @@ def test_the_drives_bounds_follow_the_supervisors() -> None:
     assert (insertion.lower, insertion.upper) == pytest.approx((-0.001, 0.101))
     assert insertion.speed == 0.002
     assert rotation.upper == -rotation.lower == pytest.approx(2 * math.pi + 0.2)
+
+
+def test_the_example_configuration_is_one() -> None:
+    file = Path(__file__).resolve().parents[1] / "config" / "drives.yaml"
+    values = yaml.safe_load(file.read_text("utf-8"))["device_driver"]["ros__parameters"]
+    parameters = DeviceDriverParameters(**values)
+    assert parameters.drive("rotation").max_torque == 0.5
+    assert parameters.drive("rotation").counts(2 * math.pi) == 65536
