@@ -199,7 +199,8 @@ def study_memory(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
 def node_update(_: Workbench) -> Iterator[Finding]:
     """Take a tip in the node: estimate with covariance, command, reach."""
     for preset in ("paper", "best"):
-        seconds = update_times(preset)
+        # What else the machine does makes it slower, never faster.
+        seconds = min((update_times(preset) for _ in range(3)), key=np.median)
         yield Finding(
             f"update_{preset}",
             f"{preset}: one update of the node's controller on one core",
