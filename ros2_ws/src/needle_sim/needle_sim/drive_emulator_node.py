@@ -51,7 +51,7 @@ Publishes   sim/drive_positions: where the motors really are, from the home swit
 _WAIT = 0.005
 _PERIOD = 0.02
 _LOOK_AROUND = 0.05
-_PATIENCE = 0.05
+_PATIENCE = 0.2
 _UNCLEAR = 2
 
 
@@ -72,13 +72,12 @@ class DriveEmulatorNode(Node):
         self._bus = EmulatedBus(values.insertion, values.rotation, clock, time.monotonic())
         self._states = {name: drive.state for name, drive in self._bus.drives.items()}
         self._syncs_told = 0
-        self._synced_at = 0.0
+        self._waits_since: float | None = None
         self._told_at = 0.0
         # The newest simulated time, and how many there were since positions were told.
         self._time_ns = 0
         self._times_since = _UNCLEAR
-        if self._steps_with_sync:
-            self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+        self._times = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
         self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
         self._diagnostics = DiagnosticsPublisher(self)
         port: Port
@@ -143,15 +142,19 @@ class DriveEmulatorNode(Node):
         """Tell the positions of the last SYNC, with the simulated time that it belongs to.
 
         Its sender may know that time before it is known here. One new time since the SYNC before
-        is it; where it is not as clear (at the start, after SYNCs that failed to come), or without
-        simulated time, a moment's patience decides.
+        is it; where it is not as clear (at the start, after SYNCs that failed to come), the newest
+        is, after some patience.
         """
         if not self._waits_for_time:
-            self._synced_at = now
-        elif self._times_since == 1 or now - self._synced_at > _PATIENCE:
+            self._waits_since = None
+            return
+        if self._waits_since is None:
+            self._waits_since = now
+        patience = _PATIENCE if self._times.get_publisher_count() else 0.0
+        if self._times_since == 1 or now - self._waits_since >= patience:
             self._syncs_told = self._bus.syncs
             self._times_since = 0
-            self._synced_at = now
+            self._waits_since = None
             self._tell_positions(self._time_ns or self.get_clock().now().nanoseconds)
 
     def _tell_positions(self, stamp_ns: int) -> None:
