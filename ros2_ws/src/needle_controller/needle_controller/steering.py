@@ -93,6 +93,7 @@ class Steering:
         self._refusals = 0
         self._awaited_since: float | None = None
         self._heard_since: float | None = None
+        self._looked_at: JointSample | None = None
 
     @property
     def tips_rejected(self) -> int:
@@ -196,8 +197,7 @@ class Steering:
         if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
             self._awaited_since = self._heard_since = None
             return []
-        moving = self._device is not None and self._device.state == "MOVING"
-        if self._awaited_since is None or (self.awaiting is Awaiting.RESULT and moving):
+        if self._awaited_since is None or (self.awaiting is Awaiting.RESULT and self._is_moving()):
             self._awaited_since = steady
         waited = steady - self._awaited_since
         if self.awaiting is Awaiting.RESULT:
@@ -209,6 +209,17 @@ class Steering:
     @property
     def _steering(self) -> bool:
         return self.state in {State.STEERING, State.WAITING_FOR_TIP}
+
+    def _is_moving(self) -> bool:
+        """Return whether the device says so, or the joints do since the last look."""
+        latest, before = self.intake.joints.latest, self._looked_at
+        self._looked_at = latest
+        says_so = self._device is not None and self._device.state == "MOVING"
+        return says_so or (
+            latest is not None
+            and before is not None
+            and abs(latest.insertion - before.insertion) > REST_INSERTION
+        )
 
     def _watch_tip(self, waited: float, steady: float) -> list[Action]:
         actions: list[Action] = []

@@ -582,6 +582,18 @@ def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
     assert sent(rig.expose()).insertion == pytest.approx(0.0016)
 
 
+def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    for tenth in range(400):
+        rig.now += TICK
+        rig.insertion += 2.5e-6
+        rig.joints()
+        assert rig.steering.on_time(0.1 * tenth) == []
+    rig.run(step)
+    assert rig.steering.state is State.STEERING
+
+
 def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
     rig = Rig()
     step = sent(rig.expose())
