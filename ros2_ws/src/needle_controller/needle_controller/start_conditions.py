@@ -5,11 +5,10 @@ from __future__ import annotations
 import dataclasses
 
 from needle_controller.joint_history import JointSample
+from needle_controller.next_step import DEPTH_TOLERANCE
 from needle_controller.plane_control import PlaneControl
 from needle_controller.steering_types import DeviceStatus, SteeringSettings
 
-DEPTH_TOLERANCE = 1e-6
-"""Insertion short of the depth that counts as there [m]."""
 _ENABLED_DEVICE = ("HOLDING", "MOVING")
 
 

@@ -8,10 +8,11 @@ happened to arrive.
 from __future__ import annotations
 
 from needle_controller.joint_history import JointSample
+from needle_controller.next_step import next_step
 from needle_controller.plane_control import PlaneControl
 from needle_controller.reachability import Reachability, reachability
 from needle_controller.retraction import RetractionWatch
-from needle_controller.start_conditions import DEPTH_TOLERANCE, Situation, is_out, obstacle
+from needle_controller.start_conditions import Situation, is_out, obstacle
 from needle_controller.steering_types import (
     Action,
     Awaiting,
@@ -313,20 +314,11 @@ class Steering:
         if self.state is State.WAITING_FOR_TIP:
             self.state = State.STEERING
             actions.append(Log("info", "STEERING: a good tip came"))
-        remaining = settings.depth - joints.insertion
-        if remaining <= DEPTH_TOLERANCE:
+        rate = float(update.command.rotation_rate)
+        self._ready_step = next_step(tip.stamp_ns, joints, rate, settings)
+        if self._ready_step is None:
             text = f"insertion {joints.insertion:.6g} m reached"
             return actions + self._leave(State.DONE, text, "info")
-        length = settings.step_length
-        if remaining < length * (1.0 + 1e-3):
-            length = remaining
-        self._ready_step = SendStep(
-            stamp_ns=tip.stamp_ns,
-            # Not joints + length: the last step ends at the depth to the last bit.
-            insertion=settings.depth if length == remaining else joints.insertion + length,
-            rotation=joints.rotation + float(update.command.rotation_rate) * length,
-            duration=length / settings.nominal_speed,
-        )
         return actions + self._send()
 
     def _send(self) -> list[Action]:
