@@ -58,18 +58,28 @@ class Cia402Axis(Axis):
         Of the SYNC [s].
     watchdog : float
         How long the drive goes without the computer's heartbeat [s].
+
+    Attributes
+    ----------
+    name : str
+        As given.
+    monitor : DriveMonitor
+        What the drive sends.
+    lacking : tuple of str
+        What the drive lacks that it could be set up without.
     """
 
     def __init__(
         self, name: str, settings: DriveSettings, link: CanLink, *, period: float, watchdog: float
     ) -> None:
-        self._name = name
+        self.name = name
         self._settings = settings
         self.actuated = settings.actuated
         self._link = link
         self._period = period
         self._watchdog = watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
+        self.lacking: tuple[str, ...] = ()
         self._machine = DriveMachine(
             settings.magnitude(settings.tolerance), period, self.monitor.feedback
         )
@@ -138,13 +148,13 @@ class Cia402Axis(Axis):
         """Set the set-point of the next cycle; `speed` follows from the cycle's length."""
         self._refuse_fault()
         if not self._machine.ready:
-            raise AxisError(f"{self._name} axis is not ready to move")
+            raise AxisError(f"{self.name} axis is not ready to move")
         settings = self._settings
         counts = settings.counts(target)
         lower, upper = settings.limits_counts
         if self._homed and not lower <= counts <= upper:
             raise AxisError(
-                f"{self._name} axis: target {target:.6g} is outside the drive's limits "
+                f"{self.name} axis: target {target:.6g} is outside the drive's limits "
                 f"[{settings.lower:.6g}, {settings.upper:.6g}]",
                 Rule.SOFTWARE_LIMITS,
             )
@@ -152,7 +162,7 @@ class Cia402Axis(Axis):
         bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
         if step > bound:
             raise AxisError(
-                f"{self._name} axis: set-point {step / settings.counts_per_unit:.6g} ahead in a "
+                f"{self.name} axis: set-point {step / settings.counts_per_unit:.6g} ahead in a "
                 f"cycle at {speed:.6g}/s, at most {bound / settings.counts_per_unit:.6g}",
                 Rule.LOOK_AHEAD,
             )
@@ -324,14 +334,14 @@ class Cia402Axis(Axis):
 
     def _refuse_fault(self) -> None:
         if not self._configured:
-            raise AxisError(f"{self._name} axis is not configured")
+            raise AxisError(f"{self.name} axis is not configured")
         fault = self._fault
         if fault is not None:
-            raise AxisError(f"{self._name} axis: {fault[1]}", fault[0])
+            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
     def _error(self, error: LinkError | DriveError) -> AxisError:
         rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
-        return AxisError(f"{self._name} axis: {error}", rule)
+        return AxisError(f"{self.name} axis: {error}", rule)
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 
@@ -340,7 +350,7 @@ class Cia402Axis(Axis):
             self._homed = False
             self._origin += 1
         self.monitor.begin_set_up()
-        set_up(self._link, self._settings, period=self._period, homed=self._homed)
+        self.lacking = set_up(self._link, self._settings, period=self._period, homed=self._homed)
         if not self._await_operational():
             raise DriveError(f"node {self._settings.node_id} did not become operational")
         arm_watchdog(self._link, self._settings, self._watchdog)

@@ -49,7 +49,7 @@ Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad p
 PERIOD_NS = 20_000_000
 PERIOD = PERIOD_NS / NANOSECONDS
 # On a running clock the next cycle must come; a simulated one waits for this one's answers.
-_REPLY_WAIT = PERIOD / 2.0
+_REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 _LATE = 1.5 * PERIOD
 
@@ -87,8 +87,10 @@ class DeviceDriverNode(LifecycleNode):
             switching=lambda: self._drives.needs_cycles,
         )
         self._active = False
+        self._autostart = values.autostart
         self.ended = False
         self._waiting_for = "the driver to be activated"
+        self._refusal = ""
         self._give_up_at = time.monotonic() + values.connect_timeout
         self._retry_at = 0.0
         self._cycle_ns: int | None = None
@@ -188,14 +190,17 @@ class DeviceDriverNode(LifecycleNode):
 
     def _start_by_itself(self) -> None:
         now = time.monotonic()
-        if not self._settings.autostart or now < self._retry_at or self.ended:
+        if not self._autostart or now < self._retry_at:
             return
         self._retry_at = now + _RETRY
         why_not = self._drives.probe()
         if not why_not:
-            self.trigger_configure()
-            self.trigger_activate()
-            return
+            # Once: afterwards the lifecycle is in somebody's hands.
+            self._autostart = False
+            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self.trigger_activate()
+                return
+            raise UserError(f"{self.get_fully_qualified_name()}: {self._refusal}")
         if now > self._give_up_at:
             raise UserError(f"{self.get_fully_qualified_name()}: {why_not}")
         if not self._waiting_for.endswith(why_not):
@@ -215,8 +220,11 @@ class DeviceDriverNode(LifecycleNode):
             why_not = "" if reply.success else reply.message
         self._device.report()
         if why_not:
+            self._refusal = why_not
             self.get_logger().error(f"not configured: {why_not}")
             return TransitionCallbackReturn.FAILURE
+        for text in self._drives.lacking:
+            self.get_logger().warning(text)
         self._tell_health()
         return TransitionCallbackReturn.SUCCESS
 

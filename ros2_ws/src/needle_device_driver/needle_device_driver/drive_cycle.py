@@ -28,6 +28,11 @@ class DriveCycle:
         self.unanswered = 0
 
     @property
+    def lacking(self) -> tuple[str, ...]:
+        """What the drives lack that they could be set up without."""
+        return tuple(f"{axis.name} drive {text}" for axis in self._axes for text in axis.lacking)
+
+    @property
     def needs_cycles(self) -> bool:
         """Whether a drive is on its way to where it was ordered, apart from set-points."""
         return any(axis.needs_cycles for axis in self._axes)
@@ -61,6 +66,9 @@ class DriveCycle:
         """
         if not self._link.is_open:
             return
+        for axis in self._axes:
+            # What came too late for the cycle before.
+            axis.update()
         try:
             send_heartbeat(self._link)
             for axis in self._axes:

@@ -13,7 +13,10 @@ from needle_device_driver.objects import (
     NMT_OPERATIONAL,
     POSITION,
     STATUS,
+    STATUS_WITHOUT_INPUTS,
 )
+
+_LENGTH_WITHOUT_INPUTS = len(STATUS_WITHOUT_INPUTS.pack(0, 0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -147,7 +150,10 @@ class DriveMonitor:
     def _on_status(self, data: bytes, time: float) -> None:
         with self._lock:
             try:
-                self._statusword, self._mode, self._inputs = STATUS.unpack(data)
+                if len(data) == _LENGTH_WITHOUT_INPUTS:
+                    self._statusword, self._mode = STATUS_WITHOUT_INPUTS.unpack(data)
+                else:
+                    self._statusword, self._mode, self._inputs = STATUS.unpack(data)
             except ValueError:
                 self.malformed += 1
                 return

@@ -19,7 +19,18 @@ from needle_device_driver.objects import Pdo
 PRODUCER_HEARTBEAT_MS = 30
 
 
-def set_up(link: CanLink, settings: DriveSettings, *, period: float, homed: bool) -> None:
+# A rule depends on these: what the drive made of them is read back.
+_CHECKED = (od.ABORT_CONNECTION_OPTION, od.FAULT_REACTION_OPTION, od.FOLLOWING_WINDOW)
+# Entries that CiA 402 leaves to the maker and that no rule hangs on alone.
+_LEFT_OUT = (
+    "has no {}: check on the rig what it does there (docs/hardware.md)",
+    "has no digital inputs to map: a retraction ends at 0 only, not at the switch",
+)
+
+
+def set_up(
+    link: CanLink, settings: DriveSettings, *, period: float, homed: bool
+) -> tuple[str, ...]:
     """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
 
     Parameters
@@ -32,6 +43,11 @@ def set_up(link: CanLink, settings: DriveSettings, *, period: float, homed: bool
         Of the SYNC [s].
     homed : bool
         Whether its position counts from home, so that software limits mean something.
+
+    Returns
+    -------
+    tuple of str
+        What the drive lacks that it could be without.
 
     Raises
     ------
@@ -48,16 +64,22 @@ def set_up(link: CanLink, settings: DriveSettings, *, period: float, homed: bool
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
     # Not while this set-up keeps the loop from its heartbeat.
     access.write(od.CONSUMER_HEARTBEAT, 0)
+    lacking: list[str] = []
     if settings.actuated:
-        _set_up_motion(access, settings, period)
+        lacking += _set_up_motion(access, settings, period)
         write_limits(access, settings, homed=homed)
-        for pdo in (od.COMMAND, od.SET_POINT):
-            _map(access, node, pdo)
-    for pdo in (od.STATUS, od.POSITION):
-        _map(access, node, pdo)
+        _map(access, node, od.COMMAND)
+        _map(access, node, od.SET_POINT)
+    if access.has(od.DIGITAL_INPUTS):
+        _map(access, node, od.STATUS)
+    else:
+        lacking.append(_LEFT_OUT[1])
+        _map(access, node, od.STATUS_WITHOUT_INPUTS)
+    _map(access, node, od.POSITION)
     access.write_optional(od.CYCLE_PERIOD, round(period * 1e6))
     access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
     link.send(od.NMT, bytes([od.NMT_START, node]))
+    return tuple(lacking)
 
 
 def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> None:
@@ -93,7 +115,7 @@ def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) ->
     access.write(od.HOMING_ACCELERATION, settings.magnitude(settings.acceleration))
 
 
-def _set_up_motion(access: ObjectAccess, settings: DriveSettings, period: float) -> None:
+def _set_up_motion(access: ObjectAccess, settings: DriveSettings, period: float) -> list[str]:
     modes = access.read(od.SUPPORTED_MODES)
     for bit, name in (
         (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
@@ -103,28 +125,35 @@ def _set_up_motion(access: ObjectAccess, settings: DriveSettings, period: float)
             raise DriveError(f"node {settings.node_id} has no {name} mode (0x6502 = 0x{modes:08X})")
     if drive_state(access.read(od.STATUSWORD)) in POWERED:
         access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-    magnitude = settings.magnitude
     # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
     access.write_checked(od.QUICK_STOP_OPTION, 6)
-    access.write(od.SHUTDOWN_OPTION, 1)
-    access.write(od.DISABLE_OPTION, 1)
-    access.write(od.FAULT_REACTION_OPTION, 2)
-    # Without the computer's heartbeat: a fault, which latches.
-    access.write_checked(od.ABORT_CONNECTION_OPTION, 1)
     # The node keeps its state: whether it exchanges process data tells a reboot.
     access.write_optional(od.ERROR_BEHAVIOUR, 1)
-    access.write_checked(od.FOLLOWING_WINDOW, magnitude(settings.following_error))
-    access.write(od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3))
+    magnitude = settings.magnitude
+    wanted = [
+        # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
+        (od.SHUTDOWN_OPTION, 1),
+        (od.DISABLE_OPTION, 1),
+        (od.FAULT_REACTION_OPTION, 2),
+        (od.ABORT_CONNECTION_OPTION, 1),
+        (od.FOLLOWING_WINDOW, magnitude(settings.following_error)),
+        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3)),
+        (od.HOME_OFFSET, 0),
+        (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed)),
+        (od.PROFILE_VELOCITY, magnitude(settings.speed)),
+        (od.PROFILE_ACCELERATION, magnitude(settings.acceleration)),
+        (od.PROFILE_DECELERATION, magnitude(settings.acceleration)),
+        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration)),
+        (od.INTERPOLATION_PERIOD, round(period * 1e3)),
+        (od.INTERPOLATION_EXPONENT, -3),
+    ]
     if settings.max_torque > 0.0:
-        access.write(od.MAX_TORQUE, round(settings.max_torque * 1e3))
-    access.write(od.HOME_OFFSET, 0)
-    access.write(od.MAX_PROFILE_VELOCITY, magnitude(settings.speed))
-    access.write(od.PROFILE_VELOCITY, magnitude(settings.speed))
-    access.write(od.PROFILE_ACCELERATION, magnitude(settings.acceleration))
-    access.write(od.PROFILE_DECELERATION, magnitude(settings.acceleration))
-    access.write(od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration))
-    access.write(od.INTERPOLATION_PERIOD, round(period * 1e3))
-    access.write(od.INTERPOLATION_EXPONENT, -3)
+        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3)))
+    return [
+        _LEFT_OUT[0].format(entry)
+        for entry, value in wanted
+        if not access.write_optional(entry, value, checked=entry in _CHECKED)
+    ]
 
 
 def _map(access: ObjectAccess, node: int, pdo: Pdo) -> None:

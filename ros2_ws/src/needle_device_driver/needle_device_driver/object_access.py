@@ -75,13 +75,25 @@ class ObjectAccess:
         if got != value:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
-    def write_optional(self, entry: Entry, value: int) -> bool:
-        """Write an entry that not every drive has; return whether this one does."""
+    def write_optional(self, entry: Entry, value: int, *, checked: bool = False) -> bool:
+        """Write an entry that not every drive has; return whether this one does.
+
+        Raises as `write`, or `write_checked` where `checked`: many drives round a ramp.
+        """
         try:
-            self.write(entry, value)
+            (self.write_checked if checked else self.write)(entry, value)
         except DriveError as error:
-            cause = error.__cause__
-            if isinstance(cause, canopen.SdoAbortedError) and cause.code in _NO_SUCH_OBJECT:
+            if _is_lacking(error):
+                return False
+            raise
+        return True
+
+    def has(self, entry: Entry) -> bool:
+        """Return whether the drive has an entry; raises as `read`."""
+        try:
+            self.read(entry)
+        except DriveError as error:
+            if _is_lacking(error):
                 return False
             raise
         return True
@@ -90,3 +102,8 @@ class ObjectAccess:
         if isinstance(error, canopen.SdoCommunicationError):
             return DriveError(f"node {self._node_id} does not answer ({what} {entry})")
         return DriveError(f"node {self._node_id} refuses to {what} {entry}: {error}")
+
+
+def _is_lacking(error: DriveError) -> bool:
+    cause = error.__cause__
+    return isinstance(cause, canopen.SdoAbortedError) and cause.code in _NO_SUCH_OBJECT

@@ -253,6 +253,7 @@ class ScriptedDrive:
         self.state = "disabled"
         self.mode = 0
         self.inputs = 0
+        self.status_size = 7
         self.position = 0
         self.target = 0
         self.next_target = 0
@@ -303,12 +304,9 @@ class ScriptedDrive:
             self.sync()
 
     def sync(self) -> None:
-        self.say(
-            0x180,
-            self.statusword.to_bytes(2, "little")
-            + bytes([self.mode])
-            + self.inputs.to_bytes(4, "little"),
-        )
+        status = self.statusword.to_bytes(2, "little") + bytes([self.mode])
+        status += self.inputs.to_bytes(4, "little")
+        self.say(0x180, status[: self.status_size])
         self.say(0x280, self.position.to_bytes(4, "little", signed=True))
         self.target = self.next_target
         if self.homing_for >= 0:
@@ -358,6 +356,7 @@ class ScriptedDrive:
                 (0x6041, 0): self.statusword.to_bytes(2, "little"),
                 (0x6061, 0): bytes([self.mode]),
                 (0x6064, 0): self.position.to_bytes(4, "little", signed=True),
+                (0x60FD, 0): self.inputs.to_bytes(4, "little"),
             }
             value = live.get((index, sub)) or self.objects.get((index, sub))
             if value is None:

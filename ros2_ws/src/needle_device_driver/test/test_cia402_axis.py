@@ -164,8 +164,25 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
 
 
 def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: Bench) -> None:
-    drive_bench.insertion.lacking = {0x1006, 0x1029}
+    drive_bench.insertion.lacking = {0x1006, 0x1029, 0x6007, 0x60C2}
     assert drive_bench.supervisor.configure(drive_bench.clock()).success
+    assert [text.partition(":")[0] for text in drive_bench.drives.lacking] == [
+        "insertion drive has no 0x6007",
+        "insertion drive has no 0x60C2",
+        "insertion drive has no 0x60C2",
+    ]
+
+
+def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: Bench) -> None:
+    bench = drive_bench
+    bench.insertion.lacking = {0x60FD}
+    bench.insertion.status_size = 3
+    bench.ready()
+    assert "no digital inputs" in bench.drives.lacking[0]
+    bench.cycle(1, holding=True)
+    bench.step()
+    bench.cycle(30, holding=True)
+    assert bench.outcomes == ["succeeded"]
 
 
 def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: Bench) -> None:
