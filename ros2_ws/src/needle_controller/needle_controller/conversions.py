@@ -76,7 +76,7 @@ def to_tip_covariance(message: PoseWithCovarianceStamped) -> TipCovariance:
             [
                 2.0 * (q.x * q.z + q.w * q.y),
                 2.0 * (q.y * q.z - q.w * q.x),
-                1.0 - 2.0 * (q.x * q.x + q.y * q.y),
+                q.w * q.w + q.z * q.z - q.x * q.x - q.y * q.y,
             ]
         ),
         direction_covariance=covariance[3:, 3:],

@@ -10,6 +10,7 @@ from needle_controller.arrays import Array
 
 LARGEST_PITCH_STD = math.radians(5.0)
 """A pitch known worse than this counts as not measured [rad]."""
+_UNIT_TOLERANCE = 1e-3
 
 
 def measured_pitch(
@@ -34,15 +35,18 @@ def measured_pitch(
     Returns
     -------
     float
-        beta = asin(d_x) of (3) [rad]; NaN where it is not finite, or known to no better than
-        `LARGEST_PITCH_STD`.
+        beta = asin(d_x) of (3) [rad]; NaN where it is not of unit length, its covariance was never
+        filled in, or it is known to no better than `LARGEST_PITCH_STD`.
     """
-    if not (np.all(np.isfinite(direction)) and np.all(np.isfinite(direction_covariance))):
+    if not np.all(np.isfinite(direction_covariance)):
+        return math.nan
+    if not abs(float(np.linalg.norm(direction)) - 1.0) < _UNIT_TOLERANCE:
         return math.nan
     x, y, z = (float(part) for part in R_plane_rig @ direction)
     cosine = math.hypot(y, z)
     slope = np.array([0.0, z, -y]) / max(cosine, 1e-9)
     variance = float(slope @ (R_plane_rig @ direction_covariance @ R_plane_rig.T) @ slope)
-    if not 0.0 <= variance <= LARGEST_PITCH_STD**2:
+    # No direction is known exactly: a variance of 0 was never filled in.
+    if not 0.0 < variance <= LARGEST_PITCH_STD**2:
         return math.nan
     return math.atan2(x, cosine)
