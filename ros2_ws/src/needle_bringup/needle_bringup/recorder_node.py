@@ -44,7 +44,7 @@ recorder: records every topic of the graph into a bag (a rosbag2 directory with 
 
 Topics that appear later are recorded too, images included. The bag also carries the message
 definitions, all nodes' parameters and their changes, the calibration file, versions and commit.
-Ctrl-C ends the recording and completes the bag. Written out at least five times a second: what a
+Ctrl-C ends the recording and completes the bag. Written out ten times a second: what a
 crash or kill -9 leaves is made whole by `ros2 run needle_bringup recover BAG`.
 
   ros2 run needle_bringup recorder --ros-args -p bag:=bags/my_run

@@ -20,7 +20,7 @@ from needle_bringup.bag_writer import (
 from needle_bringup.free_space import FreeSpace, megabytes
 from needle_common.errors import UserError
 
-FLUSH_PERIOD: Final = 0.2
+FLUSH_PERIOD: Final = 0.1
 # What waits for a slow disk at most, in bytes; more is dropped, and counted.
 WAITING_LIMIT: Final = 2**30
 RESERVE: Final = 64_000_000

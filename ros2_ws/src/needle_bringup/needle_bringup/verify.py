@@ -14,7 +14,13 @@ from typing import Any, NoReturn
 
 from tqdm import tqdm
 
-from needle_bringup import verify_step_a, verify_step_b, verify_step_c, verify_step_d
+from needle_bringup import (
+    verify_step_a,
+    verify_step_b,
+    verify_step_c,
+    verify_step_d,
+    verify_step_e,
+)
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.errors import UserError
@@ -24,6 +30,7 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
     "B": verify_step_b.CHECKS,
     "C": verify_step_c.CHECKS,
     "D": verify_step_d.CHECKS,
+    "E": verify_step_e.CHECKS,
 }
 
 DESCRIPTION = """\
