@@ -421,7 +421,7 @@ def compile_key(mode: str) -> str:
     digest = hashlib.sha256(LOCKS[mode].read_bytes() + str(ROOT).encode())
     for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/*.py")):
         source = path.read_bytes()
-        if b"\n@compiled\n" in source:
+        if re.search(rb"^(@compiled|@inlined|# Read by compiled code\.)$", source, re.MULTILINE):
             digest.update(source)
     return digest.hexdigest()
 

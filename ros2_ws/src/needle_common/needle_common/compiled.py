@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +14,7 @@ from typing import Any, TypeVar, cast
 import numba
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+_COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.MULTILINE)
 
 
 def compiled(function: Function) -> Function:
@@ -22,8 +24,9 @@ def compiled(function: Function) -> Function:
     many elements a call has. A product and a sum may become one rounding (FMA).
 
     What was compiled is kept in the user's cache, in a folder named after all files with compiled
-    functions beside the function's own: numba itself looks at the file of the called function only,
-    and would go on using old code of what that function calls in another file.
+    functions, or marked as read by such, beside the function's own: numba itself looks at the file
+    of the called function only, and would go on using old code of what that function calls in
+    another file.
 
     Parameters
     ----------
@@ -35,13 +38,28 @@ def compiled(function: Function) -> Function:
     callable
         The same, compiled.
     """
+    return _compile(function, always_inline=False)
+
+
+def inlined(function: Function) -> Function:
+    """Compile like `compiled` what loops of other compiled functions call; a decorator.
+
+    Its code becomes part of the caller's: only so can a loop be done for several elements at once.
+    """
+    return _compile(function, always_inline=True)
+
+
+def _compile(function: Function, *, always_inline: bool) -> Function:
     folder = _cache_directory(Path(function.__code__.co_filename).parent)
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder
     try:
-        result = numba.njit(cache=bool(folder), error_model="numpy", fastmath={"contract"})(
-            function
-        )
+        result = numba.njit(
+            cache=bool(folder),
+            error_model="numpy",
+            fastmath={"contract"},
+            forceinline=always_inline,
+        )(function)
     finally:
         numba.config.CACHE_DIR = before
     return cast(Function, result)
@@ -53,7 +71,7 @@ def _cache_directory(package: Path) -> str:
     digest = hashlib.sha256(numba.__version__.encode())
     for path in [Path(__file__), *sorted(package.glob("*.py"))]:
         source = path.read_bytes()
-        if b"\n@compiled\n" in source or path == Path(__file__):
+        if _COMPILED.search(source) or path == Path(__file__):
             digest.update(source)
     places = [os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")]
     if home := os.environ.get("HOME", ""):

@@ -15,20 +15,19 @@ from needle_controller.hypotheses import (
 from needle_controller.hypothesis_bank import Limits
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.0, 0.36),
-    TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.15),
-    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.22),
-    TorsionHypothesis(0.0, 0.004, 0.002, 0.10),
-    TorsionHypothesis(0.0, 0.008, 0.002, 0.17),
+    TorsionHypothesis(0.0, 0.0, 0.0, 0.52),
+    TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.10),
+    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.26),
+    TorsionHypothesis(0.0, 0.006, 0.003, 0.12),
 )
-"""None, play and lag of two sizes each."""
+"""None, a small and a large play, lag. Each one's size is estimated."""
 ROLL_HYPOTHESES = tuple(
     RollHypothesis(math.radians(roll), math.radians(16.0), weight)
     for roll, weight in (
-        (0.0, 0.19),
-        (30.0, 0.17),
-        (-30.0, 0.17),
-        *((float(roll), 0.052) for roll in (60, -60, 90, -90, 120, -120, 150, -150, 180)),
+        (0.0, 0.24),
+        (30.0, 0.21),
+        (-30.0, 0.21),
+        *((float(roll), 0.038) for roll in (60, -60, 90, -90, 120, -120, 150, -150, 180)),
     )
 )
 """Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
@@ -53,6 +52,10 @@ class FilterSettings:
         Largest error of a measured coordinate where a tip comes without covariance [m].
     tip_noise_softness : float
         Standard deviation by which that bound is blurred [m].
+    model_error : float
+        What the model leaves out of a tip's position [m]. A better sensor is not believed beyond
+        it: a filter that is linear in the roll would hold a wrong one for certain. Its square is
+        added to a tip's covariance, and a bound is taken as at least twice as large.
     surprise : float
         Probability of a measured coordinate that a hypothesis does not explain: a single tip is no
         proof against it, for its distribution is not as Gaussian as it is taken to be.
@@ -89,15 +92,16 @@ class FilterSettings:
     curvature_range: tuple[float, float] = (0.5, 1.6)
     curvature_drift: float = bounded(0.02 * math.sqrt(1000.0), 0.0, 100.0, "1/sqrt(m)")
     tip_noise_bound: float = bounded(0.001, 1e-6, 0.1, "m")
-    tip_noise_softness: float = bounded(0.0001, 0.0, 0.1, "m")
-    surprise: float = bounded(0.05, 1e-9, 1.0, "-")
-    initial_angle_std: float = bounded(math.radians(10.0), 1e-6, math.pi, "rad")
+    tip_noise_softness: float = bounded(0.00003, 0.0, 0.1, "m")
+    model_error: float = bounded(0.0001, 0.0, 0.1, "m")
+    surprise: float = bounded(0.02, 1e-9, 1.0, "-")
+    initial_angle_std: float = bounded(math.radians(8.0), 1e-6, math.pi, "rad")
     orientation_drift: float = bounded(math.sqrt(0.001), 0.0, 100.0, "rad/sqrt(m)")
     play_drift: float = bounded(0.2, 0.0, 100.0, "rad/sqrt(m)")
     lag_drift: float = bounded(0.003, 0.0, 1.0, "sqrt(m)")
     gate: float = bounded(30.0, 1.0, 1e9, "-")
     tips_until_reacceptance: int = bounded(4, 1, 1000, "-")
-    lost_below: float = bounded(-1.5, -1e9, -0.1, "-")
+    lost_below: float = bounded(-2.2, -1e9, -0.1, "-")
     prune_ratio: float = bounded(math.exp(6.0), 1.0, 1e30, "-")
     merge_angle: float = bounded(0.35, 0.0, math.pi, "rad")
     longest_step: float = bounded(0.002, 1e-5, 1.0, "m")
@@ -124,6 +128,11 @@ class FilterSettings:
         if not (self.torsion_hypotheses and self.roll_hypotheses):
             raise UserError("torsion_hypotheses and roll_hypotheses want at least one each")
 
+    @property
+    def believed_bound(self) -> float:
+        """Largest error of a measured coordinate that is reckoned with [m]."""
+        return max(self.tip_noise_bound, 2.0 * self.model_error)
+
     def limits(self) -> Limits:
         """Return what the compiled code needs of this."""
         return Limits(
@@ -136,9 +145,10 @@ class FilterSettings:
             largest_play=self.play_limit,
             smallest_lag=self.lag_range[0],
             largest_lag=self.lag_range[1],
-            prune_below=-math.log(self.prune_ratio),
+            smallest_weight=1.0 / self.prune_ratio,
             merge_angle=self.merge_angle,
             gate=self.gate,
             tips_until_reacceptance=self.tips_until_reacceptance,
             surprise=self.surprise,
+            longest_step=self.longest_step,
         )

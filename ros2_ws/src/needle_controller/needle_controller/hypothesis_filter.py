@@ -13,15 +13,15 @@ import numpy.typing as npt
 
 from needle_controller.arrays import Array
 from needle_controller.filter_settings import FilterSettings
-from needle_controller.hypothesis_bank import (
-    BEHIND_PLAY,
-    KIND,
-    LAG,
-    PLAY,
-    TIP_ANGLE,
-    Bank,
-    advance_bank,
-    correct_bank,
+from needle_controller.hypothesis_bank import Bank, advance_bank, correct_bank
+from needle_controller.hypothesis_lanes import (
+    ERROR,
+    R00,
+    X,
+    covariances,
+    rows,
+    set_covariances,
+    set_rows,
 )
 from needle_controller.hypothesis_mixture import (
     COLUMNS,
@@ -30,14 +30,14 @@ from needle_controller.hypothesis_mixture import (
     mixture,
     mixture_covariance,
 )
+from needle_controller.hypothesis_start import start_bank, start_over
 from needle_controller.kinematics import rotation_from_angles
-from needle_controller.tip_motion import CURVATURE, ERROR, TORSION
 
-UNKNOWN_POSITION_STD = 0.02
-"""Of a needle that starts without a tip [m]."""
 AMBIGUOUS_WEIGHT = 0.1
 AGE_TOLERANCE = 1e-9
 _LONGEST_QUEUE = 64
+MERGE_EVERY = 5
+"""Tips from one look for hypotheses that have become the same to the next."""
 
 
 class HypothesisFilter:
@@ -72,14 +72,15 @@ class HypothesisFilter:
         start = np.broadcast_to(tip, (*self._shape, 3)).reshape(needles, 3)
         turned = np.zeros((needles, 3))
         turned[:, 2] = np.broadcast_to(joints[..., 1], self._shape).reshape(needles)
-        self._bank = self._start(start, self.initial_rotation @ rotation_from_angles(turned))
+        rotation = self.initial_rotation @ rotation_from_angles(turned)
+        self._bank = start_bank(self.settings, start, rotation)
         self._start_turn = turned[:, 2].copy()
         self._queue: list[tuple[Array, Array]] = []
         self._refused_in_row = np.zeros(needles, dtype=np.int64)
         self._too_late = np.zeros(needles, dtype=bool)
         self._evidence = np.zeros(needles)
         self._started_over = np.zeros(needles, dtype=bool)
-        self._version = 0
+        self._version = self._corrections = 0
 
     def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
         """Move on by what really happened; see `Estimator.advance`."""
@@ -100,48 +101,53 @@ class HypothesisFilter:
         """Take a measurement; see `Estimator.correct`.
 
         Without a covariance the noise is taken as bounded (`tip_noise_bound`), with one as
-        Gaussian. A tip older than the last one is dropped, and `estimate` says so.
+        Gaussian; neither as less than `model_error` allows. A tip older than the last one is
+        dropped, and `estimate` says so.
         """
-        position = np.broadcast_to(np.asarray(tip, dtype=float), (*self._shape, 3)).reshape(-1, 3)
+        position = np.broadcast_to(np.asarray(tip, dtype=float), (*self._shape, 3))
+        position = np.array(position.reshape(-1, 3))
         self._version += 1
+        self._corrections += 1
         self._too_late = self._catch_up(self._flat(age))
         if np.any(self._too_late):
             position = np.where(self._too_late[:, None], np.nan, position)
         settings = self.settings
         if covariance is None:
-            noise, bound = (
-                np.eye(3)[None] * (settings.tip_noise_bound**2 / 3.0),
-                (settings.tip_noise_bound),
-            )
+            bound = settings.believed_bound
+            noise = np.eye(3)[None] * (bound**2 / 3.0)
         else:
             noise, bound = self._covariances(covariance), 0.0
             finite = np.all(np.isfinite(noise), axis=(1, 2))
             if not np.all(finite):
                 position = np.where(finite[:, None], position, np.nan)
+            noise = noise + np.eye(3) * settings.model_error**2
         correct_bank(
             self._bank,
-            np.ascontiguousarray(position),
+            position,
             noise,
             bound,
             settings.tip_noise_softness**2,
             settings.limits(),
+            self._corrections % MERGE_EVERY == 0,
             self._refused_in_row,
             self._evidence,
         )
         lost = np.nonzero(self._evidence < settings.lost_below)[0]
         if lost.size:
-            self._start_over(lost)
+            self._bank = start_over(self._bank, lost, settings)
+            self._evidence[lost] = 0.0
+            self._started_over[lost] = True
 
     def estimate(self) -> MixtureEstimate:
         """Return what is known now; see `Estimator.estimate`.
 
         Its covariance is to be read before the next `advance`, `correct` or `reset`.
         """
-        bank = self._looked_ahead(False)
-        needles, widest = bank.alive.size, int(bank.alive.max())
+        bank = self._looked_ahead()
+        needles, kinds = bank.alive.size, len(self.settings.torsion_hypotheses)
         coordinates, linearized = np.empty((needles, 6)), np.empty((needles, 3))
         curvature, ambiguous = np.empty(needles), np.empty(needles)
-        table = np.empty((needles, widest, COLUMNS))
+        table = np.empty((needles, kinds, COLUMNS))
         uncertainty = np.empty((needles, 3))
         mixture(bank, coordinates, linearized, curvature, ambiguous, table, uncertainty)
         version = self._version
@@ -149,7 +155,7 @@ class HypothesisFilter:
         def covariance() -> Array:
             if self._version != version:
                 raise RuntimeError("the estimator has moved on since this estimate")
-            of_all = mixture_covariance(self._looked_ahead(True), coordinates)
+            of_all = mixture_covariance(self._looked_ahead(), coordinates)
             return of_all.reshape(*self._shape, 6, 6)
 
         shape = self._shape
@@ -160,7 +166,7 @@ class HypothesisFilter:
             warnings=self._warnings(ambiguous, curvature),
             covariance_of=covariance,
             hypotheses=Hypotheses(
-                table=table.reshape(*shape, widest, COLUMNS),
+                table=table.reshape(*shape, kinds, COLUMNS),
                 base=bank.base.reshape(shape).copy(),
                 wound=(bank.base + self._start_turn).reshape(shape),
                 uncertainty=uncertainty.reshape(*shape, 3),
@@ -174,76 +180,19 @@ class HypothesisFilter:
         bank = self._bank
         self._version += 1
         self.initial_rotation = turn @ self.initial_rotation
+        state = bank.state.copy()
+        set_rows(state, X, rows(state, X, 3) @ turn.T + transform[:3, 3])
+        rotation = rows(state, R00, 9)
+        turned = turn @ rotation.reshape(*rotation.shape[:2], 3, 3)
+        set_rows(state, R00, turned.reshape(rotation.shape))
         turns = np.eye(ERROR)
         turns[:3, :3] = turns[3:6, 3:6] = turn
-        self._bank = bank._replace(
-            position=bank.position @ turn.T + transform[:3, 3],
-            rotation=turn @ bank.rotation,
-            covariance=turns @ bank.covariance @ turns.T,
-        )
-
-    def _start(self, tip: Array, rotation: Array) -> Bank:
-        """Return a bank with every hypothesis, at measured tips (N, 3) and orientations."""
-        settings = self.settings
-        pairs = [(t, r) for t in settings.torsion_hypotheses for r in settings.roll_hypotheses]
-        needles, count = len(tip), len(pairs)
-        found = np.all(np.isfinite(tip), axis=-1)
-        rolls = np.zeros((count, 3))
-        rolls[:, 2] = [r.roll for _, r in pairs]
-        rotations = rotation[:, None] @ rotation_from_angles(rolls)
-        heading = rotations[..., :, 2]
-        along = heading[..., :, None] * heading[..., None, :]
-        covariance = np.zeros((needles, count, ERROR, ERROR))
-        variance = np.where(found, settings.tip_noise_bound**2 / 3.0, UNKNOWN_POSITION_STD**2)
-        covariance[..., :3, :3] = np.eye(3) * variance[:, None, None, None]
-        roll_variance = np.array([r.std**2 for _, r in pairs])[:, None, None]
-        angle_variance = settings.initial_angle_std**2
-        covariance[..., 3:6, 3:6] = (
-            np.eye(3) * angle_variance + (roll_variance - angle_variance) * along
-        )
-        covariance[..., CURVATURE, CURVATURE] = (
-            settings.curvature_spread * settings.curvature
-        ) ** 2
-        covariance[..., TORSION, TORSION] = [t.size_std**2 for t, _ in pairs]
-        torsion = np.zeros((needles, count, 6))
-        torsion[..., PLAY] = [t.play for t, _ in pairs]
-        torsion[..., LAG] = [t.lag_length for t, _ in pairs]
-        torsion[..., KIND] = np.arange(count) // len(settings.roll_hypotheses)
-        weights = np.log([t.weight * r.weight for t, r in pairs])
-        start = np.where(found[:, None], tip, 0.0)[:, None, :]
-        return Bank(
-            alive=np.full(needles, count, dtype=np.int64),
-            position=np.repeat(start, count, axis=1),
-            rotation=np.ascontiguousarray(rotations),
-            covariance=covariance,
-            curvature=np.full((needles, count), settings.curvature),
-            torsion=torsion,
-            log_weight=np.tile(weights - np.max(weights), (needles, 1)),
-            base=np.zeros(needles),
-        )
-
-    def _start_over(self, lost: npt.NDArray[np.int64]) -> None:
-        """Give needles that nothing explains every hypothesis again, from where they were seen."""
-        settings = self.settings
-        bank = self._bank = _widened(
-            self._bank, len(settings.torsion_hypotheses) * len(settings.roll_hypotheses)
-        )
-        best = np.array([int(np.argmax(bank.log_weight[n, : bank.alive[n]])) for n in lost])
-        fresh = self._start(bank.position[lost, best], bank.rotation[lost, best])
-        torsion = fresh.torsion
-        torsion[..., TIP_ANGLE] = torsion[..., BEHIND_PLAY] = bank.base[lost, None]
-        # Nothing is known of the roll any more, not even what the base says of it.
-        weights = np.log([t.weight for t in settings.torsion_hypotheses])
-        fresh.log_weight[:] = np.repeat(weights - np.max(weights), len(settings.roll_hypotheses))
-        bank.alive[lost] = fresh.alive
-        for name in ("position", "rotation", "covariance", "curvature", "torsion", "log_weight"):
-            getattr(bank, name)[lost, : fresh.position.shape[1]] = getattr(fresh, name)
-        self._evidence[lost] = 0.0
-        self._started_over[lost] = True
+        set_covariances(state, turns @ covariances(state) @ turns.T)
+        self._bank = bank._replace(state=state)
 
     def _move(self, length: Array, turn: Array) -> None:
         """Carry the bank over an advance."""
-        _advance(self._bank, length, turn, self.settings, with_covariance=True)
+        advance_bank(self._bank, length, turn, self.settings.limits())
 
     def _catch_up(self, age: Array) -> npt.NDArray[np.bool_]:
         """Carry the bank to where the tip was exposed; return where it was past that already."""
@@ -270,20 +219,13 @@ class HypothesisFilter:
                     break
         return cast(npt.NDArray[np.bool_], too_late)
 
-    def _looked_ahead(self, with_covariance: bool) -> Bank:
+    def _looked_ahead(self) -> Bank:
         """Return the bank as it will be at the end of the queue; itself where that is empty."""
         if not self._queue:
             return self._bank
-        bank = self._bank._replace(
-            position=self._bank.position.copy(),
-            rotation=self._bank.rotation.copy(),
-            torsion=self._bank.torsion.copy(),
-            base=self._bank.base.copy(),
-        )
-        if with_covariance:
-            bank = bank._replace(covariance=bank.covariance.copy())
+        bank = Bank(self._bank.alive, self._bank.state.copy(), self._bank.base.copy())
         for length, turn in self._queue:
-            _advance(bank, length, turn, self.settings, with_covariance=with_covariance)
+            advance_bank(bank, length, turn, self.settings.limits())
         return bank
 
     def _warnings(self, ambiguous: Array, curvature: Array) -> tuple[str, ...]:
@@ -308,33 +250,10 @@ class HypothesisFilter:
     def _covariances(self, covariance: npt.ArrayLike) -> Array:
         matrix = np.asarray(covariance, dtype=float)
         if matrix.ndim == 2:
-            return np.ascontiguousarray(matrix[None])
-        shaped = np.broadcast_to(matrix, (*self._shape, 3, 3)).reshape(-1, 3, 3)
-        return np.ascontiguousarray(shaped)
+            return matrix[None]
+        return np.broadcast_to(matrix, (*self._shape, 3, 3)).reshape(-1, 3, 3)
 
     def _flat(self, values: npt.ArrayLike) -> Array:
         shaped = np.broadcast_to(np.asarray(values, dtype=float), self._shape)
-        return np.ascontiguousarray(shaped.reshape(-1))
-
-
-def _advance(
-    bank: Bank, length: Array, turn: Array, settings: FilterSettings, *, with_covariance: bool
-) -> None:
-    parts = max(1, int(np.ceil(float(np.max(length)) / settings.longest_step - 1e-9)))
-    for _ in range(parts):
-        advance_bank(bank, length / parts, turn / parts, settings.limits(), with_covariance)
-
-
-def _widened(bank: Bank, count: int) -> Bank:
-    """Return a bank with room for so many hypotheses: itself where it has it."""
-    more = count - bank.position.shape[1]
-    if more <= 0:
-        return bank
-    names = ("position", "rotation", "covariance", "curvature", "torsion", "log_weight")
-    arrays = {name: getattr(bank, name) for name in names}
-    return bank._replace(
-        **{
-            name: np.pad(array, [(0, 0), (0, more)] + [(0, 0)] * (array.ndim - 2))
-            for name, array in arrays.items()
-        }
-    )
+        # A copy: what cannot be written to is another type to compiled code, compiled once more.
+        return np.array(shaped.reshape(-1))

@@ -10,16 +10,17 @@ L.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
-import math
+from needle_common.compiled import inlined
+from needle_controller.normal_moments import falling_exponential
 
-from needle_common.compiled import compiled
+_SHORT_RAMP = 1e-3
 
 
-@compiled
+@inlined
 def turn_tip(
     tip: float,
     behind_play: float,
-    per_torsion: float,
+    per_size: float,
     base: float,
     turn: float,
     length: float,
@@ -32,7 +33,7 @@ def turn_tip(
     ----------
     tip, behind_play : float
         Angles of the tip and of the shaft behind the play, before [rad].
-    per_torsion : float
+    per_size : float
         Derivative of `tip` with respect to the torsion's size, before: the lag length if there is
         one [rad/m], the play if not [-].
     base, turn : float
@@ -46,26 +47,30 @@ def turn_tip(
 
     Returns
     -------
-    tip, behind_play, per_torsion : float
+    tip, behind_play, per_size : float
         The same, after.
     """
     after = base + turn
     behind = min(max(behind_play, after - play), after + play)
     change = behind - behind_play
-    if lag_length <= 0.0:
-        if change > 0.0:
-            per_torsion = -1.0
-        elif change < 0.0:
-            per_torsion = 1.0
-        return behind, behind, per_torsion
+    by_play = -1.0 if change > 0.0 else per_size
+    by_play = 1.0 if change < 0.0 else by_play
     # The play closes first; the ramp that follows it is the last part of the length.
-    ramp = length * min(change / turn, 1.0) / lag_length if change != 0.0 else 0.0
-    decay = math.exp(-length / lag_length)
+    lag = lag_length if lag_length > 0.0 else 1.0
+    share = min(max(change / turn, 0.0), 1.0) if turn != 0.0 else 1.0
+    ramp = length * share / lag
+    long_ramp = max(ramp, _SHORT_RAMP)
+    decay, ramp_decay = falling_exponential(-length / lag), falling_exponential(-ramp)
     distance = tip - behind_play
-    moved = behind_play + distance * decay
-    per_torsion = (per_torsion + distance * length / (lag_length * lag_length)) * decay
-    if ramp > 1e-6:
-        ramp_decay = math.exp(-ramp)
-        moved += change * (1.0 - (1.0 - ramp_decay) / ramp)
-        per_torsion += change * (ramp_decay * (1.0 + ramp) - 1.0) / (ramp * lag_length)
-    return moved, behind, per_torsion
+    # (1 - exp(-ramp)) / ramp and its like lose digits where the ramp is short.
+    short = ramp < _SHORT_RAMP
+    part = 0.5 * ramp if short else 1.0 - (1.0 - ramp_decay) / long_ramp
+    slope = -0.5 * ramp if short else (ramp_decay * (1.0 + ramp) - 1.0) / long_ramp
+    by_lag = (per_size + distance * length / (lag * lag)) * decay + change * slope / lag
+    lagged = behind_play + distance * decay + change * part
+    has_lag = lag_length > 0.0
+    return (
+        lagged if has_lag else behind,
+        behind,
+        by_lag if has_lag else by_play,
+    )

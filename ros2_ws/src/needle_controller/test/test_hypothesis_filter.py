@@ -15,9 +15,11 @@ from needle_controller.arrays import Array
 from needle_controller.best import make_best
 from needle_controller.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.hypotheses import RollHypothesis, TorsionHypothesis
+from needle_controller.hypothesis_bank import advance_bank, correct_bank
 from needle_controller.hypothesis_filter import HypothesisFilter
-from needle_controller.hypothesis_mixture import MixtureEstimate
+from needle_controller.hypothesis_mixture import T_LAG, T_PLAY, T_WEIGHT, MixtureEstimate, mixture
 from needle_controller.kinematics import rotation_from_angles
+from needle_controller.roll_turns import roll_turns
 
 CURVATURE = 1.0 / 0.122
 STEP = 0.001
@@ -102,17 +104,19 @@ def test_estimates_the_curvature() -> None:
 
 
 @pytest.mark.parametrize(
-    ("play_deg", "lag", "column", "tolerance"),
-    [(30.0, 0.0, 6, np.deg2rad(8.0)), (0.0, 0.006, 7, 0.002)],
+    ("play_deg", "lag", "column", "other", "tolerance"),
+    [(30.0, 0.0, T_PLAY, T_LAG, np.deg2rad(8.0)), (0.0, 0.006, T_LAG, T_PLAY, 0.002)],
 )
-def test_recovers_the_torsion(play_deg: float, lag: float, column: int, tolerance: float) -> None:
+def test_recovers_the_torsion(
+    play_deg: float, lag: float, column: int, other: int, tolerance: float
+) -> None:
     turns = turns_for(160, size=0.5)
     poses = path(turns, play=np.deg2rad(play_deg), lag=lag)
     estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses, bound=0.0003))
     table = estimate.hypotheses.table
-    best = table[np.argmax(table[:, 8])]
+    best = table[np.argmax(table[:, T_WEIGHT])]
     assert best[column] == pytest.approx(np.deg2rad(play_deg) + lag, abs=tolerance)
-    assert best[13 - column] == 0.0
+    assert best[other] == 0.0
 
 
 def test_covariance_is_honest_for_gaussian_noise() -> None:
@@ -352,3 +356,16 @@ def test_starts_over_when_nothing_explains_the_tips() -> None:
         seen.update(estimator.estimate().warnings)
     assert rotation_error(estimator.estimate(), poses[-1]) < 25.0
     assert any("anew" in warning for warning in seen)
+
+
+def test_nothing_is_compiled_twice() -> None:
+    """One needle and many, with and without covariance, run the same machine code."""
+    for shape in ((), (3,)):
+        for covariance in (None, np.eye(3) * 1e-6):
+            estimator, law = make_best()
+            estimator.reset(np.zeros((*shape, 3)), np.zeros(2))
+            estimator.advance(STEP, 0.1)
+            estimator.correct(np.zeros((*shape, 3)), covariance)
+            law(estimator.estimate(), bend_sign=1.0)
+    functions: list[Any] = [advance_bank, correct_bank, mixture, roll_turns]
+    assert [len(function.signatures) for function in functions] == [1, 1, 1, 1]

@@ -14,9 +14,9 @@ from needle_controller.estimator import Estimate
 from needle_controller.feedback_linearization import linearized_from_reduced
 from needle_controller.hypothesis_mixture import (
     COLUMNS,
+    T_AGREEMENT,
     T_BEHIND_PLAY,
     T_CURVATURE,
-    T_KIND,
     T_LAG,
     T_PLAY,
     T_ROLL,
@@ -25,7 +25,8 @@ from needle_controller.hypothesis_mixture import (
     Hypotheses,
     MixtureEstimate,
 )
-from needle_controller.roll_law import RollLaw, RollLawSettings, base_turn, nearest_turn
+from needle_controller.roll_law import RollLaw, RollLawSettings
+from needle_controller.roll_turns import base_turn, nearest_turn
 
 CURVATURE = 1.0 / 0.122
 DEG = np.pi / 180.0
@@ -116,26 +117,24 @@ def test_small_errors_of_the_roll_are_left_alone() -> None:
 
 
 def test_rolls_that_disagree_leave_the_needle_alone() -> None:
-    """Two hypotheses of one torsion, a right angle apart: less is turned than for one roll."""
+    """The less the hypotheses' rolls agree, the larger an error of their mean is left alone."""
     steer = law(near_dead_band=0.1, scatter_dead_band=1.0)
-    table = np.zeros((2, COLUMNS))
-    table[:, T_CURVATURE], table[:, T_WEIGHT] = CURVATURE, 0.5
-    table[:, T_ROLL] = 0.2 + np.array([0.0, 0.0])
+    table = np.zeros((1, COLUMNS))
+    table[:, T_CURVATURE], table[:, T_WEIGHT], table[:, T_ROLL] = CURVATURE, 1.0, 0.2
+    table[:, T_AGREEMENT] = 1.0
     assert turned(steer, table) == pytest.approx(-0.2)
-    table[:, T_ROLL] = 0.2 + np.array([-0.25, 0.25]) * np.pi
+    table[:, T_AGREEMENT] = 0.85
     assert turned(steer, table) == 0.0
 
 
-def test_a_torsion_hypothesis_turns_by_its_mean_roll() -> None:
-    steer = law(near_dead_band=0.1, scatter_dead_band=0.0)
+def test_torsion_hypotheses_are_averaged_by_weight() -> None:
+    steer = law(near_dead_band=0.1)
     table = np.zeros((2, COLUMNS))
-    table[:, T_CURVATURE], table[:, T_WEIGHT] = CURVATURE, 0.5
-    table[:, T_ROLL] = [0.1, 0.5]
-    assert turned(steer, table) == pytest.approx(-0.3)
-    # As two torsions: the one within the dead band asks for nothing, the other for its own turn.
-    table[:, T_KIND] = [0.0, 1.0]
+    table[:, T_CURVATURE], table[:, T_AGREEMENT] = CURVATURE, 1.0
+    table[:, T_ROLL], table[:, T_WEIGHT] = [0.1, 0.5], [0.25, 0.75]
     table[0, T_ROLL] = 0.05
-    assert turned(steer, table) == pytest.approx(-0.25)
+    # The first is within the dead band and asks for nothing.
+    assert turned(steer, table) == pytest.approx(-0.75 * 0.5)
 
 
 def turned(steer: RollLaw, table: Array) -> float:
