@@ -52,6 +52,8 @@ class LinkSettings:
         socketcand only.
     port : int
         socketcand only.
+    write_timeout : float
+        How long a frame may wait for room [s]; slcan only.
     """
 
     kind: str
@@ -60,6 +62,7 @@ class LinkSettings:
     tty_baudrate: int = 115_200
     host: str = "localhost"
     port: int = 29536
+    write_timeout: float = 0.05
 
     def __post_init__(self) -> None:
         """Refuse what names no link.
@@ -95,7 +98,10 @@ def open_bus(settings: LinkSettings) -> can.BusABC:
     try:
         if settings.kind == "slcan":
             return SlcanBus(
-                settings.channel, bitrate=settings.bitrate, tty_baudrate=settings.tty_baudrate
+                settings.channel,
+                bitrate=settings.bitrate,
+                tty_baudrate=settings.tty_baudrate,
+                write_timeout=settings.write_timeout,
             )
         if settings.kind == "socketcand":
             # python-can would try for ten seconds without a pause.

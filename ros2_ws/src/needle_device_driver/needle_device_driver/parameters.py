@@ -124,8 +124,16 @@ class _RigParameters:
     @property
     def link_settings(self) -> LinkSettings:
         """The CAN link."""
-        names = {field.name for field in dataclasses.fields(LinkSettings)} - {"kind"}
-        return LinkSettings(kind=self.link, **{name: getattr(self, name) for name in names})
+        return LinkSettings(
+            kind=self.link,
+            channel=self.channel,
+            bitrate=self.bitrate,
+            tty_baudrate=self.tty_baudrate,
+            host=self.host,
+            port=self.port,
+            # Before a drive would count as silent, its link has a name.
+            write_timeout=self.reply_age_limit / 2.0,
+        )
 
     @property
     def limits(self) -> SafetyLimits:

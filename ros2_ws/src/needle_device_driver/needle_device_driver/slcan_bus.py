@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import select
 import time
 
@@ -9,7 +10,6 @@ import serial
 from can import CanOperationError, Message
 from can.interfaces.slcan import slcanBus
 
-_WRITE_TIMEOUT = 0.05
 _ENDS = (0x0D, 0x07)
 _LONGEST_LINE = 64
 
@@ -19,7 +19,7 @@ class SlcanBus(slcanBus):
 
     The serial port is read in whatever pieces it has; byte by byte, as python-can does, a loaded
     machine falls up to 0.8 s behind. A write neither waits for the last bit to leave the port nor
-    longer than 50 ms for room, so that an adapter that takes nothing cannot hang the control loop.
+    long for room, so that an adapter that takes nothing cannot hang the control loop.
     A line that is no frame is counted, not raised.
 
     Parameters
@@ -30,9 +30,14 @@ class SlcanBus(slcanBus):
         Of the CAN bus [bit/s].
     tty_baudrate : int
         Of the serial port [bit/s]; USB adapters ignore it.
+    write_timeout : float
+        How long a write waits for room [s].
     """
 
-    def __init__(self, channel: str, *, bitrate: int, tty_baudrate: int) -> None:
+    def __init__(
+        self, channel: str, *, bitrate: int, tty_baudrate: int, write_timeout: float
+    ) -> None:
+        self._write_timeout = write_timeout
         self.malformed = 0
         self.refused = 0
         self._lines: list[str] = []
@@ -51,14 +56,16 @@ class SlcanBus(slcanBus):
         super().close()
 
     def _write(self, string: str) -> None:
-        port = self.serialPortOrig
-        if port.write_timeout != _WRITE_TIMEOUT:
-            port.write_timeout = _WRITE_TIMEOUT
+        data = string.encode() + self.LINE_TERMINATOR
+        deadline = time.monotonic() + self._write_timeout
         try:
-            port.write(string.encode() + self.LINE_TERMINATOR)
-        except serial.SerialTimeoutException as error:
-            raise CanOperationError(f"takes nothing for {_WRITE_TIMEOUT:g} s") from error
-        except (serial.SerialException, OSError, TypeError) as error:
+            port = self.serialPortOrig.fileno()
+            while data:
+                data = data[_write_now(port, data) :]
+                wait = max(0.0, deadline - time.monotonic())
+                if data and not select.select([], [port], [], wait)[1]:
+                    raise CanOperationError(f"takes nothing for {self._write_timeout:g} s")
+        except (serial.SerialException, OSError, TypeError, ValueError) as error:
             # pyserial raises TypeError where another thread has closed the port.
             raise CanOperationError(str(error)) from error
 
@@ -104,5 +111,13 @@ class SlcanBus(slcanBus):
             return None, False
 
     def send(self, msg: Message, timeout: float | None = None) -> None:
-        """Send a frame; the write timeout is the bus's own."""
+        """Send a frame; how long that may take is the bus's own."""
         super().send(msg, self.serialPortOrig.write_timeout)
+
+
+def _write_now(port: int, data: bytes) -> int:
+    """Write what there is room for; return how many bytes that were."""
+    try:
+        return os.write(port, data)
+    except BlockingIOError:
+        return 0

@@ -61,13 +61,18 @@ class Peer:
         self._thread.start()
 
     def _serve(self) -> None:
+        beat_at = 0.0
         while not self._ended:
-            message = self._bus.recv(0.05)
-            if message is None:
-                continue
-            self.syncs += message.arbitration_id == 0x80
+            message = self._bus.recv(0.02)
+            beat, now = beat_at <= time.monotonic(), time.monotonic()
+            if beat:
+                beat_at = now + 0.02
+            self.syncs += message is not None and message.arbitration_id == 0x80
             for drive in self.drives:
-                drive.take(message.arbitration_id, bytes(message.data))
+                if beat:
+                    drive.say(0x700, bytes([drive.nmt]))
+                if message is not None:
+                    drive.take(message.arbitration_id, bytes(message.data))
                 for cob_id, data in drive.out:
                     self._bus.send(
                         can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
@@ -120,7 +125,9 @@ class Rig:
             "link": "virtual",
             "channel": channel,
             "use_sim_time": True,
+            # A machine under load is no reason to stop.
             "reply_age_limit": 0.5,
+            "hold_timeout": 0.5,
             **parameters,
         }
         self.driver = DeviceDriverNode(
@@ -131,6 +138,7 @@ class Rig:
         self.time_ns = 1_000_000_000
         self.stamps = itertools.count(1)
         self.holding = False
+        self._held_at = 0.0
         self._executor = SingleThreadedExecutor(context=context)
         self._executor.add_node(self.driver)
         self._executor.add_node(self.partner)
@@ -138,7 +146,10 @@ class Rig:
     def until(self, condition: Callable[[], bool], what: str) -> None:
         deadline = time.monotonic() + LIMIT
         while not condition():
-            assert time.monotonic() < deadline, f"timed out: {what}; {self.partner.status}"
+            now = time.monotonic()
+            assert now < deadline, f"timed out: {what}; {self.partner.status}"
+            if self.holding and now > self._held_at + 0.05:
+                self.hold()
             self._executor.spin_once(timeout_sec=0.01)
 
     def matched(self) -> None:
@@ -161,6 +172,7 @@ class Rig:
 
     def hold(self, pressed: bool = True) -> None:
         self.holding = pressed
+        self._held_at = time.monotonic()
         message = Joy(axes=[1.0], buttons=[int(pressed)])
         message.header.frame_id = "partner"
         message.header.stamp = to_stamp(next(self.stamps))

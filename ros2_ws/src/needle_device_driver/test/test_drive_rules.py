@@ -435,10 +435,13 @@ def test_no_motion_by_itself_set_up_enabling_and_reset_leave_a_drive_where_it_is
     bench.configured()
     bench.cycle(5)
     assert bench.insertion.position == 12_345
+    # Someone turns the motor while it is off.
+    bench.insertion.position = 55_555
+    bench.cycle(1)
     assert bench.supervisor.enable(True, bench.clock()).success
     bench.cycle(20)
     assert bench.insertion.state == "enabled"
-    assert bench.insertion.position == 12_345
+    assert bench.insertion.position == 55_555
 
 
 def test_following_error_of_a_blocked_motor(drive_bench: Bench) -> None:
