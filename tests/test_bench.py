@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import benchmark
+import drive_benchmark
 import reference_loop
 from needle_sim.study import run_study
 from needle_sim.study_controllers import controller_factory
@@ -31,6 +32,14 @@ def test_python_control_simulates_the_same_loop() -> None:
     assert reference_loop.control_steer(system, start, noise) == pytest.approx(
         reference_loop.steer(start, noise, design), abs=1e-12
     )
+
+
+@pytest.mark.parametrize("key", drive_benchmark.WAYS)
+def test_every_way_to_the_drives_is_measured_to_its_sync(key: str) -> None:
+    delays, share = drive_benchmark.measure(drive_benchmark.WAYS[key][1], 8)
+    assert len(delays) == 8
+    assert min(delays) > 0.0
+    assert share > 0.0
 
 
 @pytest.mark.parametrize(

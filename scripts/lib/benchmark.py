@@ -15,6 +15,7 @@ from typing import NoReturn
 
 import numpy as np
 
+import drive_benchmark
 import reference_loop
 import tracker_benchmark
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
@@ -109,9 +110,10 @@ def _bench(arguments: Sequence[str]) -> int:
             f"{row.ratio:7.3g}x  {row.against}",
             flush=True,
         )
-        values[f"{row.key}_{row.unit}"] = row.value
+        unit = row.unit.replace("%", "percent")
+        values[f"{row.key}_{unit}"] = row.value
         name = row.against.replace(" ", "_").replace("-", "_").replace(",", "").lower()
-        values[f"{row.key}_{name}_{row.unit}"] = row.reference
+        values[f"{row.key}_{name}_{unit}"] = row.reference
         values[f"{row.key}_{name}_ratio"] = row.ratio
     if given.json:
         write_json(Path(given.json), values)
@@ -209,11 +211,34 @@ def tracker() -> Iterator[Row]:
             )
 
 
+def drives() -> Iterator[Row]:
+    """Run the 50 Hz cycle of both drives over a serial adapter: delay and share of a core."""
+    driver, *others = drive_benchmark.ways()
+    for other in others:
+        yield Row(
+            "drives_delay_p99",
+            "50 Hz cycle, p99 until SYNC is out",
+            "ms",
+            driver.delay_p99_ms,
+            other.what,
+            other.delay_p99_ms,
+        )
+        yield Row(
+            "drives_cpu",
+            "50 Hz cycle, share of a core",
+            "%",
+            driver.cpu_percent,
+            other.what,
+            other.cpu_percent,
+        )
+
+
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": studies,
     "updates": updates,
     "memory": memory,
     "tracker": tracker,
+    "drives": drives,
 }
 
 
