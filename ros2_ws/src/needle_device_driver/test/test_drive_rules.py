@@ -454,3 +454,28 @@ def test_following_error_of_a_blocked_motor(drive_bench: Bench) -> None:
             break
     failed(bench, Rule.FOLLOWING_ERROR, "mm off its set-point")
     assert bench.insertion.next_target - bench.insertion.position <= 0.7e-3 * 20e6
+
+
+def test_following_error_counts_from_the_set_point_that_was_due(make_drive_bench: Any) -> None:
+    # A cycle's way at full speed is twice this bound.
+    bench = make_drive_bench(insertion_following_error=5e-5)
+    bench.ready()
+    bench.cycle(1, holding=True)
+    bench.step(0.002, 0.3, 0.4)
+    bench.cycle(30, holding=True)
+    assert bench.outcomes == ["succeeded"]
+
+
+def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fresh(
+    drive_bench: Bench,
+) -> None:
+    bench = drive_bench
+    bench.configured()
+    assert bench.supervisor.joints(bench.clock()) is not None
+    bench.insertion.nmt = 0x7F
+    bench.skipped += 0.2
+    before = bench.link.frames_received
+    bench.drives.beat()
+    with bench.link.arrival:
+        assert bench.link.arrival.wait_for(lambda: bench.link.frames_received >= before + 2, 5.0)
+    assert bench.supervisor.joints(bench.clock()) is None
