@@ -80,6 +80,8 @@ class DriveEmulatorNode(Node):
         self._times = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
         self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
         self._diagnostics = DiagnosticsPublisher(self)
+        self._tell_health()
+        # Last: what fails before leaves no link behind.
         port: Port
         if values.socketcand_port:
             port = SocketcandPort(values.socketcand_port)
@@ -89,7 +91,6 @@ class DriveEmulatorNode(Node):
             port = pty
             self.get_logger().info(f"slcan adapter at {pty.path}")
         self._server = DriveServer(self._bus, port)
-        self._tell_health()
 
     def turn(self) -> bool:
         """Serve the bus for a moment.

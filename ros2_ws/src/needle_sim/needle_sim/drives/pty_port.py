@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import os
+import socket
 import termios
 import tty
 from pathlib import Path
@@ -28,7 +30,7 @@ class PtyPort:
     Raises
     ------
     UserError
-        If something else is at `link`.
+        If something else is at `link`, or another emulator.
     """
 
     def __init__(self, link: Path | None = None) -> None:
@@ -36,6 +38,7 @@ class PtyPort:
         self._master = self._slave = -1
         self._adapter = SlcanAdapter()
         self._waiting = b""
+        self._lock: socket.socket | None = None
         self.frames_lost = 0
         self.plug_in()
 
@@ -62,16 +65,11 @@ class PtyPort:
         self._waiting = b""
         if self._link is not None:
             try:
-                # A link that leads nowhere is what a killed emulator leaves behind.
-                if self._link.is_symlink() and not self._link.exists():
-                    self._link.unlink()
-                self._link.symlink_to(os.ttyname(self._slave))
-            except OSError as error:
+                self._make_link(self._link)
+            except UserError:
                 self._link = None
                 self.unplug()
-                raise UserError(
-                    f"cannot make the link {error.filename2}: {error.strerror}"
-                ) from error
+                raise
 
     def unplug(self) -> None:
         """Disappear: whoever has the port open gets an error."""
@@ -81,6 +79,9 @@ class PtyPort:
             with contextlib.suppress(OSError):
                 if str(self._link.readlink()) == os.ttyname(self._slave):
                     self._link.unlink()
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
         os.close(self._master)
         os.close(self._slave)
         self._master = self._slave = -1
@@ -112,6 +113,22 @@ class PtyPort:
             self.frames_lost += len(frames)
             data = b""
         self._write(data)
+
+    def _make_link(self, link: Path) -> None:
+        """Link to the pseudo-terminal; what a killed emulator has left there is replaced."""
+        self._lock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        name = hashlib.sha256(str(link.absolute()).encode()).hexdigest()
+        try:
+            # The kernel frees the name whatever becomes of this process.
+            self._lock.bind(f"\0needle_pty_{name}")
+        except OSError as error:
+            raise UserError(f"{link}: another emulator is plugged in there") from error
+        try:
+            if link.is_symlink() and str(link.readlink()).startswith("/dev/pts/"):
+                link.unlink()
+            link.symlink_to(os.ttyname(self._slave))
+        except OSError as error:
+            raise UserError(f"cannot make the link {link}: {error.strerror}") from error
 
     def _write(self, data: bytes) -> None:
         self._waiting += data

@@ -142,10 +142,13 @@ def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="can"):
         PtyPort(file)
     assert file.read_text() == "mine"
-    # A link that leads nowhere is what a killed emulator leaves.
+    # What a killed emulator leaves leads nowhere, or by now to somebody else's terminal.
     stale = tmp_path / "stale"
-    stale.symlink_to(tmp_path / "gone")
+    stale.symlink_to("/dev/pts/ptmx")
     port = PtyPort(stale)
+    assert stale.resolve() != Path("/dev/pts/ptmx")
+    with pytest.raises(UserError, match="another emulator"):
+        PtyPort(stale)
     assert stale.exists()
     port.unplug()
     assert list(tmp_path.iterdir()) == [file]
