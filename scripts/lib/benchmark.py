@@ -16,6 +16,7 @@ from typing import NoReturn
 import numpy as np
 
 import drive_benchmark
+import recording_benchmark
 import reference_loop
 import tracker_benchmark
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
@@ -43,6 +44,8 @@ references:
   plain Python     the same loop, needle by needle, with numbers and `math` (few needles, scaled)
   python-control   the same loop as interconnected systems of python-control (fewer, scaled); its
                    time of one update holds the needle's simulation, too
+  rosbags Writer   the same messages into an MCAP bag; the disk alone: their bytes into one file;
+                   all with what the disk needs to take them (fsync)
   one at a time    the same code as the study's, in a loop over needles (few needles, scaled)
 
 exit codes: 0 measured, 2 bad input, 130 interrupted.
@@ -233,11 +236,27 @@ def drives() -> Iterator[Row]:
         )
 
 
+def recording() -> Iterator[Row]:
+    """From messages to a bag on the disk."""
+    speeds = recording_benchmark.measure()
+    what = f"recorder's writer, {speeds.megabytes:.0f} MB"
+    for against, speed in (("rosbags Writer", speeds.rosbags), ("the disk alone", speeds.disk)):
+        yield Row(
+            "recording",
+            what,
+            "s",
+            speeds.megabytes / speeds.recorder,
+            against,
+            speeds.megabytes / speed,
+        )
+
+
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": studies,
     "updates": updates,
     "memory": memory,
     "tracker": tracker,
+    "recording": recording,
     "drives": drives,
 }
 

@@ -24,7 +24,7 @@ from needle_common.errors import UserError
 
 LIBRARY: Final = "needle_bringup"
 COMPRESSIONS: Final = ("none", "zstd")
-CHUNK_SIZE: Final = 4 * 2**20
+CHUNK_SIZE: Final = 2 * 2**20
 DISTRO_KEY: Final = "ROS_DISTRO"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 

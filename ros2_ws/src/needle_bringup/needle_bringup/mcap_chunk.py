@@ -18,7 +18,6 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, ChunkIndex, Schema
 from mcap.stream_reader import get_chunk_data_stream
-from zstandard import ZstdError
 
 RECORD_HEADER: Final = struct.Struct("<BQ")
 # message_start_time, message_end_time, uncompressed_size, uncompressed_crc, length of compression
@@ -192,7 +191,8 @@ def _decompressed(chunk: Chunk) -> bytes:
     """Return a chunk's content, checked."""
     try:
         stream, length = get_chunk_data_stream(chunk, validate_crc=True)
-    except (ZstdError, RuntimeError) as error:
+    # Each decompressor has exceptions of its own.
+    except Exception as error:
         raise ValueError(str(error)) from error
     return stream.read(length)
 

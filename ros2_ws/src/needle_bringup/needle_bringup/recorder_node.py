@@ -22,6 +22,7 @@ from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.subscription import Subscription
 
+from needle_bringup.allocator import keep_freed_memory
 from needle_bringup.bag_files import recover_hint
 from needle_bringup.bag_metadata import BagTopic
 from needle_bringup.bag_writer import COMPRESSIONS
@@ -56,6 +57,7 @@ Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad param
 """
 
 GRAPH_PERIOD = 0.1
+GRAPH_TIME = 0.05
 # All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
 DEPTH = 5000
 IMAGE_DEPTH = 60
@@ -92,7 +94,7 @@ class RecorderParameters:
         read_only=True,
     )
     max_file_size: int = parameter(
-        10_000_000_000,
+        4_000_000_000,
         unit="B",
         lower=0,
         description="Messages in one data file, after which another is begun; 0: no bound.",
@@ -191,7 +193,6 @@ class Recorder(Node):
     def _take_parameters(self, node: str, values: dict[str, Any]) -> None:
         document = {node: {"ros__parameters": values}}
         self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
-        self.recording.set_custom_data("parameters", yaml.safe_dump(self._snapshots.document()))
 
     def _take_parameter_event(self, data: bytes) -> None:
         changes = self._snapshots.take_event(deserialize_message(data, ParameterEvent))
@@ -206,7 +207,11 @@ class Recorder(Node):
         if self.recording.error is not None:
             self._leave()
             return
+        until = time.monotonic() + GRAPH_TIME
         for name, types in self.get_topic_names_and_types():
+            # What waits on the topics that are recorded comes first; the rest at the next poll.
+            if time.monotonic() > until:
+                return
             topic = self._topics.get(name)
             if topic is None:
                 topic = self._new_topic(name, types)
@@ -379,11 +384,10 @@ class Recorder(Node):
         for topic in self._topics.values():
             if not topic.described:
                 self._describe(topic)
+        parameters = yaml.safe_dump(self._snapshots.document())
+        self.recording.set_custom_data("parameters", parameters)
         self.recording.add_file(
-            "parameters.yaml",
-            "application/yaml",
-            yaml.safe_dump(self._snapshots.document()).encode(),
-            time.time_ns(),
+            "parameters.yaml", "application/yaml", parameters.encode(), time.time_ns()
         )
         lost = self._lost()
         if lost:
@@ -429,6 +433,7 @@ class _StopRequest:
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
     stop = _StopRequest()
+    keep_freed_memory()
 
     def spin(node: Node) -> int:
         recorder = cast(Recorder, node)
