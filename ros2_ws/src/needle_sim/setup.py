@@ -20,7 +20,7 @@ setup(
     zip_safe=False,
     maintainer="Needle steering maintainers",
     maintainer_email="maintainers@needle-steering.invalid",
-    description="Stands in for the rig: needle plant, tissue, stereo renderer, simulated axes.",
+    description="Stands in for the rig: needle plant, tissue, stereo renderer, emulated drives.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
