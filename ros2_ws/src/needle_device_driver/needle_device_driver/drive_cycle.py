@@ -66,9 +66,6 @@ class DriveCycle:
         """
         if not self._link.is_open:
             return
-        for axis in self._axes:
-            # What came too late for the cycle before.
-            axis.update()
         try:
             send_heartbeat(self._link)
             for axis in self._axes:

@@ -254,3 +254,8 @@ def test_socketcand_carries_frames_and_its_end_is_a_lost_link(make_link: Make) -
     with pytest.raises(LinkError, match="lost"):
         while time.monotonic() < until:
             link.send(0x80)
+    # A closed connection is readable for ever: nobody may go on reading it.
+    thread = link._thread
+    assert thread is not None
+    thread.join(5.0)
+    assert not thread.is_alive()

@@ -478,4 +478,6 @@ def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fres
     bench.drives.beat()
     with bench.link.arrival:
         assert bench.link.arrival.wait_for(lambda: bench.link.frames_received >= before + 2, 5.0)
+    bench.supervisor.observe(bench.clock())
+    assert bench.axes[1].poll(bench.clock()).time > bench.clock() - 0.1
     assert bench.supervisor.joints(bench.clock()) is None
