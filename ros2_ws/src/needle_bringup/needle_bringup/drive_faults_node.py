@@ -58,6 +58,19 @@ def fault_trials(
         hand.close()
 
 
+def _start_over(hand: DriveHand) -> None:
+    """Bring the bench back to order after a trial that went wrong."""
+    hand.release()
+    hand.insist("reset")
+    hand.insist("enable", True)
+    hand.press()
+    hand.pause(_STILL)
+    _retract(hand)
+    hand.release()
+    hand.insist("enable", False)
+    _get_ready(hand)
+
+
 def _get_ready(hand: DriveHand) -> None:
     """Needle out, homed, enabled; not held."""
     hand.insist("confirm_needle_out", True)
@@ -111,13 +124,18 @@ def _fault(
         hand.status = {}
     else:
         processes.say(words)
+    # A slow motor may be stalled for long before it is far off.
+    give_up_at = time.monotonic() + _LONGEST
+    while hand.status.get("state") in ("HOLDING", "MOVING") and time.monotonic() < give_up_at:
+        stream.keep_going()
     end = time.monotonic() + _AFTER_FAULT
     while time.monotonic() < end:
         stream.keep_going()
-    trace = hand.motors[seen:]
     stopped = hand.motors[-1]
     moving = [
-        m for m in trace if (m.insertion, m.rotation) != (stopped.insertion, stopped.rotation)
+        at
+        for at in hand.motors[seen:]
+        if (at.insertion, at.rotation) != (stopped.insertion, stopped.rotation)
     ]
     state, reason = hand.status.get("state", ""), hand.status.get("fault", "")
     log = processes.log("device_driver")[logged:]
@@ -125,12 +143,21 @@ def _fault(
     end = time.monotonic() + _STILL
     while time.monotonic() < end:
         stream.keep_going()
-    _put_right(processes, hand, kind)
-    hand.press()
-    hand.pause(_STILL)
+    try:
+        _put_right(processes, hand, kind)
+        hand.press()
+        hand.pause(_STILL)
+        trouble = ""
+    except UserError as error:
+        trouble = str(error)
     # Whatever was restored, released, reset, enabled and held: only a command moves.
-    moved = max(abs(m.insertion - stopped.insertion) for m in hand.motors[still_from:])
-    trouble = _recover(hand)
+    moved = max(abs(at.insertion - stopped.insertion) for at in hand.motors[still_from:])
+    try:
+        trouble = trouble or _recover(hand)
+    except UserError as error:
+        trouble = str(error)
+    if trouble:
+        _start_over(hand)
     return {
         "words": words,
         "speed_mm_s": stream.speed * 1e3,
