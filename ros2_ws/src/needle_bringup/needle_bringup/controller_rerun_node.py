@@ -44,6 +44,8 @@ class ControllerStage:
         The node's, as the run began.
     node : str
         The node's full name in the bag, whose changes of parameters are taken over.
+    unheard : frozenset of int
+        Stamps of tips that came while no tip was wanted (`bag_hearing.unheard_tips`) [ns].
 
     Attributes
     ----------
@@ -53,9 +55,12 @@ class ControllerStage:
         What could not be done as recorded.
     """
 
-    def __init__(self, parameters: PlaneControllerParameters, node: str) -> None:
+    def __init__(
+        self, parameters: PlaneControllerParameters, node: str, unheard: frozenset[int]
+    ) -> None:
         self._parameters = parameters
         self._node = node
+        self._unheard = unheard
         control = PlaneControl(parameters.control(), offset_plane(parameters.target_offset))
         self._steering = Steering(parameters.steering(), control)
         self._sent: int | None = None
@@ -64,7 +69,7 @@ class ControllerStage:
         self.notes: list[str] = []
         self._takers: dict[str, Callable[[Any], Iterable[Action]]] = {
             "joint_states": self._take_joints,
-            "needle/tip": lambda m: self._steering.on_tip(conversions.to_tip(m)),
+            "needle/tip": self._take_tip,
             "needle/tip_pose": lambda m: self._steering.on_tip_pose(
                 conversions.to_tip_covariance(m)
             ),
@@ -105,6 +110,10 @@ class ControllerStage:
         # rclpy gives plain floats where rosbags gives numpy's.
         insertion, rotation = float(sample.insertion), float(sample.rotation)
         return self._steering.on_joints(JointSample(sample.stamp_ns, insertion, rotation))
+
+    def _take_tip(self, message: Any) -> Iterable[Action]:
+        tip = conversions.to_tip(message)
+        return () if tip.stamp_ns in self._unheard else self._steering.on_tip(tip)
 
     def _take_result(self, message: Any) -> Iterable[Action]:
         stamp = to_nanoseconds(message.stamp) if self._sent is None else self._sent
@@ -148,7 +157,7 @@ class ControllerStage:
             return ()
         known = {field.name for field in dataclasses.fields(self._parameters)}
         changes = {
-            parameter.name: _plain(parameter.value)
+            parameter.name: plain_value(parameter.value)
             for parameter in message.changed_parameters
             if parameter.name in known
         }
@@ -176,7 +185,7 @@ def _messages(action: PublishUpdate) -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain_value(value: Any) -> Any:
     """Return the value in a ParameterValue of rosbags, lists as tuples."""
     content = getattr(value, _MEMBERS.get(value.type, "string_value"))
     if isinstance(content, (bool, int, float, str)):

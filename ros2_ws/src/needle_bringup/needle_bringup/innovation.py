@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from bisect import bisect_right
 
 import numpy as np
 import numpy.typing as npt
@@ -112,16 +113,24 @@ def gate_room(run: Run) -> GateRoom:
 
 
 def refused_tips(run: Run) -> Stamps:
-    """Return the stamps of tips after which the controller counted one more as refused [ns]."""
-    order = np.argsort(run.tips.received)
-    received, stamps = run.tips.received[order], run.tips.stamps[order]
-    refused, count = [], 0
+    """Return the stamps of tips that the controller refused [ns].
+
+    It says how many it has refused: each time it is one more, that is the last tip that had come
+    and was not used.
+    """
+    unused = ~np.isin(run.tips.stamps, run.estimate.stamps)
+    order = np.argsort(run.tips.received[unused])
+    received = run.tips.received[unused][order].tolist()
+    stamps = run.tips.stamps[unused][order].tolist()
+    refused: list[int] = []
     for status in run.controller_status:
         text = status.values.get("tips_rejected", "")
-        if text.isdigit() and int(text) > count and len(received):
-            count = int(text)
-            refused.append(stamps[max(int(np.searchsorted(received, status.log_time)) - 1, 0)])
-    return np.array(refused, np.int64)
+        if not text.isdigit() or int(text) <= len(refused):
+            continue
+        come = bisect_right(received, status.log_time)
+        free = [stamp for stamp in stamps[:come] if stamp not in refused]
+        refused += free[len(refused) - int(text) :]
+    return np.array(sorted(refused), np.int64)
 
 
 def missed_tips(run: Run) -> Stamps:

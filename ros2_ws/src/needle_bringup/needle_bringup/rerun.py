@@ -35,6 +35,8 @@ TYPES: Mapping[str, str] = {
 }
 """Relative topic to type of what the stages put out."""
 
+# What was asked so shortly before the bag's end may not have its answer in it [ns].
+_LAST_ANSWERS = 500_000_000
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -173,7 +175,10 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
             record.topic == POSE for record in kept
         )
         recorded = kept
-    today = [Record(o.topic, o.stamp, dict(members(o.message))) for o in outputs]
+    today = [
+        Record(o.topic, o.stamp, dict(members(o.message)))
+        for o in _recordable(recorded, outputs, last_time)
+    ]
     return Rerun(recorded, today, outputs, without_images)
 
 
@@ -240,6 +245,19 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[n
     error[:, 1:] = (error[:, 1:] + np.pi) % (2.0 * np.pi) - np.pi
     rms: npt.NDArray[np.float64] = np.sqrt(np.mean(error**2, axis=0))
     return rms
+
+
+def _recordable(
+    recorded: Sequence[Record], outputs: Sequence[Output], end: int
+) -> Iterator[Output]:
+    """Yield outputs without the last ones of a bag that ended before their like was recorded."""
+    last: dict[str, int] = {}
+    for record in recorded:
+        last[record.topic] = max(record.stamp, last.get(record.topic, 0))
+    for output in outputs:
+        newer = output.stamp > last.get(output.topic, 0)
+        if not (newer and output.log_time > end - _LAST_ANSWERS):
+            yield output
 
 
 def _inputs(run: Run, watched: set[str], stages: Sequence[Stage]) -> Iterator[tuple[str, int, Any]]:

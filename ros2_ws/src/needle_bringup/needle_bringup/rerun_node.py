@@ -11,10 +11,12 @@ from typing import Any, NoReturn, TypeVar
 
 import yaml
 
+from needle_bringup.bag_files import read_messages
+from needle_bringup.bag_hearing import unheard_tips
 from needle_bringup.bag_reader import Run, read_run
 from needle_bringup.bag_writer import refuse_existing_bag
 from needle_bringup.comparison import compare
-from needle_bringup.controller_rerun_node import ControllerStage
+from needle_bringup.controller_rerun_node import ControllerStage, plain_value
 from needle_bringup.rerun import (
     TIP_TOPICS,
     has_images,
@@ -125,7 +127,7 @@ def _run(words: Sequence[str]) -> int:
     controller_node = _node(run, CONTROLLER, changes)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
     tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
-    controller = _controller(controller_node)
+    controller = _controller(run, controller_node)
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
 
@@ -135,7 +137,7 @@ def _run(words: Sequence[str]) -> int:
         outputs = rerun.outputs
         answers = [output for output in outputs if output.topic in TIP_TOPICS]
         if answers:
-            outputs = [*answers, *run_tips(run, _controller(controller_node), answers)]
+            outputs = [*answers, *run_tips(run, _controller(run, controller_node), answers)]
         nodes = [node for node in (tracker_node, controller_node) if node is not None]
         used = {node.name: node.values for node in nodes}
         write_rerun(run, given.output, outputs, used, calibration)
@@ -176,7 +178,8 @@ def _parser() -> _Parser:
 
 
 def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node:
-    found = [full for full in run.parameters if full.rsplit("/", maxsplit=1)[-1] == name]
+    recorded = run.parameters or _announced(run)
+    found = [full for full in recorded if full.rsplit("/", maxsplit=1)[-1] == name]
     if not found and name not in changes:
         raise UserError(
             f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
@@ -184,7 +187,21 @@ def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node
         )
     full_name = found[0] if found else f"{run.namespace}{name}"
     given = changes.get(name, {})
-    return Node(full_name, {**run.parameters.get(full_name, {}), **given}, frozenset(given))
+    return Node(full_name, {**recorded.get(full_name, {}), **given}, frozenset(given))
+
+
+def _announced(run: Run) -> dict[str, dict[str, Any]]:
+    """Return what nodes said of their parameters as they started, by full name.
+
+    That is all that a bag of ROS 2's own recorder has, if the recorder was there first.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for _, _, message in read_messages(run.path, "/parameter_events".__eq__):
+        values = found.setdefault(str(message.node), {})
+        for parameter in message.new_parameters:
+            if parameter.value.type:
+                values[str(parameter.name)] = plain_value(parameter.value)
+    return {node: values for node, values in found.items() if values}
 
 
 def _calibration(run: Run, node: Node) -> str:
@@ -212,8 +229,9 @@ def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
     return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
 
 
-def _controller(node: Node) -> ControllerStage:
-    return ControllerStage(node.parameters(PlaneControllerParameters), node.name)
+def _controller(run: Run, node: Node) -> ControllerStage:
+    parameters = node.parameters(PlaneControllerParameters)
+    return ControllerStage(parameters, node.name, unheard_tips(run))
 
 
 def _summary(tracker: TrackerStage | None, controller: ControllerStage, node: Node) -> str:

@@ -31,13 +31,6 @@ def test_a_tip_that_was_used_was_heard_after_the_result_though_sent_before() -> 
     assert order(tip, result, asked, estimate) == ["result", "controller_status", "tip", "estimate"]
 
 
-def test_a_tip_that_was_not_used_was_heard_before_the_controller_asked() -> None:
-    result = sent(10, "device/result")
-    tip = sent(15, "needle/tip", stamp=7)
-    asked = sent(20, "needle/controller_status")
-    assert order(result, tip, asked) == ["tip", "result", "controller_status"]
-
-
 def test_tips_keep_their_order() -> None:
     used, later = sent(9, "needle/tip", stamp=7), sent(11, "needle/tip", stamp=8)
     estimate = sent(25, "needle/estimate", stamp=7)
@@ -46,12 +39,11 @@ def test_tips_keep_their_order() -> None:
     assert heard[0].time <= heard[1].time
 
 
-def test_nothing_is_heard_before_it_was_sent_nor_much_later() -> None:
+def test_nothing_is_heard_before_it_was_sent() -> None:
     messages = [
         sent(10, "device/result"),
         sent(12, "needle/tip", stamp=7),
-        sent(1500, "needle/controller_status"),
+        sent(13, "needle/controller_status"),
         sent(11, "needle/estimate", stamp=7),
     ]
-    assert all(h.time >= h.log_time for h in as_heard(messages, "/rig/"))
-    assert order(*messages)[0] == "result"
+    assert all(heard.time >= heard.log_time for heard in as_heard(messages, "/rig/"))

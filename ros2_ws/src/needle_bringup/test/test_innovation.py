@@ -9,6 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from needle_bringup.bag_hearing import unheard_tips
 from needle_bringup.bag_reader import Run, Series, Status
 from needle_bringup.innovation import gate_room, innovations, missed_tips, refused_tips
 
@@ -134,6 +135,10 @@ def test_refused_and_missed_tips_are_found() -> None:
     ]
     nothing = np.tile(np.eye(3).ravel() * 1e-8, (STEPS + 1, 1))
     nothing[[3, 4]] = np.inf
-    run = make_run(controller_status=statuses, tip_covariances=series(nothing))
+    whole = make_run(controller_status=statuses, tip_covariances=series(nothing))
+    used = ~np.isin(whole.estimate.stamps, [6 * 10**9, 7 * 10**9, 9 * 10**9])
+    estimate = Series(*(part[used] for part in dataclasses.astuple(whole.estimate)))
+    run = dataclasses.replace(whole, estimate=estimate)
     assert refused_tips(run).tolist() == [7 * 10**9, 9 * 10**9]
     assert missed_tips(run).tolist() == [3 * 10**9, 4 * 10**9]
+    assert unheard_tips(run) == {6 * 10**9}
