@@ -43,7 +43,7 @@ def full_rate(bench: Workbench, duration: float = DURATION) -> Iterator[Finding]
     """Record stereo at 2 x 30 Hz with everything else while both cores are busy."""
     seen = record_full_rate(bench.folder, duration)
     yield from _rate_findings(seen, duration)
-    yield from _reader_findings("full_rate", seen.bag)
+    yield from bag_findings("full_rate", seen.bag)
 
 
 def _rate_findings(seen: FullRate, duration: float) -> Iterator[Finding]:
@@ -142,10 +142,11 @@ def disk_full(bench: Workbench) -> Iterator[Finding]:
 
 def bag_format(bench: Workbench) -> Iterator[Finding]:
     """Look at a run's bag with rosbags, mcap and rosbag2's own rules."""
-    yield from _reader_findings("bag_format", bench.run("disk_usual", "--seed", "41").bag)
+    yield from bag_findings("bag_format", bench.run("disk_usual", "--seed", "41").bag)
 
 
-def _reader_findings(key: str, bag: Path) -> Iterator[Finding]:
+def bag_findings(key: str, bag: Path) -> Iterator[Finding]:
+    """Look at a bag with rosbags, mcap and rosbag2's own rules."""
     why = unreadable(bag)
     yield Finding(
         f"{key}_readers", "rosbags and mcap read the bag", "all messages", why or "all", not why
