@@ -392,6 +392,9 @@ class Cia402Axis(Axis):
         )
         self._machine.begin_anew(self.monitor.feedback)
         self._velocity = 0.0
+        if self._machine.state in FAULTS and access.has(od.ERROR_CODE):
+            # A fault from before has sent its message to nobody.
+            self.monitor.emergency = access.read(od.ERROR_CODE) or None
 
     def _switch_off_now(self) -> None:
         """Run cycles of its own until the drive is off: nobody else will."""

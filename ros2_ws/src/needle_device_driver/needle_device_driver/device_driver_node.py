@@ -51,6 +51,7 @@ PERIOD = PERIOD_NS / NANOSECONDS
 # On a running clock the next cycle must come; a simulated one waits for this one's answers.
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
+_HELD_UP = 2.5 * PERIOD
 _LATE = 1.5 * PERIOD
 
 
@@ -95,6 +96,7 @@ class DeviceDriverNode(LifecycleNode):
         self._retry_at = 0.0
         self._cycle_ns: int | None = None
         self._cycled_at: float | None = None
+        self._timed_at: float | None = None
         self._late_cycles = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
@@ -132,6 +134,7 @@ class DeviceDriverNode(LifecycleNode):
         if self._sim_time:
             # Simulated time may stand still; watchdogs do not.
             self._drives.beat()
+            self._hear_first()
             self._supervisor.observe(time.monotonic())
             self._device.report()
             return
@@ -142,6 +145,13 @@ class DeviceDriverNode(LifecycleNode):
         self._late_cycles += self._cycled_at is not None and now - self._cycled_at > _LATE
         self._cycled_at = now
         self._cycle(self.get_clock().now().nanoseconds, _REPLY_WAIT)
+
+    def _hear_first(self) -> None:
+        """After a hold-up of this process, hear what has come meanwhile before judging by it."""
+        now, before = time.monotonic(), self._timed_at
+        self._timed_at = now
+        if before is not None and now - before > _HELD_UP:
+            self._drives.hear(now, 2.0 * PERIOD)
 
     def _on_clock(self, message: Clock) -> None:
         ros_ns = to_nanoseconds(message.clock)

@@ -56,6 +56,13 @@ class DriveCycle:
             except LinkError:
                 return
 
+    def hear(self, since: float, wait: float) -> None:
+        """Wait, at most so long [s], until every drive was heard `since` then [s]."""
+        with self._link.arrival:
+            self._link.arrival.wait_for(
+                lambda: all(axis.monitor.fresh_time >= since for axis in self._axes), wait
+            )
+
     def exchange(self, wait: float) -> None:
         """Run one cycle.
 

@@ -481,3 +481,19 @@ def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fres
     bench.supervisor.observe(bench.clock())
     assert bench.axes[1].poll(bench.clock()).time > bench.clock() - 0.1
     assert bench.supervisor.joints(bench.clock()) is None
+
+
+def test_drive_watchdog_that_tripped_before_the_start_is_told_at_the_start(
+    drive_bench: Bench,
+) -> None:
+    bench = drive_bench
+    bench.insertion.fail(0x8130)
+    bench.insertion.out.clear()
+    bench.supervisor.configure(bench.clock())
+    assert in_state(bench, State.FAULT)
+    assert bench.notices[-1].rule is Rule.DRIVE_WATCHDOG
+    assert "insertion axis: the drive reports 0x8130" in bench.status.fault
+    assert bench.insertion.state == "fault"
+    assert bench.supervisor.reset(bench.clock()).success
+    bench.cycle(3)
+    assert in_state(bench, State.DISABLED)
