@@ -12,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 
 from needle_bringup.drive_hand_node import INSERTION_COUNT, ROTATION_COUNT, DriveHand
 from needle_bringup.drive_processes import DriveProcesses
+from needle_bringup.rig_configuration import PATIENT_WATCHDOG
 from needle_common.conversions import RELIABLE, to_stamp
 
 TICK_NS = 20_000_000
@@ -89,6 +90,8 @@ def random_steps(folder: Path, domain: int, count: int, seed: int) -> dict[str, 
             "device_driver": {
                 "use_sim_time": True,
                 "lock_step": True,
+                "watchdog": PATIENT_WATCHDOG,
+                "reply_age_limit": PATIENT_WATCHDOG,
                 "retraction_speed": _FAST,
             },
         },
@@ -135,7 +138,15 @@ class _RandomSteps:
     def prepare(self) -> None:
         """Home, enable, press."""
         hand = self._hand
-        hand.until(lambda: hand.ready() and self.time.matched(), "the driver", 60.0)
+        hand.until(
+            lambda: (
+                hand.ready()
+                and self.time.matched()
+                and hand.status.get("state") not in (None, "UNCONFIGURED")
+            ),
+            "the driver",
+            60.0,
+        )
         self.time.tick()
         hand.insist("confirm_needle_out", True)
         hand.insist("home")
