@@ -15,8 +15,12 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from needle_bringup.bag_metadata import OfferedQos
 
-# rosbag2 plays with this depth where DDS did not tell the publisher's.
-UNKNOWN_DEPTH = 10
+IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
+# DDS does not tell a publisher's depth. What late joiners get of a latched topic; and what a
+# subscriber that is busy for a moment may have waiting.
+UNKNOWN_LATCHED_DEPTH = 10
+UNKNOWN_IMAGE_DEPTH = 30
+UNKNOWN_DEPTH = 500
 
 
 def offered_qos(offer: TopicEndpointInfo) -> OfferedQos:
@@ -53,20 +57,23 @@ def strictest_request(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSPro
     )
 
 
-def recorded_offer(offers: Sequence[OfferedQos]) -> QoSProfile:
+def recorded_offer(type_name: str, offers: Sequence[OfferedQos]) -> QoSProfile:
     """Return the offer that serves whoever was served by the recorded ones.
 
     One recorded offer is given as it was. Of several, the stronger of each policy: it matches
     every request that one of them matched.
     """
+    unknown_depth = UNKNOWN_IMAGE_DEPTH if type_name in IMAGE_TYPES else UNKNOWN_DEPTH
     if not offers:
-        return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=UNKNOWN_DEPTH)
+        return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=unknown_depth)
     keep_all = any(offer.history == "keep_all" for offer in offers)
     reliable = any(offer.reliability != "best_effort" for offer in offers)
     latched = any(offer.durability == "transient_local" for offer in offers)
+    if latched:
+        unknown_depth = UNKNOWN_LATCHED_DEPTH
     return QoSProfile(
         history=HistoryPolicy.KEEP_ALL if keep_all else HistoryPolicy.KEEP_LAST,
-        depth=max(offer.depth for offer in offers) or UNKNOWN_DEPTH,
+        depth=max(offer.depth for offer in offers) or unknown_depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
         lifespan=Duration(nanoseconds=max(offer.lifespan for offer in offers)),

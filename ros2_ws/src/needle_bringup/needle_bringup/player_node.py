@@ -145,7 +145,9 @@ class Player(Node):
             topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
         )
         publisher = self.create_publisher(
-            _message_class(topic.type_name), name, recorded_offer(topic.offered_qos)
+            _message_class(topic.type_name),
+            name,
+            recorded_offer(topic.type_name, topic.offered_qos),
         )
         # Remappings of the ROS command line come after ours.
         final = publisher.topic_name

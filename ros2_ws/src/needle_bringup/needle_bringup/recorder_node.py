@@ -26,7 +26,7 @@ from needle_bringup.allocator import keep_freed_memory
 from needle_bringup.bag_files import recover_hint
 from needle_bringup.bag_metadata import BagTopic
 from needle_bringup.bag_writer import COMPRESSIONS
-from needle_bringup.conversions import offered_qos, strictest_request
+from needle_bringup.conversions import IMAGE_TYPES, offered_qos, strictest_request
 from needle_bringup.free_space import megabytes
 from needle_bringup.message_definitions import full_definition
 from needle_bringup.message_loss import SequenceGaps
@@ -61,7 +61,6 @@ GRAPH_TIME = 0.05
 # All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
 DEPTH = 5000
 IMAGE_DEPTH = 60
-IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
 LAST_WORDS_LIMIT = 1.0
