@@ -7,36 +7,31 @@ from needle_device_driver.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402 import (
     FAULTS,
-    FOLLOWING_ERROR,
     POWERED,
     START_HOMING,
     DriveCommand,
     Goal,
     Mode,
-    drive_state,
 )
+from needle_device_driver.drive_fault import Fault, drive_fault
 from needle_device_driver.drive_machine import LONGEST_REST, DriveMachine
 from needle_device_driver.drive_monitor import DriveMonitor
 from needle_device_driver.drive_settings import HERE, DriveSettings
 from needle_device_driver.drive_setup import (
     arm_watchdog,
+    await_operational,
     disarm_watchdog,
+    reset_fault,
     set_up,
     write_homing,
     write_limits,
 )
-from needle_device_driver.emergency import HEARTBEAT_LOST, describe_error
 from needle_device_driver.homing_run import HomingRun, HomingStep
 from needle_device_driver.object_access import DriveError, ObjectAccess, send_heartbeat
 from needle_device_driver.rules import Rule
 
-# In seconds.
-_HEARTBEAT_WAIT = 0.3
-_FAULT_RESET_WAIT = 1.0
 # In cycles without an answer: a drive that is switched off at the end is given up.
 _SILENT = 5
-
-Fault = tuple[Rule, str]
 
 
 class Cia402Axis(Axis):
@@ -185,10 +180,14 @@ class Cia402Axis(Axis):
         self._homing = None
         try:
             self._link.open()
-            survived = self._await_operational() and not self.monitor.rebooted
+            survived = (
+                await_operational(self._link, self.monitor, self._period)
+                and not self.monitor.rebooted
+            )
             if not survived or self._opening != self._link.openings:
                 self._set_up(survived=survived)
-            self._reset_fault()
+            self.monitor.emergency = None
+            reset_fault(self._access, self._link.clock)
             self._refresh()
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
@@ -308,29 +307,12 @@ class Cia402Axis(Axis):
         return limit | od.HOME_SWITCH
 
     @property
-    def _fault(self) -> Fault | None:  # noqa: PLR0911 - each return is a fault
+    def _fault(self) -> Fault | None:
         if not self._configured:
             return None
         if self._link.lost:
             return Rule.LINK_LOSS, self._link.lost
-        monitor, machine = self.monitor, self._machine
-        if monitor.rebooted:
-            return Rule.DRIVE_REBOOT, "the drive rebooted; its home position is lost"
-        code = monitor.emergency
-        if code is not None:
-            rule = Rule.DRIVE_WATCHDOG if code == HEARTBEAT_LOST else Rule.DRIVE_EMERGENCY
-            return rule, f"the drive reports {describe_error(code)}"
-        if machine.state in FAULTS and self.actuated:
-            return Rule.DRIVE_EMERGENCY, f"the drive is in {machine.state.name}"
-        if monitor.left_operational:
-            return Rule.DRIVE_REBOOT, "the drive left the operational state"
-        if machine.trouble:
-            return Rule.ONE_FAULT_STOPS_BOTH, f"the drive {machine.trouble}"
-        if self._homing is not None and self._homing.step is HomingStep.FAILED:
-            return Rule.ONE_FAULT_STOPS_BOTH, "the drive reports that homing failed"
-        if machine.ready and machine.at.statusword & FOLLOWING_ERROR:
-            return Rule.FOLLOWING_ERROR, "the drive reports a following error"
-        return None
+        return drive_fault(self.monitor, self._machine, self._homing, actuated=self.actuated)
 
     def _refuse_fault(self) -> None:
         if not self._configured:
@@ -351,35 +333,12 @@ class Cia402Axis(Axis):
             self._origin += 1
         self.monitor.begin_set_up()
         self.lacking = set_up(self._link, self._settings, period=self._period, homed=self._homed)
-        if not self._await_operational():
+        if not await_operational(self._link, self.monitor, self._period):
             raise DriveError(f"node {self._settings.node_id} did not become operational")
         arm_watchdog(self._link, self._settings, self._watchdog)
         self.monitor.end_set_up()
         self._opening = self._link.openings
         self._refresh()
-
-    def _await_operational(self) -> bool:
-        until = self._link.clock() + _HEARTBEAT_WAIT
-        while self._link.clock() < until:
-            send_heartbeat(self._link)
-            if self.monitor.await_operational(self._period):
-                return True
-        return False
-
-    def _reset_fault(self) -> None:
-        access = self._access
-        self.monitor.emergency = None
-        if drive_state(access.read(od.STATUSWORD)) not in FAULTS:
-            return
-        # The rising edge counts.
-        access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-        access.write(od.CONTROLWORD, DriveCommand.FAULT_RESET)
-        until = self._link.clock() + _FAULT_RESET_WAIT
-        while drive_state(access.read(od.STATUSWORD)) in FAULTS:
-            if self._link.clock() > until:
-                code = describe_error(access.read(od.ERROR_CODE))
-                raise DriveError(f"the drive does not leave its fault: {code}")
-        access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
 
     def _refresh(self) -> None:
         """Ask for what the next SYNC would bring, and forget what was before."""

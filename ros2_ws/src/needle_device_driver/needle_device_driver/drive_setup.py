@@ -2,21 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from needle_device_driver import objects as od
 from needle_device_driver.can_link import CanLink
 from needle_device_driver.cia402 import (
+    FAULTS,
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
     SUPPORTS_HOMING,
     DriveCommand,
     drive_state,
 )
+from needle_device_driver.drive_monitor import DriveMonitor
 from needle_device_driver.drive_settings import DriveSettings
-from needle_device_driver.object_access import DriveError, ObjectAccess
+from needle_device_driver.emergency import describe_error
+from needle_device_driver.object_access import DriveError, ObjectAccess, send_heartbeat
 from needle_device_driver.objects import Pdo
 
 # Milliseconds between a drive's heartbeats: well inside the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
+# In seconds.
+_HEARTBEAT_WAIT = 0.3
+_FAULT_RESET_WAIT = 1.0
 
 
 # A rule depends on these: what the drive made of them is read back.
@@ -91,6 +99,46 @@ def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> Non
         ObjectAccess(link, settings.node_id).write_checked(
             od.CONSUMER_HEARTBEAT, od.MASTER_NODE_ID << 16 | round(watchdog * 1e3)
         )
+
+
+def await_operational(link: CanLink, monitor: DriveMonitor, period: float) -> bool:
+    """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
+    until = link.clock() + _HEARTBEAT_WAIT
+    while link.clock() < until:
+        send_heartbeat(link)
+        if monitor.await_operational(period):
+            return True
+    return False
+
+
+def reset_fault(access: ObjectAccess, clock: Callable[[], float]) -> None:
+    """Acknowledge a drive's fault and wait until it is gone; moves nothing.
+
+    Parameters
+    ----------
+    access : ObjectAccess
+        The drive.
+    clock : callable
+        Steady time [s].
+
+    Raises
+    ------
+    DriveError
+        If the drive does not answer, or stays in its fault.
+    LinkError
+        If the link is lost.
+    """
+    if drive_state(access.read(od.STATUSWORD)) not in FAULTS:
+        return
+    # The rising edge counts.
+    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    access.write(od.CONTROLWORD, DriveCommand.FAULT_RESET)
+    until = clock() + _FAULT_RESET_WAIT
+    while drive_state(access.read(od.STATUSWORD)) in FAULTS:
+        if clock() > until:
+            code = describe_error(access.read(od.ERROR_CODE))
+            raise DriveError(f"the drive does not leave its fault: {code}")
+    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
 
 
 def disarm_watchdog(link: CanLink, settings: DriveSettings) -> None:
