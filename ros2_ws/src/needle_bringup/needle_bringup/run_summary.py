@@ -63,7 +63,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "wall_s": wall_s,
         "watchdog_trips": watchdog_trips(run),
         "state": run.last_status("state"),
-        "reason": run.last_status("reason"),
+        "reason": run.recording.get("recording_ended") or run.last_status("reason"),
         "commit": run.commit,
         "bag": str(run.path),
     }
