@@ -1,9 +1,10 @@
 """The nodes that run beside a rig's own cameras and drives; for ROS 2 Jazzy with `ros2 launch`.
 
-    ros2 launch needle_bringup rig.launch.py calibration:=/path/calibration.yaml bag:=bags/today
+    ros2 launch needle_bringup rig.launch.py calibration:=FILE drives:=FILE bag:=DIR
 
-Starts tracker, controller and recorder. The cameras, the drives and the person's hold switch come
-from elsewhere: nothing in here moves a needle by itself.
+Starts tracker, controller and recorder, and the driver where `drives` names its configuration
+(docs/hardware.md). The cameras and the person's hold switch come from elsewhere: nothing in here
+moves a needle by itself.
 """
 
 from pathlib import Path
@@ -33,6 +34,16 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
             DeclareLaunchArgument(
                 "params", default_value=rig, description="parameter file on top of rig.yaml"
+            ),
+            DeclareLaunchArgument(
+                "drives", default_value="", description="the drives' parameter file; empty: none"
+            ),
+            Node(
+                package="needle_device_driver",
+                executable="device_driver",
+                parameters=[LaunchConfiguration("drives")],
+                output="screen",
+                condition=LaunchConfigurationNotEquals("drives", ""),
             ),
             Node(
                 package="needle_bringup",

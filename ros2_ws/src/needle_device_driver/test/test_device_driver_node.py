@@ -450,6 +450,23 @@ def test_the_lifecycle_ends_in_switched_off_drives_and_begins_again(make_rig: Ma
     assert rig.driver.ended
 
 
+def test_its_end_in_the_middle_of_a_step_leaves_the_drives_off(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.ready()
+    message = rig.message(duration=1.0)
+    rig.partner.commands.publish(message)
+    rig.until(lambda: rig.partner.status["state"] == "MOVING", "step")
+    rig.tick(5)
+    rig.driver.close()
+    at = rig.positions
+    assert [drive.state for drive in rig.peer.drives] == ["disabled"] * 2
+    assert all(drive.objects[0x1016, 1] == bytes(4) for drive in rig.peer.drives)
+    rig.until(lambda: bool(rig.partner.results), "result")
+    assert rig.partner.results[-1].stamp == message.header.stamp
+    assert rig.partner.results[-1].frame_id.startswith("aborted: ")
+    assert rig.positions == at
+
+
 def test_without_autostart_nothing_is_configured_until_it_is_asked_for(make_rig: Make) -> None:
     rig = make_rig(autostart=False)
     rig.matched()
