@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from needle_bringup.tracker_sequences import Exposure, insertion_sequence
 from needle_tracker.calibration import StereoCalibration, load_calibration
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import StereoTracker, default_settings
+from needle_tracker.tracker import StereoTracker
+from needle_tracker.tracker_settings import default_settings
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,8 @@ from needle_tracker.calibration import StereoCalibration
 from needle_tracker.insertion_history import InsertionHistory
 from needle_tracker.pairing import Pair, PairMatcher
 from needle_tracker.pre_bend import heading_of
-from needle_tracker.tracker import Measurement, StereoTracker, TrackerSettings
+from needle_tracker.tracker import Measurement, StereoTracker
+from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 
 _NEW_RECORDING = 1_000_000_000  # [ns]: a longer step back in time begins a new recording

@@ -7,10 +7,10 @@ import dataclasses
 from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_tracker.calibration import Phantom
+from needle_tracker.gates import GateSettings
 from needle_tracker.pair_answers import AnsweringSettings
 from needle_tracker.search_grid import Reach
-from needle_tracker.track import GateSettings
-from needle_tracker.tracker import TrackerSettings
+from needle_tracker.tracker_settings import TrackerSettings
 
 
 @dataclasses.dataclass(frozen=True)

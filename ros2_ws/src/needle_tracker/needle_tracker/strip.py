@@ -28,6 +28,8 @@ LINE_WIDTHS = 8.7  # the middle line is fitted to so much of the shaft's end
 LEAST_ROWS = 10
 _SMOOTH_ROWS = 4  # either way, of the light beside the needle
 _NOISE_FLOOR = 0.7  # [grey levels]
+# So many of the rows, so close together, say how dark the needle is.
+_ALIKE_SHARE, _ALIKE_SPREAD, _ALIKE_MARGIN = 0.4, 1.6, 0.2
 
 
 @compiled
@@ -307,8 +309,23 @@ def needle_level(
         for j in range(reach - near, reach + near + 1):
             part[i - first] += STEP_PX * darkness[i, j]
     part.sort()
-    # Glints only take mass away: the level is above the middle.
-    level = part[int(0.6 * len(part))]
+    # Many rows agree where the needle is plain to see; of two such levels the darker, since glints
+    # take more away than shadows add.
+    size = max(int(_ALIKE_SHARE * len(part)), 1)
+    least = part[-1] - part[0]
+    for i in range(len(part) - size + 1):
+        least = min(least, part[i + size - 1] - part[i])
+    start = 0
+    for i in range(len(part) - size + 1):
+        if part[i + size - 1] - part[i] <= _ALIKE_SPREAD * least:
+            start = i
+    middle = part[start + size // 2]
+    level, count = 0.0, 0
+    for i in range(len(part)):
+        if abs(part[i] - middle) <= _ALIKE_MARGIN * abs(middle):
+            level += part[i]
+            count += 1
+    level /= max(count, 1)
     if hint > 0.0:
         level = min(max(level, 0.7 * hint), 1.3 * hint)
     return level if level > 4.0 * noise * math.sqrt(width) else 0.0

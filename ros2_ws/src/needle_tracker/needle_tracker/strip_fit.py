@@ -25,6 +25,7 @@ from needle_tracker.strip import (
     row_masses,
     straight_line,
 )
+from needle_tracker.strip_end import edge_fall, find_end, taper_beyond
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -35,81 +36,6 @@ _AGREE_PX = 0.7  # what agrees with a line [px]
 _VOTE_STEP_PX = 0.3
 _SHIFTS, _TILTS = 9, 8
 _ROWS_ALIKE = 3.0
-_NEEDLE_MASS = 0.62  # what a shadow on the floor does not have
-_FAINT_DOUBT = 0.3
-
-
-@compiled
-def find_end(
-    mass: Array, behind: int, prior: float, prior_sigma: float
-) -> tuple[float, float, float]:
-    """Return where the mass falls to half its level for good.
-
-    Every row votes for "needle" or "beyond its end" by how far its mass is from half the level;
-    a prediction votes as well. A stretch that a glint or a bubble hides is bridged.
-
-    Parameters
-    ----------
-    mass : ndarray, shape (rows,)
-        From `row_masses`.
-    behind : int
-        Row of the strip's middle.
-    prior, prior_sigma : float
-        Predicted end [px from the middle]; `prior_sigma` 0: none.
-
-    Returns
-    -------
-    along : float
-        The end [px from the middle]; NaN where there is none.
-    before, after : float
-        Mean mass just inside and just outside the end: 1 and 0 for a clear end. What is faint and
-        even beyond the end counts for little.
-    """
-    rows = len(mass)
-    nothing = (np.nan, 0.0, 0.0)
-    smooth = np.empty(rows)
-    for i in range(rows):
-        first, last = max(i - 1, 0), min(i + 1, rows - 1)
-        total = 0.0
-        for k in range(first, last + 1):
-            total += mass[k]
-        smooth[i] = total / (last - first + 1)
-    best, largest, votes = -1, -1e30, 0.0
-    for i in range(rows - 1):
-        votes += min(max(smooth[i] - _NEEDLE_MASS, -0.5), 0.5)
-        value = votes
-        if prior_sigma > 0.0:
-            far = (i + 0.5 - behind - prior) / prior_sigma
-            value -= 0.5 * far * far
-        if value > largest and smooth[i] >= _NEEDLE_MASS > smooth[i + 1]:
-            best, largest = i, value
-    if best < LEAST_ROWS - 2:
-        return nothing
-    # The level next to the end: light and focus may differ along the shaft.
-    part = np.sort(mass[max(best - 16, 0) : max(best - 2, 1)])
-    level = part[len(part) // 2]
-    if not 0.75 < level < 1.35:
-        level = 1.0
-    # Beyond the end there may be something fainter, such as the needle's own shadow.
-    part = np.sort(mass[min(best + 4, rows - 4) : min(best + 11, rows)])
-    beyond = part[len(part) // 2]
-    half = 0.5 * (level + min(max(beyond, 0.0), _NEEDLE_MASS))
-    i = best
-    while i > 0 and smooth[i] < half:
-        i -= 1
-    while i < rows - 2 and smooth[i + 1] >= half:
-        i += 1
-    if smooth[i] <= smooth[i + 1]:
-        return nothing
-    along = i - behind + (smooth[i] - half) / (smooth[i] - smooth[i + 1])
-    before = after = 0.0
-    size = 4
-    for k in range(size):
-        before += mass[max(i - 2 - k, 0)] / level / size
-        after += mass[min(i + 4 + k, rows - 1)] / level / size
-    if 0.0 < beyond < _NEEDLE_MASS:
-        after = max(abs(after - beyond / level), _FAINT_DOUBT * beyond / level)
-    return along, before, after
 
 
 @compiled
@@ -291,7 +217,8 @@ def fit_strip(
         stop = float(last)
         shift = a + b * stop
     prior = 0.0
-    along = line = slope = sigma_line = sigma_slope = level = noise = before = after = 0.0
+    along = line = slope = sigma_line = sigma_slope = level = noise = before = after = fall = 0.0
+    doubt = sigma_end = 0.0
     count = 0
     for _ in range(3):
         scale = math.sqrt(1.0 + b * b)
@@ -312,10 +239,10 @@ def fit_strip(
         if level <= 0.0:
             return -2
         mass = row_masses(darkness, width, level)
-        along, before, after = find_end(mass, behind, prior, prior_sigma)
+        along, before, after, fall = find_end(mass, behind, prior, prior_sigma)
         if prior_sigma > 0.0 and not abs(along - prior) <= 3.0 * prior_sigma:
             # No end where it must be: hidden. The line is good for something all the same.
-            along, before, after = prior, 0.0, 1.0
+            along, before, after, fall = prior, 0.0, 1.0, 0.0
         if not math.isfinite(along):
             return -1
         line, slope, sigma_line, sigma_slope, count = middle_line(
@@ -323,7 +250,10 @@ def fit_strip(
         )
         if count == 0:
             return -3
-        stop, shift, b = along, line, slope
+        sigma_end = 2.3 * noise * math.sqrt(width + 4.0) / level
+        edge = edge_fall(darkness, behind, along, line, slope)
+        beyond, doubt = taper_beyond(fall, edge, sigma_end)
+        stop, shift, b = along + beyond, line + slope * beyond, slope
         if abs(along) < 3.0 and abs(line) < 0.5 and abs(slope) < 0.02:
             break
     scale = math.sqrt(1.0 + b * b)
@@ -332,7 +262,7 @@ def fit_strip(
     result[2] = (direction[0] - b * direction[1]) / scale
     result[3] = (direction[1] + b * direction[0]) / scale
     result[4] = sigma_line
-    result[5] = 1.5 * noise * math.sqrt(width + 4.0) / level
+    result[5] = math.hypot(sigma_end, doubt)
     result[6] = sigma_slope
     result[7] = level / width
     result[8] = before

@@ -15,8 +15,9 @@ from needle_tracker.strip_fit import fit_strip
 Array = NDArray[np.float64]
 
 _LINE_SYSTEMATIC_PX = 0.018  # what calibration and the needle's bend leave in the line
-_END_SYSTEMATIC_PX = 0.045  # bevel, blur, light: where "half" is
-_HIDDEN_END_PX = 25.0  # an end that cannot be seen is as good as unknown
+_END_SYSTEMATIC_PX = 0.13  # bevel, blur, light: where "half" is
+# An end that cannot be seen is hardly known; but the line is the needle's near that place only.
+_HIDDEN_END_PX = 8.0
 _END_DOUBT_PX = 4.5  # for each unit of mass too little before, or left after, the end
 _SOUND_END = 0.02
 _HIDDEN_FACTOR = 3.0  # what hides the end is beside the line too

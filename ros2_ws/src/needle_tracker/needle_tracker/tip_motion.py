@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 _DRIFT = 0.02e-3  # what moves from pair to pair at rest [m]
 _LEAN_SIGMA = 0.12  # between the visible end and the heading (pre-bend) [rad]
 # What spoils a view spoils the next one's too: the gain is not all believed.
-_ALIKE = 0.25
+_ALIKE = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,12 +67,21 @@ class TipMotion:
         off = tip.position - self.position
         return float(off @ np.linalg.solve(self.covariance[:3, :3] + tip.covariance, off))
 
+    def merged(self, tip: SpatialTip) -> SpatialTip:
+        """Return a measured tip merged with this state."""
+        motion = self.updated(tip)
+        return dataclasses.replace(
+            tip, position=motion.position, covariance=motion.covariance[:3, :3].copy()
+        )
+
     def updated(self, tip: SpatialTip) -> TipMotion:
         """Return the state with a measured tip taken in."""
         gain = self.covariance[:, :3] @ np.linalg.inv(self.covariance[:3, :3] + tip.covariance)
         change = gain @ (tip.position - self.position)
         covariance = self.covariance - gain @ self.covariance[:3, :]
-        covariance[:3, :3] = (1.0 - _ALIKE) * covariance[:3, :3] + _ALIKE * tip.covariance
+        # K (1 - K): most where prediction and measurement count alike.
+        gain = gain[:3]
+        covariance[:3, :3] += _ALIKE * (np.eye(3) - gain) @ gain @ covariance[:3, :3]
         return TipMotion(
             self.position + change[:3],
             self.heading + change[3:],

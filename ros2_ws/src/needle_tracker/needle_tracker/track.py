@@ -1,4 +1,4 @@
-"""Whether a measured tip is believed: physical gates, and the track's state.
+"""Whether a measured tip is believed: the gates, the prediction, and the track's state.
 
 Nothing here looks at images: measured tips and insertions come in as arguments, decisions go out as
 data.
@@ -8,19 +8,16 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.search_grid import Reach
+from needle_tracker.gates import GateSettings, refusal
 from needle_tracker.tip_motion import TipMotion
 from needle_tracker.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
-DISAGREE_ALONG = "views disagree along the needle"
-UNCERTAIN = "too uncertain"
 TOO_FAR = "too far from the last tip"
 _HEADING_TOLERANCE = 0.12  # [rad]
 _HIDDEN_PER_LOST = 4
@@ -39,55 +36,6 @@ class TrackState(enum.Enum):
     TRACKING = "TRACKING"
     LOST = "LOST"  # was tracked and is not seen; found again only where it can have got to
     ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
-
-
-@dataclasses.dataclass(frozen=True)
-class GateSettings:
-    """Bounds that a believed tip keeps.
-
-    Attributes
-    ----------
-    reach : Reach
-        What the needle can do.
-    surface_height : float
-        x of the phantom's surface [m].
-    least_distance : float
-        Least distance from the entry at which a tip can be seen [m].
-    tip_lean : float
-        Largest angle between the visible end and the path (pre-bend) [rad].
-    insertion_margin : float
-        Tolerance between tip and insertion [m].
-    step_margin : float
-        Tolerance of the tip against where the last one and the insertion have it [m].
-    free_step : float
-        Largest move per pair where the insertion is not known [m].
-    max_disagreement : float
-        Largest disagreement of the views along the needle [m].
-    max_miss_px : float
-        Largest distance of the tip from the image lines [px].
-    max_depth_sigma : float
-        Largest standard deviation in any direction [m].
-    confirm_pairs : int
-        Successive pairs that agree before a tip is believed without a known insertion.
-    lost_after : int
-        Successive pairs without a believed tip until the track is lost.
-    forget_after : int
-        Successive pairs without a believed tip until the last place no longer counts.
-    """
-
-    reach: Reach
-    surface_height: float
-    least_distance: float
-    tip_lean: float
-    insertion_margin: float
-    step_margin: float
-    free_step: float
-    max_disagreement: float
-    max_miss_px: float
-    max_depth_sigma: float
-    confirm_pairs: int
-    lost_after: int
-    forget_after: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,53 +58,6 @@ class Anchor:
     insertion: float | None
     ahead: float = 0.0
     known: bool = False
-
-
-def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) -> str | None:
-    """Return why a measured tip cannot be the needle's, None where it can.
-
-    Parameters
-    ----------
-    tip : SpatialTip
-        Measured tip in `rig`.
-    insertion : float or None
-        Length of needle in the phantom at the exposure [m], None where unknown.
-    settings : GateSettings
-        The bounds.
-
-    Returns
-    -------
-    str or None
-        Short reason, the same for the same gate (it is counted by).
-    """
-    reach, margin = settings.reach, settings.insertion_margin
-    distance = max(float(np.linalg.norm(tip.position)), 1e-9)
-    largest_sigma = math.sqrt(float(np.linalg.eigvalsh(tip.covariance)[-1]))
-    path_length = distance if insertion is None else max(insertion, distance)
-    # Steered ever the same way, and a little more for what the margins leave open.
-    largest_turn = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
-    checks = [
-        (tip.disagreement > settings.max_disagreement, DISAGREE_ALONG),
-        (tip.disagreement_across > settings.max_miss_px, "views disagree across the needle"),
-        (largest_sigma > settings.max_depth_sigma, UNCERTAIN),
-        (tip.position[0] > settings.surface_height, "above the surface"),
-        (distance < settings.least_distance, "too close to the entry"),
-        (distance > reach.length + margin, "beyond the longest insertion"),
-        (
-            _angle_to_z(tip.position / distance) > float(reach.chord_angle(np.array(distance))),
-            "outside the reachable cone",
-        ),
-        (_angle_to_z(tip.direction) > largest_turn, "direction not reachable"),
-    ]
-    if insertion is not None:
-        shortest = reach.shortest_chord(insertion)
-        checks.append((distance > insertion + margin, "farther than the insertion"))
-        checks.append((distance < shortest - margin, "short of the insertion"))
-    return next((reason for failed, reason in checks if failed), None)
-
-
-def _angle_to_z(unit: Array) -> float:
-    return math.acos(min(max(float(unit[2]), -1.0), 1.0))
 
 
 class Track:
@@ -210,18 +111,23 @@ class Track:
         return Anchor(motion, insertion, ahead, known)
 
     def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
-        """Return why a measured tip is not believed, None where it passes all gates."""
-        reason = refusal(tip, insertion, self._settings)
-        if reason is None and self.anchor is not None:
-            predicted = self.predict(insertion)
-            if predicted is not None:
-                miss = float(np.linalg.norm(tip.position - predicted.motion.position))
-                if miss > self.tolerance(predicted):
-                    return TOO_FAR
-                following = predicted.known and self.state is TrackState.TRACKING
-                if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
-                    return "too far from the prediction"
-        return reason
+        """Return why a measured tip is not believed, None where it passes all gates.
+
+        While the needle is followed, what is judged is what would be believed: the tip merged with
+        its prediction. What one view says alone is then enough if the prediction says the rest.
+        """
+        predicted = self.predict(insertion)
+        following = predicted is not None and predicted.known and self.state is TrackState.TRACKING
+        merged = predicted.motion.merged(tip) if predicted is not None and following else tip
+        reason = refusal(merged, insertion, self._settings)
+        if reason is not None or predicted is None:
+            return reason
+        miss = float(np.linalg.norm(merged.position - predicted.motion.position))
+        if miss > self.tolerance(predicted):
+            return TOO_FAR
+        if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
+            return "too far from the prediction"
+        return None
 
     def accept(
         self,
@@ -264,9 +170,7 @@ class Track:
         motion = TipMotion.start(tip)
         if predicted is not None and predicted.known and not anew:
             motion = predicted.motion.updated(tip)
-            tip = dataclasses.replace(
-                tip, position=motion.position, covariance=motion.covariance[:3, :3].copy()
-            )
+            tip = predicted.motion.merged(tip)
         self.anchor = Anchor(motion, insertion)
         return tip if self.state is TrackState.TRACKING else None
 
@@ -344,32 +248,3 @@ class Track:
         ahead = abs(predicted.ahead)
         bend = 0.5 * settings.reach.curvature * ahead * ahead
         return settings.step_margin + _HEADING_TOLERANCE * ahead + bend
-
-
-def tip_at_entry(insertion: float, hole_tolerance: float, entry_angle: float) -> SpatialTip:
-    """Return the tip of a needle that is too short to be seen.
-
-    Parameters
-    ----------
-    insertion : float
-        Length of needle beyond the entry point [m].
-    hole_tolerance : float
-        Standard deviation of the path's place at the entry [m].
-    entry_angle : float
-        Standard deviation of the heading at the entry [rad].
-
-    Returns
-    -------
-    SpatialTip
-        On the z axis of `rig`, with the covariance that follows.
-    """
-    sideways = math.hypot(hole_tolerance, insertion * math.sin(entry_angle))
-    along = math.hypot(hole_tolerance, insertion * (1.0 - math.cos(entry_angle)))
-    return SpatialTip(
-        np.array([0.0, 0.0, insertion]),
-        np.diag([sideways**2, sideways**2, along**2]),
-        np.array([0.0, 0.0, 1.0]),
-        np.diag([entry_angle**2, entry_angle**2, 0.0]),
-        0.0,
-        0.0,
-    )

@@ -20,7 +20,8 @@ from needle_common.errors import OutOfBoundsError, UserError
 from needle_tracker.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import Measurement, StereoTracker, default_settings
+from needle_tracker.tracker import Measurement, StereoTracker
+from needle_tracker.tracker_settings import default_settings
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names

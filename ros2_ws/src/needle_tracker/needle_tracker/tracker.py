@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 
 import cv2
 import numpy as np
 
-from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
-from needle_tracker.compiled_projection import project_point
+from needle_tracker.calibration import SIDES, StereoCalibration
 from needle_tracker.detection import (
     DetectionSettings,
     Image,
@@ -24,107 +22,29 @@ from needle_tracker.detection import (
     find_paths,
     without_shadows,
 )
+from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, Follower, weighed
+from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
 from needle_tracker.refraction import RefractedCamera
-from needle_tracker.search_grid import Reach, SearchGrid, make_search_grid
+from needle_tracker.search_grid import SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
-from needle_tracker.tip_fit import Expected, ImageTip, fit_expected, fit_tip, hidden
-from needle_tracker.track import (
-    DISAGREE_ALONG,
-    TOO_FAR,
-    UNCERTAIN,
-    GateSettings,
-    Track,
-    TrackState,
-    tip_at_entry,
-)
+from needle_tracker.tip_fit import Expected, ImageTip, fit_tip, hidden
+from needle_tracker.track import TOO_FAR, Track, TrackState
+from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip, triangulate
 
 UNCLEAR = "not clear enough to begin with"
 HIDDEN = "the end is hidden in both images"
-_SIDEWAYS = 0.9e-3  # the strip reaches so far beside the prediction [m] ...
-_ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma) [m]
-# What both ends must keep to begin a track, and to begin it with the first pair [px].
-_SOUND_PX, _SOUND_ALONG_PX = 0.3, 1.0
-_CERTAIN_PX, _CERTAIN_ALONG_PX = 0.15, 0.6
+_SOUND_PX, _SOUND_ALONG_PX = 0.3, 1.0  # what both ends must keep to begin a track [px]
 _CONTRAST_RATIO = 2.2
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_RIVALS, _UNSOUND_RIVALS = 2, 3
-_FOLLOW_DIRECTLY = 6e-3  # up to here the prediction is as good as the strip is wide [m]
+_SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
+_CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
 _FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
 _GRID_AHEAD = 1.5e-3
+_DRAWN_SHARE, _DRAWN_POINTS = 0.3, 20  # of the longest insertion, to warm up on
 _GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
-
-
-@dataclasses.dataclass(frozen=True)
-class TrackerSettings:
-    """Everything that the tracker is told beside the calibration.
-
-    Attributes
-    ----------
-    gates : GateSettings
-        Bounds that a believed tip keeps.
-    needle_width : float
-        Diameter of the needle [m].
-    bright : bool or None
-        Whether it is brighter than its surroundings; None: found out.
-    min_contrast : float
-        Least contrast [grey levels].
-    noise_factor : float
-        Ridge threshold in standard deviations of the noise.
-    entry_zone : float
-        Insertion below which the needle is not looked for [m].
-    hole_clearance : float
-        Radius around the entry that is not looked at [m].
-    """
-
-    gates: GateSettings
-    needle_width: float
-    bright: bool | None
-    min_contrast: float
-    noise_factor: float
-    entry_zone: float
-    hole_clearance: float
-
-
-def default_settings(phantom: Phantom) -> TrackerSettings:
-    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend).
-
-    Parameters
-    ----------
-    phantom : Phantom
-        From the calibration.
-
-    Returns
-    -------
-    TrackerSettings
-        The same as the node's defaults.
-    """
-    hole_clearance = 2.0e-3
-    gates = GateSettings(
-        reach=Reach(curvature=9.0, entry_angle=0.1745, hole_tolerance=0.5e-3, length=0.15),
-        surface_height=phantom.surface_height,
-        least_distance=hole_clearance + 1.5e-3,
-        tip_lean=0.21,
-        insertion_margin=2.0e-3,
-        step_margin=1.0e-3,
-        free_step=5.0e-3,
-        max_disagreement=1.5e-3,
-        max_miss_px=1.0,
-        max_depth_sigma=0.5e-3,
-        confirm_pairs=3,
-        lost_after=10,
-        forget_after=30,
-    )
-    return TrackerSettings(
-        gates=gates,
-        needle_width=0.7e-3,
-        bright=None,
-        min_contrast=10.0,
-        noise_factor=5.0,
-        entry_zone=4.5e-3,
-        hole_clearance=hole_clearance,
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -198,30 +118,38 @@ class StereoTracker:
         )
         self.grids = (self._grid(self.views[0]), self._grid(self.views[1]))
         self._detection = (self._look(self.views[0]), self._look(self.views[1]))
-        self._entries = tuple(view.project(np.zeros(3)) for view in self.views)
+        self._follower = Follower(
+            self.views, self._detection, settings.needle_width, settings.hole_clearance
+        )
         self._shapes = tuple((camera.height, camera.width) for camera in cameras)
         self.track = Track(settings.gates)
         self._last: tuple[ImageTip, ImageTip] | None = None
+        self._contradicted = 0
 
     def warm_up(self) -> None:
-        """Compile, or load, all that is compiled: the first pair must not wait for it."""
-        tips = []
-        for i, view in enumerate(self.views):
-            image = np.full(self._shapes[i], 128, np.uint8)
-            point = view.project(np.array([0.0, 0.0, 0.5 * self.settings.gates.reach.length]))
-            direction = np.array([1.0, 0.0])
-            expected = Expected(point, direction, 100.0, 6, 0.0)
-            for search in (0, 6):
-                where = dataclasses.replace(expected, search=search)
-                fit_expected(image, where, False, self._detection[i])
-            find_paths(image, self.grids[i], self._detection[i])
-            tips.append(ImageTip(point, direction, 0.1, 0.1, 0.1, 50.0))
-        triangulate(self.views, (tips[0], tips[1]))
+        """Compile, or load, all that is compiled: the first pair must not wait for it.
+
+        The tracker looks at a needle that it draws itself, and forgets it.
+        """
+        length = _DRAWN_SHARE * self.settings.gates.reach.length
+        line = np.zeros((_DRAWN_POINTS, 3))
+        line[:, 2] = np.linspace(0.0, length, _DRAWN_POINTS)
+        needle, ground = (200, 60) if self.settings.bright else (60, 200)
+        images = []
+        for view, look, shape in zip(self.views, self._detection, self._shapes, strict=True):
+            image = np.full(shape, ground, np.uint8)
+            corners = np.round(np.nan_to_num(view.project(line))).astype(np.int32)
+            cv2.polylines(image, [corners], False, needle, max(round(look.needle_width_px), 1))
+            images.append(image)
+        for _ in range(2):
+            self.process(images[0], images[1], length)
+        self.reset()
 
     def reset(self) -> None:
         """Forget the track."""
         self.track.reset()
         self._last = None
+        self._contradicted = 0
 
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair.
@@ -272,11 +200,11 @@ class StereoTracker:
                 self._last = None
             return dataclasses.replace(measured, state=self.track.state)
         anew = measured.contested is not None
-        beyond_doubt = is_sound(measured.image_tips, _CERTAIN_PX, _CERTAIN_ALONG_PX)
+        beyond_doubt = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
         believed = self.track.accept(measured.tip, insertion, anew=anew, certain=beyond_doubt)
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:
-            self._last = (left_tip, right_tip)
+            self._last = (left_tip, right_tip) if anew else self._steadied(left_tip, right_tip)
         reason = "not confirmed yet" if believed is None else ""
         return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
 
@@ -285,51 +213,55 @@ class StereoTracker:
         self.track.miss()
         return Measurement(None, self.track.state, reason)
 
+    def _steadied(self, left: ImageTip, right: ImageTip) -> tuple[ImageTip, ImageTip]:
+        """Return how the needle was seen last: what crosses it must not be taken for it.
+
+        Its contrast changes slowly, and an end that is not clear has no direction of its own.
+        """
+        if self._last is None:
+            return left, right
+        first, second = (
+            dataclasses.replace(
+                tip,
+                direction=tip.direction if tip.clear else before.direction,
+                contrast=min(
+                    max(tip.contrast, before.contrast / _SLOW_CHANGE),
+                    before.contrast * _SLOW_CHANGE,
+                ),
+            )
+            for tip, before in zip((left, right), self._last, strict=True)
+        )
+        return first, second
+
     def _follow(self, images: tuple[Image, Image], insertion: float | None) -> Measurement | None:
         """Look where the tip should be; None where that is not known or nothing is seen there."""
         predicted = self.track.predict(insertion)
         last = self._last
-        if predicted is None or last is None or abs(predicted.ahead) > _FOLLOW_AHEAD:
+        if (
+            predicted is None
+            or last is None
+            or abs(predicted.ahead) > _FOLLOW_AHEAD
+            or (predicted.known and not self.track.is_certain(insertion))
+        ):
             return None
-        if predicted.known and not self.track.is_certain(insertion):
+        looked = self._follower.look(images, predicted, last)
+        if looked is None:
             return None
-        known = predicted.known
-        loose = 0.1 * abs(predicted.ahead)
-        tips: list[ImageTip] = []
-        regions: list[Expected] = []
-        for i in range(2):
-            point = np.empty(2)
-            project_point(self.views[i].packed, predicted.motion.position, point)
-            scale = self._scale(i)
-            if not math.isfinite(point[0]):
+        found, regions = looked
+        if predicted.known:
+            sights = weighed(self.views, found, predicted.motion)
+            contradicted = sights is not None and sights.contradicted
+            self._contradicted = self._contradicted + 1 if contradicted else 0
+            if sights is None or self._contradicted > _CONTRADICTED:
                 return None
-            room = math.dist(point, self._entries[i]) - self.settings.hole_clearance * scale
-            expected = Expected(
-                point,
-                last[i].direction,
-                room,
-                round(min(max((_SIDEWAYS + loose) * scale, 6.0), 20.0)),
-                (_ALONG + loose) * scale if known else 0.0,
-                last[i].contrast,
-            )
-            tip = None
-            if known and abs(predicted.ahead) < _FOLLOW_DIRECTLY:
-                on_line = dataclasses.replace(expected, search=0)
-                tip = fit_expected(images[i], on_line, last[i].bright, self._detection[i])
-            if tip is None:
-                tip = fit_expected(images[i], expected, last[i].bright, self._detection[i])
-            if tip is None:
-                return None
-            tips.append(tip)
-            regions.append(expected)
-        found = (tips[0], tips[1])
+            found = sights.tips
         if not (found[0].clear or found[1].clear):
             measured = Measurement(None, self.track.state, HIDDEN, found)
         else:
             measured = self._judged(found, insertion)
             if measured.tip is None and measured.reason != UNCERTAIN:
                 return None
-        return dataclasses.replace(measured, regions=(regions[0], regions[1]))
+        return dataclasses.replace(measured, regions=regions)
 
     def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
         """Look everywhere that can be reached (with this insertion, where known)."""
@@ -379,16 +311,17 @@ class StereoTracker:
         if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
             measured = self._one_sided(found, insertion) or measured
         sound = is_sound(measured.image_tips, _SOUND_PX, _SOUND_ALONG_PX)
+        fits = measured.tip is not None and self.track.fits(measured.tip, insertion)
+        wanted = 0
         if measured.reason == TOO_FAR and sound:
             wanted = _SOUND_RIVALS
-        elif (
-            measured.tip is not None and not sound and not self.track.fits(measured.tip, insertion)
-        ):
+        elif measured.tip is not None and not fits and not sound:
             if self.track.anchor is None:
                 return dataclasses.replace(measured, tip=None, reason=UNCLEAR)
             wanted = _UNSOUND_RIVALS
-        else:
-            wanted = 0
+        elif measured.tip is not None and not fits and self.track.state is TrackState.LOST:
+            certain = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
+            wanted = 0 if certain else _SOUND_RIVALS
         tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured

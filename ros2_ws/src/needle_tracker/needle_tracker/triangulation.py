@@ -8,6 +8,7 @@ badly seen end hardly touches the depth.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from needle_tracker.tip_fit import ImageTip
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
+_ALONG_SIGMAS, _ALONG_DOUBT = 3.0, 0.6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,7 +40,7 @@ class SpatialTip:
     disagreement : float
         By how much the cameras disagree about the end along the shaft [m].
     disagreement_across : float
-        By how much the end misses the two shaft lines [px].
+        By how much more than expected the end misses the two shaft lines [px].
     """
 
     position: Array
@@ -125,16 +127,32 @@ def triangulate(
     scales = [float(axis[1] @ j @ direction) for axis, j in zip(axes, jacobians, strict=True)]
     # An end that only one camera sees has nothing to disagree with.
     along = 0.0
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
     if tips[0].clear and tips[1].clear:
         along = abs(residual[1] / scales[0] - residual[3] / scales[1])
+        # Two ends that are too far apart: one of them is wrong, and nothing says which.
+        sigma = math.hypot(tips[0].sigma_along / scales[0], tips[1].sigma_along / scales[1])
+        doubt = max(along * along - (_ALONG_SIGMAS * sigma) ** 2, 0.0)
+        covariance += _ALONG_DOUBT**2 * doubt * np.outer(direction, direction)
+    else:
+        # A line is good for nothing far from where it was seen.
+        along = max(
+            max(abs(float(residual[k])) - float(sigmas[k]), 0.0) / abs(scale)
+            for k, scale in zip((1, 3), scales, strict=True)
+        )
     return SpatialTip(
         position,
-        np.asarray(np.linalg.inv(normal), dtype=np.float64),
+        covariance,
         direction,
         direction_covariance,
         float(along),
-        float(max(abs(residual[0]), abs(residual[2]))),
+        max(_beyond(residual[0], sigmas[0]), _beyond(residual[2], sigmas[2])),
     )
+
+
+def _beyond(residual: float, sigma: float) -> float:
+    """Return how far a residual goes beyond what its standard deviation explains [px]."""
+    return max(abs(float(residual)) - 3.0 * float(sigma), 0.0)
 
 
 def _shaft_direction(

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from needle_tracker.calibration import StereoCalibration, load_calibration
+from needle_tracker.gates import GateSettings
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach
-from needle_tracker.track import GateSettings
-from needle_tracker.tracker import TrackerSettings
+from needle_tracker.tracker_settings import TrackerSettings
 
 CALIBRATION = Path(__file__).parents[1] / "config" / "calibration.yaml"
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from needle_tracker.annotation import annotate, describe
 from needle_tracker.calibration import StereoCalibration
-from needle_tracker.tracker import StereoTracker, TrackerSettings
+from needle_tracker.tracker import StereoTracker
+from needle_tracker.tracker_settings import TrackerSettings
 
 
 def test_tip_region_and_state_are_drawn_where_they_are(

@@ -16,7 +16,8 @@ from needle_sim.scenarios import find_scenario
 from needle_sim.stereo_rig import load_stereo_rig
 from needle_tracker.calibration import Camera, StereoCalibration
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import StereoTracker, default_settings
+from needle_tracker.tracker import StereoTracker
+from needle_tracker.tracker_settings import default_settings
 
 Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 

@@ -9,9 +9,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from needle_tracker.gates import GateSettings, refusal, tip_at_entry
 from needle_tracker.search_grid import Reach
-from needle_tracker.track import GateSettings, Track, TrackState, refusal, tip_at_entry
-from needle_tracker.tracker import TrackerSettings
+from needle_tracker.track import Track, TrackState
+from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 
 

@@ -14,7 +14,7 @@ import pytest
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.parameters import StereoTrackerParameters
 from needle_tracker.track_images import COLUMNS, main
-from needle_tracker.tracker import default_settings
+from needle_tracker.tracker_settings import default_settings
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
 Drawn = list[tuple[np.ndarray, np.ndarray, np.ndarray]]

@@ -1,0 +1,205 @@
+"""Where along a fitted shaft the needle ends, and how far beyond half its mass it tapers off.
+
+The darkness summed across the needle, row by row, falls from its level to nothing. A flat end falls
+as fast as the image's blur lets the shaft's own edges fall; a bevelled one falls over its length,
+and its extreme point lies half of that beyond the middle of the fall.
+"""
+
+# Compiled functions take plain numbers, one by one.
+# ruff: noqa: PLR0912
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_common.compiled import compiled
+from needle_tracker.strip import LEAST_ROWS, STEP_PX
+
+Array = NDArray[np.float64]
+
+_NEEDLE_MASS = 0.62  # what a shadow on the floor does not have
+_FAINT_DOUBT = 0.4
+_KNEE, _FEIGNED = 0.5, 8.0  # [px^2], of the end's standard deviation
+_MOST_DOUBT = 0.5
+_CLEAR_OF = 0.6
+_LONGEST_FALL = 12  # [px]
+# Three rows together blur an end more than the shaft's edges [px^2]; where the blur is wide, what
+# is left of that is that edges close to each other look sharper than they are.
+_ROWS_SQUARE = 1.75
+_END_OVER_EDGE = 1.42
+_SHIFT = 1.1  # of the extreme point, over the taper's share of the fall
+_DOUBT = 0.4
+_KNEE, _FEIGNED = 0.5, 8.0  # [px^2], of the end's standard deviation
+_MOST_DOUBT = 0.5
+_CLEAR_OF = 0.6
+_EDGE_ROWS = 24
+_WHOLE = 0.93
+# From the profile of a box under a Gaussian: quarter width of an edge over the full width at half.
+_BLUNT_FROM, _BLUNT, _BLUNTEST = 0.275, 3.2, 0.4
+
+
+@compiled
+def find_end(
+    mass: Array, behind: int, prior: float, prior_sigma: float
+) -> tuple[float, float, float, float]:
+    """Return where the mass falls to half its level for good.
+
+    Every row votes for "needle" or "beyond its end" by how far its mass is from half the level;
+    a prediction votes as well. A stretch that a glint or a bubble hides is bridged.
+
+    Parameters
+    ----------
+    mass : ndarray, shape (rows,)
+        From `row_masses`.
+    behind : int
+        Row of the strip's middle.
+    prior, prior_sigma : float
+        Predicted end [px from the middle]; `prior_sigma` 0: none.
+
+    Returns
+    -------
+    along : float
+        The end [px from the middle]; NaN where there is none.
+    before, after : float
+        Mean mass just inside and just outside the end: 1 and 0 for a clear end. What is faint and
+        even beyond the end counts for little.
+    fall : float
+        Length over which the mass falls from three quarters to one quarter [px]; 0: not known.
+    """
+    rows = len(mass)
+    nothing = (np.nan, 0.0, 0.0, 0.0)
+    smooth = np.empty(rows)
+    for i in range(rows):
+        first, last = max(i - 1, 0), min(i + 1, rows - 1)
+        total = 0.0
+        for k in range(first, last + 1):
+            total += mass[k]
+        smooth[i] = total / (last - first + 1)
+    best, largest, votes = -1, -1e30, 0.0
+    for i in range(rows - 1):
+        votes += min(max(smooth[i] - _NEEDLE_MASS, -0.5), 0.5)
+        value = votes
+        if prior_sigma > 0.0:
+            far = (i + 0.5 - behind - prior) / prior_sigma
+            value -= 0.5 * far * far
+        if value > largest and smooth[i] >= _NEEDLE_MASS > smooth[i + 1]:
+            best, largest = i, value
+    if best < LEAST_ROWS - 2:
+        return nothing
+    # The level next to the end: light and focus may differ along the shaft.
+    part = np.sort(mass[max(best - 16, 0) : max(best - 2, 1)])
+    level = part[len(part) // 2]
+    if not 0.75 < level < 1.35:
+        level = 1.0
+    # Beyond the end there may be something fainter, such as the needle's own shadow, or more light
+    # than beside it, where a shadow lies there.
+    part = np.sort(mass[min(best + 4, rows - 4) : min(best + 11, rows)])
+    beyond = min(max(part[len(part) // 2], -_NEEDLE_MASS), _NEEDLE_MASS)
+    half = 0.5 * (level + beyond)
+    i = best
+    while i > 0 and smooth[i] < half:
+        i -= 1
+    while i < rows - 2 and smooth[i + 1] >= half:
+        i += 1
+    if smooth[i] <= smooth[i + 1]:
+        return nothing
+    along = i - behind + (smooth[i] - half) / (smooth[i] - smooth[i + 1])
+    quarter = 0.5 * (level - half)
+    inner = outer = 0.0
+    for k in range(i, max(i - _LONGEST_FALL, 0), -1):
+        if smooth[k] >= half + quarter > smooth[k + 1]:
+            inner = k + (smooth[k] - half - quarter) / (smooth[k] - smooth[k + 1])
+            break
+    for k in range(i, min(i + _LONGEST_FALL, rows - 1)):
+        if smooth[k] >= half - quarter > smooth[k + 1]:
+            outer = k + (smooth[k] - half + quarter) / (smooth[k] - smooth[k + 1])
+            break
+    fall = outer - inner if inner > 0.0 and outer > 0.0 else 0.0
+    # Clear of the fall.
+    aside = round(_CLEAR_OF * fall)
+    before = after = 0.0
+    size = 4
+    for k in range(size):
+        before += mass[max(i - 1 - aside - k, 0)] / level / size
+        after += mass[min(i + 3 + aside + k, rows - 1)] / level / size
+    if abs(beyond) < _NEEDLE_MASS:
+        after = max(abs(after - beyond / level), _FAINT_DOUBT * abs(beyond) / level)
+    return along, before, after, fall
+
+
+@compiled
+def edge_fall(darkness: Array, behind: int, end: float, line: float, slope: float) -> float:
+    """Return over which width the shaft's edges fall from three quarters to one quarter [px].
+
+    Parameters
+    ----------
+    darkness : ndarray, shape (rows, columns)
+        From `fine_strip`.
+    behind : int
+        Row of the strip's middle.
+    end : float
+        Where the needle ends [px from the middle].
+    line, slope : float
+        Offset of its middle line there [px], and slope.
+
+    Returns
+    -------
+    float
+        Mean of both edges, as sharp as they would be if the needle were wide; 0: not known.
+    """
+    rows, columns = darkness.shape
+    last = min(int(end) + behind - 5, rows - 1)
+    first = max(last - _EDGE_ROWS, 0)
+    profile = np.zeros(columns)
+    for i in range(first, last + 1):
+        moved = (line + slope * (i - behind - end)) / STEP_PX
+        for j in range(columns):
+            place = min(max(j + moved, 0.0), columns - 1.001)
+            k = int(place)
+            share = place - k
+            profile[j] += (1.0 - share) * darkness[i, k] + share * darkness[i, k + 1]
+    largest = profile.max()
+    middle = columns // 2
+    # A bright middle makes edges of its own.
+    if not profile[middle] >= _WHOLE * largest > 0.0:
+        return 0.0
+    fall = width = 0.0
+    for side in (-1, 1):
+        places = np.full(3, -1.0)
+        for k in range(middle, 0, -1):
+            here, beyond = profile[middle + side * (k - 1)], profile[middle + side * k]
+            for m in range(3):
+                level = 0.25 * (m + 1) * largest
+                if places[m] < 0.0 and here >= level > beyond:
+                    places[m] = STEP_PX * (k - 1 + (here - level) / (here - beyond))
+        if places.min() < 0.0:
+            return 0.0
+        fall += 0.5 * (places[0] - places[2])
+        width += places[1]
+    # Where the blur is as wide as the needle the profile's top is lower than the needle is dark.
+    return fall * (1.0 + min(_BLUNT * max(fall / width - _BLUNT_FROM, 0.0), _BLUNTEST))
+
+
+@compiled
+def taper_beyond(fall: float, edge: float, sigma: float) -> tuple[float, float]:
+    """Return how far the extreme point lies beyond half the mass, and how uncertain that is [px].
+
+    Parameters
+    ----------
+    fall, edge : float
+        From `find_end` and `edge_fall`.
+    sigma : float
+        Standard deviation of an end, from the image's noise [px].
+    """
+    if fall <= 0.0 or edge <= 0.0:
+        return 0.0, 0.0
+    flat = max(edge * edge + _ROWS_SQUARE, (_END_OVER_EDGE * edge) ** 2)
+    square = max(fall * fall - flat, 0.0)
+    taper = math.sqrt(square)
+    # What the noise can feign is no taper.
+    knee = math.hypot(_KNEE, _FEIGNED * fall * sigma)
+    share = square * square / (square * square + knee * knee)
+    return _SHIFT * taper * share, min(_DOUBT * taper * share, _MOST_DOUBT)
