@@ -105,6 +105,8 @@ class DeviceDriverNode(LifecycleNode):
             self._diagnostics,
             refuse=self._why_not_ready,
         )
+        # rclpy's first line takes a tenth of a second: not once the drives wait for a heartbeat.
+        self.get_logger().info(f"looking for the drives on {values.link_settings}")
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
         if self._sim_time:

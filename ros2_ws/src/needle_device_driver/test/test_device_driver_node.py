@@ -549,6 +549,7 @@ def test_the_executable_says_in_one_line_what_is_missing_and_ends_on_a_signal() 
     assert "Traceback" not in missing.stderr
     with subprocess.Popen(command, env=environment, stderr=subprocess.PIPE, text=True) as process:
         assert process.stderr is not None
+        assert "looking for the drives" in process.stderr.readline()
         assert "waiting for the drives" in process.stderr.readline()
         process.send_signal(signal.SIGINT)
         assert process.wait(timeout=60) == 0
