@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import signal
 import sys
@@ -310,6 +311,8 @@ def main() -> int:
         assert isinstance(node, DeviceDriverNode)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
+        # What is there stays: no collection need look through it while the drives wait.
+        gc.freeze()
         try:
             while not (ended or node.ended):
                 executor.spin_once(timeout_sec=0.1)
