@@ -210,3 +210,12 @@ def test_a_damaged_message_index_is_written_again(tmp_path: Path) -> None:
         assert numbers(file) == list(range(COUNT))
         begin, end = chunk.end, chunk.end + chunk.index.message_index_length
         assert file.read_bytes()[begin:end] == whole[begin:end]
+
+
+def test_a_lost_summary_comes_back_as_the_library_writes_it(tmp_path: Path) -> None:
+    whole = write(tmp_path / "bag", whole=True).read_bytes()
+    file = tmp_path / "cut_0.mcap"
+    for length in (1, 8, 30, 300, 1500):
+        file.write_bytes(whole[:-length])
+        repair(file, scan_file(file), library="test")
+        assert file.read_bytes() == whole
