@@ -30,6 +30,7 @@ from needle_sim.drives.fault_commands import COMMANDS
 from needle_sim.drives.power_state import PowerState
 from needle_sim.drives.pty_port import PtyPort
 from needle_sim.drives.socketcand_port import SocketcandPort
+from needle_sim.sync_stamps import SyncStamps
 
 HELP = f"""\
 drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
@@ -52,7 +53,6 @@ _WAIT = 0.005
 _PERIOD = 0.02
 _LOOK_AROUND = 0.05
 _PATIENCE = 0.2
-_UNCLEAR = 2
 
 
 class DriveEmulatorNode(Node):
@@ -71,12 +71,9 @@ class DriveEmulatorNode(Node):
         self._steps_with_sync = clock is MotionClock.SYNC
         self._bus = EmulatedBus(values.insertion, values.rotation, clock, time.monotonic())
         self._states = {name: drive.state for name, drive in self._bus.drives.items()}
-        self._syncs_told = 0
-        self._waits_since: float | None = None
+        self._syncs_seen = 0
+        self._stamps = SyncStamps(_PATIENCE)
         self._told_at = 0.0
-        # The newest simulated time, and how many there were since positions were told.
-        self._time_ns = 0
-        self._times_since = _UNCLEAR
         self._times = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
         self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
         self._diagnostics = DiagnosticsPublisher(self)
@@ -100,7 +97,7 @@ class DriveEmulatorNode(Node):
         bool
             Whether the stamp of the last positions waits for /clock.
         """
-        self._server.turn(_WAIT if not self._waits_for_time else 0.0)
+        self._server.turn(0.0 if self._stamps.waits else _WAIT)
         now = time.monotonic()
         if self._steps_with_sync:
             self._tell_synced_positions(now)
@@ -108,7 +105,7 @@ class DriveEmulatorNode(Node):
             self._told_at = max(self._told_at + _PERIOD, now - _PERIOD)
             self._tell_positions(self.get_clock().now().nanoseconds)
         self._watch_states()
-        return self._waits_for_time
+        return self._stamps.waits
 
     def obey(self, line: str) -> None:
         """Carry out a fault on command; complain about what is none."""
@@ -125,38 +122,20 @@ class DriveEmulatorNode(Node):
         self._server.close()
 
     @property
-    def times_heard(self) -> int:
+    def new_times(self) -> int:
         """How many new simulated times were heard since positions were told."""
-        return self._times_since
-
-    @property
-    def _waits_for_time(self) -> bool:
-        return self._steps_with_sync and self._bus.syncs > self._syncs_told
+        return self._stamps.new_times
 
     def _on_clock(self, message: Clock) -> None:
-        time_ns = to_nanoseconds(message.clock)
-        if time_ns != self._time_ns:
-            self._time_ns = time_ns
-            self._times_since += 1
+        self._stamps.hear(to_nanoseconds(message.clock))
 
     def _tell_synced_positions(self, now: float) -> None:
-        """Tell the positions of the last SYNC, with the simulated time that it belongs to.
-
-        Its sender may know that time before it is known here. One new time since the SYNC before
-        is it; where it is not as clear (at the start, after SYNCs that failed to come), the newest
-        is, after some patience.
-        """
-        if not self._waits_for_time:
-            self._waits_since = None
-            return
-        if self._waits_since is None:
-            self._waits_since = now
-        patience = _PATIENCE if self._times.get_publisher_count() else 0.0
-        if self._times_since == 1 or now - self._waits_since >= patience:
-            self._syncs_told = self._bus.syncs
-            self._times_since = 0
-            self._waits_since = None
-            self._tell_positions(self._time_ns or self.get_clock().now().nanoseconds)
+        """Tell the positions of the last SYNC, with the simulated time that it belongs to."""
+        self._stamps.sync(self._bus.syncs - self._syncs_seen, now)
+        self._syncs_seen = self._bus.syncs
+        stamp_ns = self._stamps.take(now, simulated=self._times.get_publisher_count() > 0)
+        if stamp_ns is not None:
+            self._tell_positions(stamp_ns or self.get_clock().now().nanoseconds)
 
     def _tell_positions(self, stamp_ns: int) -> None:
         axes = self._bus.axes()
@@ -217,9 +196,9 @@ def main() -> int:
                 if waits or now - looked_at >= _LOOK_AROUND:
                     looked_at = now
                     times = -1
-                    while node.times_heard != times:
+                    while node.new_times != times:
                         # All that is there counts: a stamp that came late must not be taken twice.
-                        times = node.times_heard
+                        times = node.new_times
                         executor.spin_once(timeout_sec=_WAIT if waits and times == 0 else 0.0)
         finally:
             node.close()

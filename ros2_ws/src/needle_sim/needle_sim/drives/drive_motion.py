@@ -79,11 +79,6 @@ class DriveMotion:
         self._mode = self._word = 0
         self._homed = self._homing_failed = self._limited = False
 
-    def switch_on(self) -> None:
-        """Hold the motor where it is."""
-        self._demand.hold(self._motor.position)
-        self.forget()
-
     def switch_off(self) -> None:
         """Let go of the motor: the friction of screw and gear holds it at once."""
         self._motor.rest()

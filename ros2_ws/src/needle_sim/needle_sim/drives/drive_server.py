@@ -45,15 +45,16 @@ class DriveServer:
     def __init__(self, bus: EmulatedBus, port: Port) -> None:
         self.bus = bus
         self._port = port
+        # Drives that booted before anybody could hear it are there at once.
+        bus.poll(time.monotonic())
 
     def turn(self, timeout: float) -> None:
         """Wait for input, at most `timeout` [s], and do what is due."""
         select.select(self._port.filenos, [], [], timeout)
-        self._port.send(self.bus.poll(time.monotonic()))
+        # All that has come first: a heartbeat that waits to be read is not missed.
         for frame in self._port.receive():
             self.bus.receive(frame, time.monotonic())
-            # An answer may decide what the computer sends next: nothing is held back.
-            self._port.send(self.bus.poll(time.monotonic()))
+        self._port.send(self.bus.poll(time.monotonic()))
 
     def obey(self, line: str) -> None:
         """Carry out a fault on command.

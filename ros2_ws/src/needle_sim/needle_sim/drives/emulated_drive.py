@@ -226,8 +226,6 @@ class EmulatedDrive:
         before = self.state
         if state is before:
             return
-        if state is PowerState.OPERATION_ENABLED and before is not PowerState.QUICK_STOP_ACTIVE:
-            self._motion.switch_on()
         self._motion.forget()
         if before is PowerState.OPERATION_ENABLED and self._slows_down_before(state):
             self._leaving = state

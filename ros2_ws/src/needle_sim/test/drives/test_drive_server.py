@@ -12,6 +12,7 @@ import canopen
 import pytest
 
 from needle_common.errors import UserError
+from needle_sim.drives.can_frame import CanFrame
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_server import DriveServer, Port
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
@@ -134,6 +135,44 @@ def test_socketcand_port_in_use_is_named() -> None:
     with pytest.raises(UserError, match=str(port.port)):
         SocketcandPort(port.port)
     port.unplug()
+
+
+class LatePort:
+    """Has frames that came while nobody looked."""
+
+    def __init__(self, frames: list[CanFrame]) -> None:
+        self.filenos: list[int] = []
+        self.sent: list[CanFrame] = []
+        self._frames = frames
+
+    def plug_in(self) -> None:
+        """Be there."""
+
+    def unplug(self) -> None:
+        """Be gone."""
+
+    def receive(self) -> tuple[CanFrame, ...]:
+        frames, self._frames = self._frames, []
+        return tuple(frames)
+
+    def send(self, frames: list[CanFrame]) -> None:
+        self.sent += frames
+
+
+def test_heartbeat_that_was_not_read_yet_is_not_missed() -> None:
+    # Long ago on the steady clock: both watchdogs heard the last heartbeat then.
+    watch = b"\x23\x16\x10\x01\x64\x00\x7f\x00"
+    port = LatePort([CanFrame(0x080), CanFrame(0x77F, b"\5")])
+    server = DriveServer(make_bus(), port)
+    for node in (INSERTION, ROTATION):
+        server.bus.receive(CanFrame(0x600 + node, watch), 1.0)
+    server.bus.receive(CanFrame(0x77F, b"\5"), 1.0)
+    server.turn(0.0)
+    assert [frame for frame in port.sent if frame.identifier in (0x81, 0x82)] == []
+    port.sent.clear()
+    threading.Event().wait(0.11)
+    server.turn(0.0)
+    assert [frame.identifier for frame in port.sent] == [0x81, 0x82]
 
 
 def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:

@@ -403,8 +403,11 @@ def test_cut_bus_loses_frames_both_ways() -> None:
     master.enable(CSP)
     master.bus.is_cut = True
     master.heard.clear()
+    master.network.send_message(0x601, b"\x23\x7a\x60\0\x20\x03\0\0")
+    master.network.send_message(0x80, b"")
     master.wait(0.5)
     assert master.heard == []
+    assert master.true_counts() == 0.0
     # The drive's own watchdog has seen it.
     assert master.bus.drives["insertion"].state is PowerState.FAULT
 

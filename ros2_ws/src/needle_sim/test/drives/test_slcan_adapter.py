@@ -59,7 +59,8 @@ def test_closed_channel_passes_nothing() -> None:
     assert adapter.feed(b"t0800\r").reply == b"\a"
     assert adapter.encode(CanFrame(0x181, b"\1")) == b""
     adapter.feed(b"O\r")
-    assert adapter.encode(CanFrame(0x181, b"\1\xab")) == b"t181201AB\r"
+    assert adapter.encode(CanFrame(0x1AB, b"\1\xab")) == b"t1AB201AB\r"
+    assert adapter.encode(CanFrame(0x08F, b"")) == b"t08F0\r"
     assert adapter.feed(b"V\rN\rF\r").reply == b"V1013\rNSIM1\rF00\r"
     adapter.feed(b"C\r")
     assert not adapter.is_open
