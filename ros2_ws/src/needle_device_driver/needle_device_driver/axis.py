@@ -50,6 +50,9 @@ class AxisSnapshot:
         The rule behind the fault.
     ready : bool
         Whether a move would begin at once: not while a powered axis still comes to rest.
+    answered : bool
+        Whether the axis has answered to all that it was asked: until then, where it is is not known
+        well enough to send it on.
     origin : int
         Changes whenever `position` begins to count from elsewhere.
     """
@@ -64,6 +67,7 @@ class AxisSnapshot:
     fault: str
     fault_rule: Rule = Rule.ONE_FAULT_STOPS_BOTH
     ready: bool = True
+    answered: bool = True
     origin: int = 0
 
 

@@ -31,6 +31,11 @@ class PairSnapshot:
         """Whether both axes would begin to move at once."""
         return self.insertion.ready and self.rotation.ready
 
+    @property
+    def answered(self) -> bool:
+        """Whether both axes have answered to all that they were asked."""
+        return self.insertion.answered and self.rotation.answered
+
     def age(self, now: float) -> float:
         """Return the age of the older reply [s]."""
         return now - min(self.insertion.time, self.rotation.time)

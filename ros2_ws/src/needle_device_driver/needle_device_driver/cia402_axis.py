@@ -207,6 +207,7 @@ class Cia402Axis(Axis):
             fault="" if fault is None else fault[1],
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
+            answered=self.monitor.answered(),
             origin=self._origin,
         )
 

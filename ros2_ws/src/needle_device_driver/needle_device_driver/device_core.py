@@ -209,15 +209,19 @@ class DeviceCore:
         if self._homing_time > longest:
             self.fail(f"no home switch within {longest:.0f} s", Rule.HOMING_TIME)
 
-    def drive(self, period: float, speed_scale: float) -> None:
+    def drive(self, period: float, speed_scale: float, now: float) -> None:
         """Order the set-points of the next `period` [s] of what is under way."""
-        if self._run is None or self.snapshot is None:
+        if self._run is None:
             return
-        problem = self._run.problem(self.snapshot)
+        at = self.poll(now)
+        if not at.answered:
+            # Nothing is sent on that may have lost its way: silence stops, then is a fault.
+            return
+        problem = self._run.problem(at)
         if problem is not None:
             self.fail(problem[1], problem[0])
             return
-        set_point = self._run.advance(self.snapshot, period, speed_scale)
+        set_point = self._run.advance(at, period, speed_scale)
         if set_point is None:
             return
         try:

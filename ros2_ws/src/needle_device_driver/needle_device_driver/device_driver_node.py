@@ -175,6 +175,7 @@ class DeviceDriverNode(LifecycleNode):
     def _cycle(self, ros_ns: int, wait: float) -> None:
         now = time.monotonic()
         self._supervisor.note_time(ros_ns, now)
+        self._drives.collect()
         self._supervisor.drive(PERIOD, now)
         self._drives.exchange(wait)
         self._supervisor.observe(time.monotonic())

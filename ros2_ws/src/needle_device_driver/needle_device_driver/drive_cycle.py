@@ -63,6 +63,11 @@ class DriveCycle:
                 lambda: all(axis.monitor.fresh_time >= since for axis in self._axes), wait
             )
 
+    def collect(self) -> None:
+        """Take the answers that came too late for the cycle before."""
+        for axis in self._axes:
+            axis.update()
+
     def exchange(self, wait: float) -> None:
         """Run one cycle.
 

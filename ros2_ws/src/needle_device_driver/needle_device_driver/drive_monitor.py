@@ -95,8 +95,9 @@ class DriveMonitor:
             return self._watching and self._nmt_state != NMT_OPERATIONAL
 
     def answered(self) -> bool:
-        """Return whether all process data arrived since the last SYNC; call it under `arrival`."""
-        return not self._awaited()
+        """Return whether all process data arrived since the last SYNC."""
+        with self._lock:
+            return not self._awaited()
 
     def expect_answer(self) -> None:
         """Take note that a SYNC goes out now."""

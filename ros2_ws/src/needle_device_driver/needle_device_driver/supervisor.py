@@ -334,7 +334,7 @@ class MotionSupervisor:
             return
         self._watch_hold(now)
         if self.may_move(now):
-            self._core.drive(period, self._hold.speed_scale)
+            self._core.drive(period, self._hold.speed_scale, now)
 
     def observe(self, now: float) -> None:
         """Read the axes, watch over them and the hold, and end what has ended."""

@@ -489,6 +489,7 @@ class DriveBench:
                 self.hold(scale=scale)
             now = self.clock()
             self.supervisor.note_time(self.ros_ns, now)
+            self.drives.collect()
             self.supervisor.drive(PERIOD, now)
             self.drives.exchange(self.wait)
             self.supervisor.observe(self.clock())

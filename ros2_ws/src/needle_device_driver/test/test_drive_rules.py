@@ -497,3 +497,38 @@ def test_drive_watchdog_that_tripped_before_the_start_is_told_at_the_start(
     assert bench.supervisor.reset(bench.clock()).success
     bench.cycle(3)
     assert in_state(bench, State.DISABLED)
+
+
+def test_look_ahead_an_axis_that_has_not_answered_is_not_sent_on(drive_bench: Bench) -> None:
+    bench = drive_bench
+    bench.ready()
+    bench.cycle(1, holding=True)
+    bench.step(0.001, 1.0, 0.35)
+    bench.cycle(3, holding=True)
+    bench.wait = 0.001
+    sync = bench.rotation.sync
+    bench.rotation.sync = lambda: None
+    bench.cycle(1, holding=True)
+    waiting = bench.insertion.next_target, bench.rotation.next_target
+    bench.cycle(5, holding=True)
+    assert (bench.insertion.next_target, bench.rotation.next_target) == waiting
+    assert in_state(bench, State.MOVING)
+    # It was but a moment.
+    bench.rotation.sync, bench.wait = sync, 2.0
+    bench.cycle(30, holding=True)
+    assert bench.outcomes == ["succeeded"]
+
+
+def test_look_ahead_an_answer_that_comes_late_counts_in_the_next_cycle(drive_bench: Bench) -> None:
+    bench = drive_bench
+    bench.ready()
+    bench.cycle(1, holding=True)
+    bench.step(0.001, 0.1, 0.2)
+    bench.wait = 0.0
+    for _ in range(20):
+        bench.cycle(1, holding=True)
+        with bench.link.arrival:
+            assert bench.link.arrival.wait_for(
+                lambda: all(axis.monitor.answered() for axis in bench.axes), 5.0
+            )
+    assert bench.outcomes == ["succeeded"]
