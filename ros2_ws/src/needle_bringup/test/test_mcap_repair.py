@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import resource
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
@@ -60,7 +62,21 @@ def numbers(file: Path) -> list[int]:
         by_rosbags = [bytes(data) for _, _, data in reader.messages()]
     assert sorted(indexed) == sorted(streamed) == sorted(by_rosbags)
     assert all(data == payload(int.from_bytes(data[:4], "little")) for data in by_rosbags)
+    require_indexes_in_place(file)
     return sorted(int.from_bytes(data[:4], "little") for data in by_rosbags)
+
+
+def require_indexes_in_place(file: Path) -> None:
+    """The C++ readers go by the offsets of message indexes, the Python ones do not."""
+    data = file.read_bytes()
+    with file.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    for chunk in summary.chunk_indexes:
+        assert chunk.message_index_offsets
+        for channel, offset in chunk.message_index_offsets.items():
+            opcode, _, found = struct.unpack_from("<BQH", data, offset)
+            assert (opcode, found) == (Opcode.MESSAGE_INDEX, channel)
 
 
 @pytest.fixture(scope="module")
