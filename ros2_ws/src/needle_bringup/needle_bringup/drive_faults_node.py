@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import random
+import re
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -111,27 +113,12 @@ def _fault(
 ) -> dict[str, Any]:
     """Let it happen at a random moment of a random motion, watch, recover."""
     words = _words(kind, rng)
-    for _ in range(_STARVED):
-        hand.press()
-        stream = _Stream(hand, rng)
-        moment = time.monotonic() + rng.uniform(0.1, 0.6)
-        while time.monotonic() < moment:
-            stream.keep_going()
-        if hand.status.get("state") in ("HOLDING", "MOVING"):
-            break
-        # Watchdogs trip on a machine that has no time for this: it was no trial.
-        _start_over(hand)
-    else:
-        raise UserError(f"the machine is too slow for a trial: {hand.status.get('fault')}")
+    stream = _move_until_moment(hand, rng)
     before = hand.motors[-1]
     seen = len(hand.motors)
     logged = len(processes.log("device_driver"))
     faults = processes.log("drive_emulator").count(": fault 0x")
-    if kind == "kill_driver":
-        processes.kill("device_driver")
-        hand.status = {}
-    else:
-        processes.say(words)
+    begun_at = _happen(processes, hand, kind, words)
     # A slow motor may be stalled for long before it is far off.
     give_up_at = time.monotonic() + _LONGEST
     while hand.status.get("state") in ("HOLDING", "MOVING") and time.monotonic() < give_up_at:
@@ -165,12 +152,13 @@ def _fault(
     except UserError as error:
         trouble = str(error)
     if trouble:
-        _start_over(hand)
+        with contextlib.suppress(UserError):
+            _start_over(hand)
     return {
         "words": words,
         "speed_mm_s": stream.speed * 1e3,
         "turn_rate_rad_s": stream.turn_rate,
-        "distance_mm": (stopped.insertion - before.insertion) * 1e3,
+        "distance_mm": (stopped.insertion - begun_at) * 1e3,
         "rotation_rad": abs(stopped.rotation - before.rotation),
         "stopped_after_s": moving[-1].heard_at - before.heard_at if moving else 0.0,
         "state": state,
@@ -180,6 +168,43 @@ def _fault(
         "moved_by_itself_mm": moved * 1e3,
         "trouble_after": trouble,
     }
+
+
+def _move_until_moment(hand: DriveHand, rng: random.Random) -> _Stream:
+    """Press, and make steps until the moment has come."""
+    for _ in range(_STARVED):
+        with contextlib.suppress(UserError):
+            hand.press()
+            stream = _Stream(hand, rng)
+            moment = time.monotonic() + rng.uniform(0.1, 0.6)
+            while time.monotonic() < moment:
+                stream.keep_going()
+            if hand.status.get("state") in ("HOLDING", "MOVING"):
+                return stream
+        # Watchdogs trip on a machine that has no time for this: it was no trial.
+        with contextlib.suppress(UserError):
+            _start_over(hand)
+    raise UserError(f"the machine is too slow for a trial: {hand.status.get('fault')}")
+
+
+def _happen(processes: DriveProcesses, hand: DriveHand, kind: str, words: str) -> float:
+    """Let it happen; return where the insertion axis was [m]."""
+    if kind == "kill_driver":
+        at = hand.motors[-1].insertion
+        processes.kill("device_driver")
+        hand.status = {}
+        return at
+    commands = len(_commanded(processes))
+    processes.say(words)
+    hand.until(lambda: len(_commanded(processes)) > commands, "the fault")
+    # Where the emulator says that it came; what is heard here is older.
+    return _commanded(processes)[-1]
+
+
+def _commanded(processes: DriveProcesses) -> list[float]:
+    """Return where the insertion axis was at each fault on command so far [m]."""
+    found = re.findall(r"on command: .*, at (\S+) mm", processes.log("drive_emulator"))
+    return [float(position) * 1e-3 for position in found]
 
 
 def _words(kind: str, rng: random.Random) -> str:

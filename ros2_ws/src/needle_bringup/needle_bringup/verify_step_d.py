@@ -27,7 +27,7 @@ SAME_TOPICS = (
 SHORT = ("--level", "drive", "--depth-mm", "40")
 # What the memory of both processes may grow by in 9,000 steps [MB]: less than a byte a cycle.
 MEMORY_SLACK = 2.0
-# The trial hears of the motors 50 times a second, and of the fault's moment no better [s].
+# Where a motor was when a node was killed is known from what was heard last, 50 times a second [s].
 SAMPLING = 0.04
 
 
@@ -48,14 +48,14 @@ class Bound:
 
 
 # A drive ends at the last set-point by itself: at most the one sent and the one under way.
-_BY_ITSELF = Bound(0.04)
+_BY_ITSELF = Bound(0.04, 0.005)
 # A silent drive is noticed by its age, then a cycle and a ramp.
 _SILENT = Bound(0.1 + 0.02 + 0.05)
 _TOLD = Bound(0.02 + 0.05)
 BOUNDS = {
     "cut_bus": _BY_ITSELF,
     "unplug": _BY_ITSELF,
-    "kill_driver": _BY_ITSELF,
+    "kill_driver": Bound(0.04 + SAMPLING, 0.005),
     "reboot": _SILENT,
     "hang": _SILENT,
     "emcy": _TOLD,
@@ -206,12 +206,12 @@ def _allowed(kind: str, outcome: dict[str, Any]) -> float:
     speed = float(outcome["speed_mm_s"])
     if kind == "stall":
         if outcome["words"].endswith("insertion"):
-            return 0.05 + speed * SAMPLING
+            return 0.05
         # The insertion goes on until the rotation is far enough off.
         until = _FOLLOWING[1] / float(outcome["turn_rate_rad_s"]) + _SILENT.time
-        return _SILENT.way + speed * (until + SAMPLING)
+        return _SILENT.way + speed * until
     bound = BOUNDS[kind]
-    return bound.way + speed * (bound.time + SAMPLING)
+    return bound.way + speed * bound.time
 
 
 def _trials(*words: object) -> list[dict[str, Any]]:

@@ -46,7 +46,7 @@ def test_faults_are_named_and_need_a_command_to_go_on() -> None:
     ("change", "missed"),
     [
         ({}, set()),
-        ({"distance_mm": 0.46}, {"cut_bus_bound"}),
+        ({"distance_mm": 0.21}, {"cut_bus_bound"}),
         ({"state": "HOLDING"}, {"cut_bus_named"}),
         ({"logged": False}, {"cut_bus_named"}),
         ({"moved_by_itself_mm": 1e-4}, {"cut_bus_recovery"}),

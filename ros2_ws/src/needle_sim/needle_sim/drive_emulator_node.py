@@ -108,13 +108,17 @@ class DriveEmulatorNode(Node):
         return self._stamps.waits
 
     def obey(self, line: str) -> None:
-        """Carry out a fault on command; complain about what is none."""
+        """Carry out a fault on command, and say where it came; complain about what is none."""
+        axes = self._bus.axes()
         try:
             self._server.obey(line)
         except UserError as error:
             self.get_logger().error(str(error))
             return
-        self.get_logger().warning(f"on command: {line.strip()}")
+        self.get_logger().warning(
+            f"on command: {line.strip()}, at {axes['insertion'].position * 1e3:.6f} mm, "
+            f"{axes['rotation'].position:.6f} rad"
+        )
         self._tell_health()
 
     def close(self) -> None:
