@@ -33,9 +33,9 @@ class Tolerance:
     reason: str
 
 
-LENGTH = Tolerance("m", 1e-7, 1e-6, "a thousandth of what the tracker resolves")
+LENGTH = Tolerance("m", 1e-7, 1e-6, "below a hundredth of the error of a tip")
 ANGLE = Tolerance("rad", 1e-6, 1e-6, "a hundredth of an encoder count of the rotation")
-QUATERNION = Tolerance("-", 1e-6, 0.0, "half the angle's")
+QUATERNION = Tolerance("-", 1e-6, 0.0, "as an angle, halved")
 RATIO = Tolerance("-", 1e-6, 1e-6, "as an angle: sines of angles")
 CURVATURE = Tolerance("1/m", 1e-5, 1e-6, "turns a heading by 1e-6 rad in 120 mm")
 ROTATION_RATE = Tolerance("rad/m", 1e-3, 1e-6, "1e-6 rad in a step of 1 mm")

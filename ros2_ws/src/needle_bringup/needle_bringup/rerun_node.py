@@ -185,7 +185,8 @@ def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node
             f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
             f"with --params"
         )
-    full_name = found[0] if found else f"{run.namespace}{name}"
+    own = f"{run.namespace}{name}"
+    full_name = found[0] if found and own not in found else own
     given = changes.get(name, {})
     return Node(full_name, {**recorded.get(full_name, {}), **given}, frozenset(given))
 
