@@ -21,7 +21,7 @@ def run(bag: Path, *arguments: str) -> Run:
     return finished
 
 
-@pytest.mark.parametrize("level", ["tip", "camera"])
+@pytest.mark.parametrize("level", ["tip", "camera", "drive"])
 def test_it_steers_records_and_reports(tmp_path: Path, level: str) -> None:
     bag, result = tmp_path / "bag", tmp_path / "result.json"
     finished = run(bag, "--level", level, *SHORT, "--json", str(result))
