@@ -99,6 +99,7 @@ def cycle(bench: Bench) -> None:
 
 @settings(
     max_examples=20,
+    derandomize=True,
     deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
