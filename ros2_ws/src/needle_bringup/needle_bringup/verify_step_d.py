@@ -49,8 +49,8 @@ class Bound:
 
 # A drive ends at the last set-point by itself: at most the one sent and the one under way.
 _BY_ITSELF = Bound(0.04, 0.005)
-# A silent drive is noticed by its age, then a cycle and a ramp.
-_SILENT = Bound(0.1 + 0.02 + 0.05)
+# The other drive gets no set-point more once one has left a SYNC unanswered.
+_SILENT = Bound(0.08)
 _TOLD = Bound(0.02 + 0.05)
 BOUNDS = {
     "cut_bus": _BY_ITSELF,
@@ -60,8 +60,10 @@ BOUNDS = {
     "hang": _SILENT,
     "emcy": _TOLD,
 }
-# An axis that does not follow is noticed when it is so far off [mm], [rad].
-_FOLLOWING = (0.5, 0.1)
+# A rotation that does not follow is noticed when it is so far off [rad]; then come the patience of
+# the drive, a cycle and a ramp [s].
+_FOLLOWING = 0.1
+_NOTICED = 0.17
 
 
 def many_steps(_: Workbench, count: int = STEPS) -> Iterator[Finding]:
@@ -208,8 +210,8 @@ def _allowed(kind: str, outcome: dict[str, Any]) -> float:
         if outcome["words"].endswith("insertion"):
             return 0.05
         # The insertion goes on until the rotation is far enough off.
-        until = _FOLLOWING[1] / float(outcome["turn_rate_rad_s"]) + _SILENT.time
-        return _SILENT.way + speed * until
+        until = _FOLLOWING / float(outcome["turn_rate_rad_s"]) + _NOTICED
+        return 0.05 + speed * until
     bound = BOUNDS[kind]
     return bound.way + speed * bound.time
 
