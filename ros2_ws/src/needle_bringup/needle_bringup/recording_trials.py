@@ -14,11 +14,12 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
+from needle_bringup.bag_files import read_contents
 from needle_bringup.bag_recovery import recover_bag
 from needle_bringup.ros_domain import own_domain
+from needle_bringup.verification import unreadable
 from needle_common.errors import UserError
 
 # The first bytes of every message: the encoding, then the stamp's seconds; its nanoseconds are the
@@ -37,8 +38,9 @@ class FullRate:
     ----------
     bag : Path
         The bag.
-    sent, missing : dict of str to int
-        For each topic: messages that were sent, and that are not in the bag.
+    sent, missing, counted : dict of str to int
+        For each topic: messages that were sent, that are not in the bag, and that the recorder
+        says it lost.
     processor_share : float
         Processor time of the recorder over the time, of one core.
     memory_mb, growth_mb : float
@@ -52,6 +54,7 @@ class FullRate:
     bag: Path
     sent: dict[str, int]
     missing: dict[str, int]
+    counted: dict[str, int]
     processor_share: float
     memory_mb: float
     growth_mb: float
@@ -111,6 +114,7 @@ def record_full_rate(
         bag,
         sent,
         {topic: count - kept.get(topic, 0) for topic, count in sent.items()},
+        json.loads(read_contents(bag).custom_data.get("messages_lost", "{}")),
         share,
         memory[-1],
         float(growth),
@@ -155,24 +159,6 @@ def _recovered(bag: Path, killed_at: int) -> Killed:
     with Reader(bag) as reader:
         age = (killed_at - (reader.end_time - 1)) / _SECOND
     return Killed(messages, age, gaps, "")
-
-
-def unreadable(bag: Path) -> str:
-    """Return why a bag does not open with rosbags and mcap; an empty text if it does."""
-    try:
-        with Reader(bag) as reader:
-            count = sum(1 for _ in reader.messages())
-            told = reader.message_count
-        seen = 0
-        for file in bag.glob("*.mcap"):
-            with file.open("rb") as stream:
-                seen += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
-    # any failure to read is what is looked for
-    except Exception as error:  # noqa: BLE001
-        return f"{type(error).__name__}: {error}"
-    if told == count == seen:
-        return ""
-    return f"metadata.yaml tells of {told} messages, rosbags reads {count}, mcap {seen}"
 
 
 def _numbers(bag: Path) -> dict[str, list[int]]:

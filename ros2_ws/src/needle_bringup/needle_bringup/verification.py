@@ -267,10 +267,14 @@ def unreadable(bag: Path) -> str:
     try:
         with Reader(bag) as reader:
             count = sum(1 for _ in reader.messages())
-        data_file = next(bag.glob("*.mcap"))
-        with data_file.open("rb") as stream:
-            seen = sum(1 for _ in make_reader(stream).iter_messages())
+            told = reader.message_count
+        seen = 0
+        for file in bag.glob("*.mcap"):
+            with file.open("rb") as stream:
+                seen += sum(1 for _ in make_reader(stream, validate_crcs=True).iter_messages())
     # any failure to read is what is looked for
     except Exception as error:  # noqa: BLE001
         return f"{type(error).__name__}: {error}"
-    return "" if seen == count else f"rosbags reads {count} messages, mcap {seen}"
+    if told == count == seen:
+        return ""
+    return f"metadata.yaml tells of {told} messages, rosbags reads {count}, mcap {seen}"

@@ -23,9 +23,8 @@ from needle_bringup.recording_trials import (
     Killed,
     record_and_kill,
     record_full_rate,
-    unreadable,
 )
-from needle_bringup.verification import Check, Finding, Workbench, diagnostics, payloads
+from needle_bringup.verification import Check, Finding, Workbench, diagnostics, payloads, unreadable
 from needle_common.errors import UserError
 
 DURATION = 60.0
@@ -54,6 +53,14 @@ def _rate_findings(seen: FullRate, duration: float) -> Iterator[Finding]:
         "0, counted at the source",
         f"{sum(missing.values())} {missing or ''} ({seen.megabytes_per_s:.0f} MB/s)".strip(),
         not missing and seen.exit_code == 0,
+    )
+    counted = {topic: seen.counted[topic] for topic in seen.sent if topic in seen.counted}
+    yield Finding(
+        "full_rate_counted",
+        "what the recorder itself counts as lost",
+        "just that",
+        f"{sum(counted.values())} {counted or ''}".strip(),
+        counted == missing,
     )
     yield Finding(
         "full_rate_processor",
