@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bringup.drive_hand_node import INSERTION_COUNT, DriveHand
-from needle_bringup.drive_processes import DriveProcesses
+from needle_bringup.trial_processes import TrialProcesses, drives_and_driver
 from needle_common.errors import UserError
 
 AXES = ("insertion", "rotation")
@@ -46,7 +46,7 @@ def fault_trials(
     for kind in kinds:
         if kind not in FAULTS:
             raise UserError(f"fault {kind!r} is not one of {', '.join(FAULTS)}")
-    processes = DriveProcesses(folder, domain, {"device_driver": {"retraction_speed": _FAST}})
+    processes = TrialProcesses(folder, domain, drives_and_driver({}, {"retraction_speed": _FAST}))
     hand = DriveHand()
     try:
         hand.until(hand.ready, "the driver", 60.0)
@@ -109,7 +109,7 @@ class _Stream:
 
 
 def _fault(
-    processes: DriveProcesses, hand: DriveHand, kind: str, rng: random.Random
+    processes: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random
 ) -> dict[str, Any]:
     """Let it happen at a random moment of a random motion, watch, recover."""
     words = _words(kind, rng)
@@ -187,7 +187,7 @@ def _move_until_moment(hand: DriveHand, rng: random.Random) -> _Stream:
     raise UserError(f"the machine is too slow for a trial: {hand.status.get('fault')}")
 
 
-def _happen(processes: DriveProcesses, hand: DriveHand, kind: str, words: str) -> float:
+def _happen(processes: TrialProcesses, hand: DriveHand, kind: str, words: str) -> float:
     """Let it happen; return where the insertion axis was [m]."""
     if kind == "kill_driver":
         at = hand.motors[-1].insertion
@@ -201,7 +201,7 @@ def _happen(processes: DriveProcesses, hand: DriveHand, kind: str, words: str) -
     return _commanded(processes)[-1]
 
 
-def _commanded(processes: DriveProcesses) -> list[float]:
+def _commanded(processes: TrialProcesses) -> list[float]:
     """Return where the insertion axis was at each fault on command so far [m]."""
     found = re.findall(r"on command: .*, at (\S+) mm", processes.log("drive_emulator"))
     return [float(position) * 1e-3 for position in found]
@@ -215,7 +215,7 @@ def _words(kind: str, rng: random.Random) -> str:
     return kind
 
 
-def _put_right(processes: DriveProcesses, hand: DriveHand, kind: str) -> None:
+def _put_right(processes: TrialProcesses, hand: DriveHand, kind: str) -> None:
     """End the fault, release, reset, enable."""
     if kind == "kill_driver":
         processes.start("device_driver")

@@ -11,8 +11,8 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 
 from needle_bringup.drive_hand_node import INSERTION_COUNT, ROTATION_COUNT, DriveHand
-from needle_bringup.drive_processes import DriveProcesses
 from needle_bringup.rig_configuration import PATIENT_WATCHDOG
+from needle_bringup.trial_processes import TrialProcesses, drives_and_driver
 from needle_common.conversions import RELIABLE, to_stamp
 
 TICK_NS = 20_000_000
@@ -82,20 +82,15 @@ def random_steps(folder: Path, domain: int, count: int, seed: int) -> dict[str, 
         Figures; distances in counts of the encoders.
     """
     rng = random.Random(seed)
-    processes = DriveProcesses(
-        folder,
-        domain,
-        {
-            "drive_emulator": {"motion_clock": "sync", "use_sim_time": True},
-            "device_driver": {
-                "use_sim_time": True,
-                "lock_step": True,
-                "watchdog": PATIENT_WATCHDOG,
-                "reply_age_limit": PATIENT_WATCHDOG,
-                "retraction_speed": _FAST,
-            },
-        },
-    )
+    emulator = {"motion_clock": "sync", "use_sim_time": True}
+    driver = {
+        "use_sim_time": True,
+        "lock_step": True,
+        "watchdog": PATIENT_WATCHDOG,
+        "reply_age_limit": PATIENT_WATCHDOG,
+        "retraction_speed": _FAST,
+    }
+    processes = TrialProcesses(folder, domain, drives_and_driver(emulator, driver))
     hand = DriveHand()
     begin = time.monotonic()
     try:
@@ -105,17 +100,16 @@ def random_steps(folder: Path, domain: int, count: int, seed: int) -> dict[str, 
         for number in range(count):
             steps.make()
             if number in (count // 10, count - 1):
-                memory.append(sum(processes.memory().values()))
+                memory.append(processes.memory())
         hand.release()
         steps.time.tick()
         processes.check()
     finally:
-        warnings = processes.stop()
+        processes.stop()
     outcome = {
         "steps": count,
         **steps.figures(),
         "memory_growth_MB": (memory[-1] - memory[0]) / 1e6,
-        "warnings": warnings,
         "wall_s": time.monotonic() - begin,
     }
     hand.close()

@@ -10,12 +10,12 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from needle_bringup.drive_hand_node import DriveHand
-from needle_bringup.graph_processes import GraphProcesses
+from needle_bringup.trial_processes import TrialProcesses, graph_in_real_time
 from needle_common.conversions import LATCHED, values_of
 from needle_common.errors import UserError
 
 KILLED = ("plane_controller", "stereo_tracker", "operator")
-_READY = 60.0
+_READY = 120.0
 _WATCHED = 3.0
 _STILL = 1.0
 _RESUMED = 60.0
@@ -48,7 +48,7 @@ def kill_trials(
         for number in range(count):
             place = folder / f"{kind}_{number}"
             place.mkdir()
-            graph = GraphProcesses(place, domain, rng.randrange(1000))
+            graph = TrialProcesses(place, domain, graph_in_real_time(rng.randrange(1000)))
             hand = DriveHand(steers=False)
             try:
                 yield {"fault": kind, "number": number, **_kill(graph, hand, kind, rng)}
@@ -57,7 +57,7 @@ def kill_trials(
                 hand.close()
 
 
-def _kill(graph: GraphProcesses, hand: DriveHand, kind: str, rng: random.Random) -> dict[str, Any]:
+def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random) -> dict[str, Any]:
     controller: dict[str, str] = {}
 
     def on_controller(message: DiagnosticStatus) -> None:
