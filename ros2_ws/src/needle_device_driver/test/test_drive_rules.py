@@ -535,3 +535,27 @@ def test_look_ahead_an_answer_that_comes_late_counts_in_the_next_cycle(
                 lambda: all(axis.monitor.answered() for axis in bench.axes), 5.0
             )
     assert bench.outcomes == ["succeeded"]
+
+
+def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(drive_bench: Bench) -> None:
+    bench = drive_bench
+    bench.moving()
+    bench.cycle(20, holding=True)
+    depth, drawn_out = bench.insertion.position, 0
+    for cycles in (10, 100):
+        bench.insertion.reboot()
+        bench.deliver(bench.insertion)
+        bench.wait = 0.001
+        bench.cycle(1)
+        bench.wait = 2.0
+        bench.hold(False)
+        assert bench.supervisor.reset(bench.clock()).success
+        bench.cycle(5)
+        assert bench.supervisor.enable(True, bench.clock()).success
+        bench.cycle(12)
+        bench.hold(False)
+        bench.cycle(1, holding=True)
+        assert bench.supervisor.retract(bench.clock()).success
+        bench.cycle(cycles, holding=True)
+        drawn_out -= bench.insertion.position
+    assert drawn_out == pytest.approx(depth, abs=4000)
