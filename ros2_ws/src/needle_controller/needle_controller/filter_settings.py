@@ -15,9 +15,9 @@ from needle_controller.hypotheses import (
 from needle_controller.hypothesis_bank import Limits
 
 TORSION_HYPOTHESES = (
-    TorsionHypothesis(0.0, 0.0, 0.0, 0.55),
-    TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.08),
-    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.26),
+    TorsionHypothesis(0.0, 0.0, 0.0, 0.52),
+    TorsionHypothesis(math.radians(20.0), 0.0, 0.15, 0.12),
+    TorsionHypothesis(math.radians(40.0), 0.0, 0.15, 0.25),
     TorsionHypothesis(0.0, 0.006, 0.003, 0.11),
 )
 """None, a small and a large play, lag. Each one's size is estimated."""
@@ -95,7 +95,7 @@ class FilterSettings:
     tip_noise_softness: float = bounded(0.00003, 0.0, 0.1, "m")
     model_error: float = bounded(0.0001, 0.0, 0.1, "m")
     surprise: float = bounded(0.02, 1e-9, 1.0, "-")
-    initial_angle_std: float = bounded(math.radians(8.5), 1e-6, math.pi, "rad")
+    initial_angle_std: float = bounded(math.radians(8.0), 1e-6, math.pi, "rad")
     orientation_drift: float = bounded(math.sqrt(0.001), 0.0, 100.0, "rad/sqrt(m)")
     play_drift: float = bounded(0.2, 0.0, 100.0, "rad/sqrt(m)")
     lag_drift: float = bounded(0.003, 0.0, 1.0, "sqrt(m)")

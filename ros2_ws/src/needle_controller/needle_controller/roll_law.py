@@ -72,9 +72,6 @@ class RollLawSettings:
         Most that a single hypothesis asks of a step, before the mean [rad].
     smallest_weight : float
         Hypotheses that weigh less than this share of the heaviest have no say in the turn.
-    scatter_slowing : float
-        How much slower the base turns at most where the rolls point everywhere, in proportion to
-        how little they agree: spinning hides the roll.
     """
 
     step_length: float = bounded(0.001, 1e-5, 0.1, "m")
@@ -95,7 +92,6 @@ class RollLawSettings:
     far_dead_band: float = bounded(0.15, 0.0, math.pi, "rad")
     largest_turn: float = bounded(2.0, 0.01, 100.0, "rad")
     smallest_weight: float = bounded(0.02, 0.0, 1.0, "-")
-    scatter_slowing: float = bounded(0.4, 0.0, 10.0, "-")
 
     def __post_init__(self) -> None:
         """Check every field; raises UserError with the value and the bound."""

@@ -48,7 +48,6 @@ class RollLawNumbers(NamedTuple):
     far_dead_band: float
     largest_turn: float
     smallest_weight: float
-    scatter_slowing: float
 
 
 @compiled
@@ -84,7 +83,7 @@ def roll_turns(
     for n in range(table.shape[0]):
         x, pitch = state[n, 0], state[n, 1]
         heaviest = np.max(table[n, :, T_WEIGHT])
-        turns = weights = s3_mean = agreement = 0.0
+        turns = weights = s3_mean = 0.0
         for k in range(table.shape[1]):
             row = table[n, k]
             if row[T_WEIGHT] < numbers.smallest_weight * heaviest or row[T_WEIGHT] == 0.0:
@@ -100,11 +99,9 @@ def roll_turns(
                 tip_turn = 0.0
             asked = base_turn(row, tip_turn, base[n], numbers.step_length)
             turns += weight * min(max(asked, -numbers.largest_turn), numbers.largest_turn)
-            agreement += weight * row[T_AGREEMENT]
             s3_mean += weight * s3
             weights += weight
-        most = limit * max(1.0 - numbers.scatter_slowing * (1.0 - agreement / weights), 0.0)
-        turn[n] = min(max(turns / weights, -most), most)
+        turn[n] = min(max(turns / weights, -limit), limit)
         wanted[n] = s3_mean / weights
 
 
