@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_bringup.bag_reader import Series, read_run
+from needle_bringup.bag_reader import HealthEvent, Series, read_run
 from needle_bringup.bag_writer import BagWriter
 from needle_bringup.run_summary import reduced_states, summarize
 from needle_common.errors import UserError
@@ -29,6 +30,14 @@ def test_summary_of_a_known_run(make_run: MakeRun) -> None:
     wanted = {"level": "tip", "controller": "paper", "seed": 7, "steps": 120, "wall_s": 12.5}
     assert {key: summary[key] for key in wanted} == wanted
     assert summary["converged"] is True
+
+
+def test_ticks_without_an_answer_are_watchdog_trips(make_run: MakeRun) -> None:
+    # At level drive sim_rig has no status of its own to count them in.
+    tick = HealthEvent(0, "sim_rig: watchdogs", 1, "the drives left a tick unanswered (1)")
+    well = HealthEvent(1, "stereo_tracker: track", 1, "LOST")
+    run = dataclasses.replace(read_run(make_run()), health=[tick, well])
+    assert summarize(run)["watchdog_trips"] == 3 + 1
 
 
 def test_rms_is_over_the_last_20_mm(make_run: MakeRun) -> None:
