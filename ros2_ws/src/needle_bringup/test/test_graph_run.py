@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from needle_bringup import rerun_node
 from needle_bringup.verification import Run, Workbench, payloads, unreadable
 
 SHORT = ("--depth-mm", "10")
@@ -40,6 +41,8 @@ def test_it_steers_records_and_reports(tmp_path: Path, level: str) -> None:
     assert list(bag.glob("*.png"))
     counts = {topic: len(data) for topic, data in payloads(bag, TOPICS).items()}
     assert counts == dict.fromkeys(TOPICS, 10) | {"/needle/tip": 11, "/sim/tip_pose": 11}
+    # What was recorded is what the code does, taken through it again.
+    assert rerun_node.main([str(bag)]) == 0
 
 
 def test_one_seed_is_one_run_and_another_another(tmp_path: Path) -> None:
