@@ -238,7 +238,7 @@ def test_many_steps_end_where_their_sum_is_to_the_count(make_drive_bench: Any) -
     bench = make_drive_bench(max_step_length=0.002)
     bench.ready()
     insertion = rotation = 0.0
-    for k in range(200):
+    for k in range(100):
         insertion += 0.0003 + 0.0004 * (k % 7) / 7
         rotation += 0.2 * (-1) ** (k // 3) * (k % 5) / 5
         bench.cycle(1, holding=True)
@@ -246,7 +246,7 @@ def test_many_steps_end_where_their_sum_is_to_the_count(make_drive_bench: Any) -
             bench.command(insertion, rotation, bench.ros_ns, 0.15), bench.clock()
         )
         bench.cycle(11, holding=True)
-    assert bench.outcomes == ["succeeded"] * 200
+    assert bench.outcomes == ["succeeded"] * 100
     assert bench.positions == (
         round(insertion * 20e6),
         round(rotation * 65536 / 6.283185307179586),
