@@ -90,8 +90,8 @@ TROUBLE = tuple(
     )
 )
 SPEED = (
-    Study("speed_paper", "paper", (), {}, {"wall_s": 0.2}),
-    Study("speed_best", "best", (), {}, {"wall_s": 10.0}),
+    Study("speed_paper", "paper", (), {}, {"cpu_s": 0.2}),
+    Study("speed_best", "best", (), {}, {"cpu_s": 10.0}),
 )
 
 
