@@ -64,7 +64,8 @@ IMAGE_DEPTH = 60
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
 LAST_WORDS_LIMIT = 1.0
-WARN_WAITING = 20_000
+# Bytes that wait for the disk: two seconds of stereo images.
+WARN_WAITING = 100_000_000
 # The disk is nearly full when it lasts less than this at the present rate [s], or when what is
 # left is less than so many times the reserve.
 WARN_BEFORE = 120.0
@@ -338,9 +339,11 @@ class Recorder(Node):
         }
         level, message = self._health()
         self._diagnostics.set("bag", Diagnostic(level, message, values))
-        if level is Level.OK or message == self._told:
+        # Once for each kind of trouble: the figures at the end of a message change.
+        kind = message.partition(":")[0]
+        if level is Level.OK or kind == self._told:
             return
-        self._told = message
+        self._told = kind
         if level is Level.ERROR:
             self.get_logger().error(message)
         else:
@@ -353,8 +356,12 @@ class Recorder(Node):
         lost = self._lost()
         if lost:
             return Level.WARN, f"messages lost on {', '.join(lost)}"
-        if recording.messages_waiting > WARN_WAITING:
-            return Level.WARN, "the disk is slower than the graph"
+        if recording.bytes_waiting > WARN_WAITING:
+            waiting = megabytes(recording.bytes_waiting)
+            return (
+                Level.WARN,
+                f"the disk, or this machine, is slower than the graph: {waiting} wait",
+            )
         warning = self._space_warning()
         if not warning and self._refused:
             warning = "; ".join(self._refused.values())

@@ -94,6 +94,11 @@ class Recording:
         """Messages received that the thread has not taken yet."""
         return self._jobs.qsize()
 
+    @property
+    def bytes_waiting(self) -> int:
+        """Their size [B]."""
+        return self.bytes_received - self._bytes_done
+
     def add_topic(self, topic: BagTopic) -> None:
         """Announce a topic; before the first `append` with its name."""
         self._put(lambda: self._add_topic(topic))
@@ -102,7 +107,7 @@ class Recording:
         self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int = 0
     ) -> None:
         """Queue one serialised message; times are the system clock's [ns]."""
-        if self.error is not None or self.bytes_received - self._bytes_done > WAITING_LIMIT:
+        if self.error is not None or self.bytes_waiting > WAITING_LIMIT:
             self._drop(topic)
             return
         self.bytes_received += len(data)

@@ -240,6 +240,8 @@ def test_topics_with_subscribers_only_are_recorded_from_the_first_message(
     publisher = source.publisher(Int32, "estop")
     source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
     publisher.publish(Int32(data=1))
+    # What is not acknowledged goes with its publisher.
+    assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
     source.node.destroy_publisher(publisher)
     source.wait(lambda: not graph.count_publishers("/estop"), "the publisher to go")
     assert end(process, signal.SIGINT)[0] == 0
