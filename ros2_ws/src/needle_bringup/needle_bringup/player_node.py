@@ -5,12 +5,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
-import select
 import signal
 import sys
-import termios
 import time
-import tty
 from collections.abc import Iterator
 from functools import partial
 from types import FrameType
@@ -33,6 +30,7 @@ from needle_bringup.parameters import AnsweringNodes
 from needle_bringup.playback import PlaybackClock, ReadAhead
 from needle_bringup.player_options import PlayerOptions, parse_options, require_fits
 from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
+from needle_bringup.terminal_keys import Keys
 from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.conversions import RELIABLE, to_stamp
@@ -272,30 +270,6 @@ def _message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
-class _Keys:
-    """The keys pressed in a terminal; none where there is no terminal."""
-
-    def __init__(self) -> None:
-        self._file = sys.stdin.fileno() if sys.stdin is not None and sys.stdin.isatty() else None
-        self._before: list[Any] = []
-
-    def __enter__(self) -> _Keys:
-        if self._file is not None:
-            self._before = termios.tcgetattr(self._file)
-            tty.setcbreak(self._file)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._file is not None:
-            termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
-
-    def pressed(self) -> str:
-        """Return the key pressed since the last call, or an empty text."""
-        if self._file is None or not select.select([self._file], [], [], 0.0)[0]:
-            return ""
-        return sys.stdin.read(1)
-
-
 def _play(player: Player, loop: bool, stopped: list[bool]) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(player)
@@ -306,7 +280,7 @@ def _play(player: Player, loop: bool, stopped: list[bool]) -> int:
         leave=False,
         bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar pauses",
     )
-    with bar, _Keys() as keys:
+    with bar, Keys() as keys:
         player.prepare(partial(executor.spin_once, 0.05))
         while True:
             with contextlib.closing(ReadAhead(player.read)) as source:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import dataclasses
 import importlib
 import json
 import signal
@@ -25,19 +24,18 @@ from rclpy.subscription import Subscription
 from needle_bringup.allocator import keep_freed_memory
 from needle_bringup.bag_files import recover_hint
 from needle_bringup.bag_metadata import BagTopic
-from needle_bringup.bag_writer import COMPRESSIONS
 from needle_bringup.conversions import IMAGE_TYPES, offered_qos, strictest_request
-from needle_bringup.free_space import megabytes
 from needle_bringup.message_definitions import full_definition
 from needle_bringup.message_loss import SequenceGaps
 from needle_bringup.parameters import ParameterSnapshots
 from needle_bringup.provenance import commit, distribution, versions
-from needle_bringup.recording import RESERVE, Recording
+from needle_bringup.recorder_health import RecorderHealth
+from needle_bringup.recorder_parameters import RecorderParameters
+from needle_bringup.recording import Recording
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
-from needle_common.parameter_fields import check_fields, parameter
 from needle_common.parameters import NodeParameters
 
 HELP = """
@@ -64,60 +62,8 @@ IMAGE_DEPTH = 60
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
 LAST_WORDS_LIMIT = 1.0
-# Bytes that wait for the disk: two seconds of stereo images.
-WARN_WAITING = 100_000_000
-# The disk is nearly full when it lasts less than this at the present rate [s], or when what is
-# left is less than so many times the reserve.
-WARN_BEFORE = 120.0
-WARN_RESERVES = 3
 REPORT_PERIOD = 0.5
 PARAMETER_EVENTS = "/parameter_events"
-
-
-@dataclasses.dataclass(frozen=True)
-class RecorderParameters:
-    """What the recorder can be told."""
-
-    bag: str = parameter(
-        "",
-        unit="-",
-        description="The bag's directory; empty: a new time-stamped one here.",
-        read_only=True,
-    )
-    calibration_file: str = parameter(
-        "", unit="-", description="A file to keep in the bag as calibration.yaml.", read_only=True
-    )
-    run_info: str = parameter(
-        "",
-        unit="-",
-        description="Text about the run to keep in the bag: YAML `key: value` lines or JSON.",
-        read_only=True,
-    )
-    max_file_size: int = parameter(
-        4_000_000_000,
-        unit="B",
-        lower=0,
-        description="Messages in one data file, after which another is begun; 0: no bound.",
-        read_only=True,
-    )
-    compression: str = parameter(
-        "none",
-        unit="-",
-        choices=COMPRESSIONS,
-        description="Of the data: zstd takes a third of a core for noisy images.",
-        read_only=True,
-    )
-    reserve: int = parameter(
-        RESERVE,
-        unit="B",
-        lower=0,
-        description="Free space at which the recording ends; at most a tenth of the disk.",
-        read_only=True,
-    )
-
-    def __post_init__(self) -> None:
-        """Check the fields."""
-        check_fields(self)
 
 
 class _Topic:
@@ -155,7 +101,6 @@ class Recorder(Node):
         self._topics: dict[str, _Topic] = {}
         self._refused: dict[str, str] = {}
         self._told: str = ""
-        self._bytes_before, self._rate = 0, 0.0
         self.bag = Path(bag)
         self.recording = Recording(
             self.bag,
@@ -164,6 +109,7 @@ class Recorder(Node):
             compression=self._settings.compression,
             reserve=self._settings.reserve,
         )
+        self._health = RecorderHealth(self.recording, self.bag)
         try:
             self._write_provenance(calibration)
             self._snapshots = ParameterSnapshots(self, self._take_parameters)
@@ -325,19 +271,16 @@ class Recorder(Node):
     def report(self) -> None:
         """Publish the recording's health."""
         recording = self.recording
-        received = recording.bytes_received
-        # A second's mean or so: images come in bursts.
-        self._rate += 0.5 * ((received - self._bytes_before) / REPORT_PERIOD - self._rate)
-        self._bytes_before = received
+        lost = self._lost()
         values = {
             "bag": str(self.bag),
             "topics": str(len(self._topics)),
             "messages": str(recording.messages_received),
             "messages_waiting": str(recording.messages_waiting),
-            "messages_lost": str(sum(self._lost().values())),
-            "size_bytes": str(received),
+            "messages_lost": str(sum(lost.values())),
+            "size_bytes": str(recording.bytes_received),
         }
-        level, message = self._health()
+        level, message = self._health.look(REPORT_PERIOD, lost, list(self._refused.values()))
         self._diagnostics.set("bag", Diagnostic(level, message, values))
         # Once for each kind of trouble: the figures at the end of a message change.
         kind = message.partition(":")[0]
@@ -348,35 +291,6 @@ class Recorder(Node):
             self.get_logger().error(message)
         else:
             self.get_logger().warning(message)
-
-    def _health(self) -> tuple[Level, str]:
-        recording = self.recording
-        if recording.error is not None:
-            return Level.ERROR, f"recording ended: {recording.error}"
-        lost = self._lost()
-        if lost:
-            return Level.WARN, f"messages lost on {', '.join(lost)}"
-        if recording.bytes_waiting > WARN_WAITING:
-            waiting = megabytes(recording.bytes_waiting)
-            return (
-                Level.WARN,
-                f"the disk, or this machine, is slower than the graph: {waiting} wait",
-            )
-        warning = self._space_warning()
-        if not warning and self._refused:
-            warning = "; ".join(self._refused.values())
-        return (Level.WARN, warning) if warning else (Level.OK, "recording")
-
-    def _space_warning(self) -> str:
-        space = self.recording.space
-        try:
-            usable = space.usable()
-        except OSError as error:
-            return f"cannot look at the disk of {self.bag}: {error.strerror}"
-        if usable >= max(WARN_BEFORE * self._rate, WARN_RESERVES * space.reserve):
-            return ""
-        reserve = megabytes(space.reserve)
-        return f"the disk of {self.bag} is nearly full: recording ends at {reserve} free"
 
     def _lost(self) -> dict[str, int]:
         """Return how many messages of which topic are not in the bag."""
