@@ -153,7 +153,7 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         # Motors that move by a SYNC period with every SYNC repeat a run to the count.
         "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},
         "device_driver": driver,
-        "stereo_tracker": {},
+        "stereo_tracker": {"wait_for_recorder": True},
         "plane_controller": {
             "preset": options.controller,
             "depth": options.depth_mm * 1e-3,

@@ -45,6 +45,12 @@ class StereoTrackerParameters:
         upper=60.0,
         read_only=True,
     )
+    wait_for_recorder: bool = parameter(
+        False,
+        unit="-",
+        description="Take images only when a node named recorder listens to what is found.",
+        read_only=True,
+    )
     needle_width: float = parameter(
         0.7e-3,
         unit="m",

@@ -15,7 +15,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamp
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
 from needle_common.conversions import (
     IMAGES,
     IMAGES_BEST_EFFORT,
@@ -99,22 +99,29 @@ class StereoTrackerNode(Node):
             )
             self.create_subscription(PoseStamped, "target_plane", self._on_target, LATCHED)
         self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
-        quality = IMAGES if parameters.reliable_images else IMAGES_BEST_EFFORT
+        self._image_quality = IMAGES if parameters.reliable_images else IMAGES_BEST_EFFORT
+        self._hears_images = False
+        if not parameters.wait_for_recorder:
+            self._hear_images()
+        self.create_timer(_CHECK_PERIOD, self._check, clock=STEADY_CLOCK)
+        self._report()
+
+    def _hear_images(self) -> None:
+        """Subscribe to the images."""
+        self._hears_images = True
         for side in SIDES:
             self.create_subscription(
                 Image,
                 f"stereo/{side}/image_raw",
                 lambda message, side=side: self._on_image(side, message),
-                quality,
+                self._image_quality,
             )
             self.create_subscription(
                 CameraInfo,
                 f"stereo/{side}/camera_info",
                 lambda message, side=side: self._on_camera_info(side, message),
-                quality,
+                self._image_quality,
             )
-        self.create_timer(_CHECK_PERIOD, self._check, clock=STEADY_CLOCK)
-        self._report()
 
     def _on_camera_info(self, side: str, message: CameraInfo) -> None:
         problem = camera_info_problem(message, side, self._cameras[side])
@@ -136,6 +143,9 @@ class StereoTrackerNode(Node):
         self._publish(self._answers.add_image(side, stamp, frame, now))
 
     def _check(self) -> None:
+        # An answer that is sent before the recorder listens is not in the bag.
+        if not self._hears_images and not unrecorded(self, (self._tip, self._tip_pose)):
+            self._hear_images()
         self._publish(self._answers.ready(time.monotonic()))
         self._report()
 

@@ -163,6 +163,41 @@ def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
     bench.until(lambda: bench.health["images"][:2] == (0, "pairs complete"))
 
 
+def test_no_image_is_taken_before_the_recorder_listens(context: Context) -> None:
+    node = StereoTrackerNode(
+        context=context, parameter_overrides=[Parameter("wait_for_recorder", value=True)]
+    )
+    recorder = Node("recorder", context=context)
+    executor = SingleThreadedExecutor(context=context)
+    executor.add_node(node)
+    executor.add_node(recorder)
+
+    def spin_until(condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < end, "waited in vain"
+            executor.spin_once(timeout_sec=0.05)
+
+    try:
+        recorder.create_subscription(PointStamped, "needle/tip", lambda _: None, RELIABLE)
+        spin_until(lambda: node._tip.get_subscription_count() == 1)
+        node._check()
+        assert node.count_subscribers("stereo/left/image_raw") == 0
+        recorder.create_subscription(
+            PoseWithCovarianceStamped, "needle/tip_pose", lambda _: None, RELIABLE
+        )
+        spin_until(
+            lambda: all(
+                node.count_subscribers(f"stereo/{side}/image_raw") for side in ("left", "right")
+            )
+        )
+    finally:
+        for each in (node, recorder):
+            executor.remove_node(each)
+            each.destroy_node()
+        executor.shutdown()
+
+
 def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None:
     assert found(bench.pair(1_000_000_000, images))
     bench.image("left", 1_020_000_000, images[0])
