@@ -28,6 +28,7 @@ from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
 from needle_tracker.tip_fit import Expected, ImageTip, fit_tip, hidden
+from needle_tracker.tip_motion import TipMotion
 from needle_tracker.track import TOO_FAR, Track, TrackState
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip, triangulate
@@ -36,10 +37,14 @@ UNCLEAR = "not clear enough to begin with"
 HIDDEN = "the end is hidden in both images"
 _SOUND_PX, _SOUND_ALONG_PX = 0.3, 1.0  # what both ends must keep to begin a track [px]
 _CONTRAST_RATIO = 2.2
+# What is enough to begin with a needle that is so short [m], near where the entry has it.
+_YOUNG, _YOUNG_PX, _YOUNG_ALONG_PX, _YOUNG_SURPRISE = 15e-3, 0.6, 3.0, 9.0
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_RIVALS, _UNSOUND_RIVALS = 2, 3
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
+# With no end in sight, lines so good tell where the needle is, for so much more insertion [px, m].
+_HIDDEN_LINE_PX, _HIDDEN_WAY = 1.0, 5e-3
 _FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
 _GRID_AHEAD = 1.5e-3
@@ -125,6 +130,7 @@ class StereoTracker:
         self.track = Track(settings.gates)
         self._last: tuple[ImageTip, ImageTip] | None = None
         self._contradicted = 0
+        self._clear_at: float | None = None
 
     def warm_up(self) -> None:
         """Compile, or load, all that is compiled: the first pair must not wait for it.
@@ -150,6 +156,7 @@ class StereoTracker:
         self.track.reset()
         self._last = None
         self._contradicted = 0
+        self._clear_at = None
 
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair.
@@ -205,6 +212,8 @@ class StereoTracker:
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:
             self._last = (left_tip, right_tip) if anew else self._steadied(left_tip, right_tip)
+            if left_tip.clear or right_tip.clear:
+                self._clear_at = insertion
         reason = "not confirmed yet" if believed is None else ""
         return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
 
@@ -255,13 +264,20 @@ class StereoTracker:
             if sights is None or self._contradicted > _CONTRADICTED:
                 return None
             found = sights.tips
-        if not (found[0].clear or found[1].clear):
+        if not (found[0].clear or found[1].clear or self._goes_on(found, insertion)):
             measured = Measurement(None, self.track.state, HIDDEN, found)
         else:
             measured = self._judged(found, insertion)
             if measured.tip is None and measured.reason != UNCERTAIN:
                 return None
         return dataclasses.replace(measured, regions=regions)
+
+    def _goes_on(self, found: tuple[ImageTip, ImageTip], insertion: float | None) -> bool:
+        """Return whether two shafts without ends are enough: the stage says how far they go."""
+        if self._clear_at is None or insertion is None:
+            return False
+        lines = all(tip.sigma_across <= _HIDDEN_LINE_PX for tip in found)
+        return lines and abs(insertion - self._clear_at) <= _HIDDEN_WAY
 
     def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
         """Look everywhere that can be reached (with this insertion, where known)."""
@@ -316,9 +332,11 @@ class StereoTracker:
         if measured.reason == TOO_FAR and sound:
             wanted = _SOUND_RIVALS
         elif measured.tip is not None and not fits and not sound:
-            if self.track.anchor is None:
-                return dataclasses.replace(measured, tip=None, reason=UNCLEAR)
-            wanted = _UNSOUND_RIVALS
+            begun = self.track.state in (TrackState.TRACKING, TrackState.LOST)
+            if begun or not self._is_young(measured, insertion):
+                if self.track.anchor is None:
+                    return dataclasses.replace(measured, tip=None, reason=UNCLEAR)
+                wanted = _UNSOUND_RIVALS
         elif measured.tip is not None and not fits and self.track.state is TrackState.LOST:
             certain = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
             wanted = 0 if certain else _SOUND_RIVALS
@@ -333,6 +351,20 @@ class StereoTracker:
         if self.track.contest(tip, insertion, wanted):
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
         return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
+
+    def _is_young(self, measured: Measurement, insertion: float | None) -> bool:
+        """Return whether a short needle is seen about where the entry has it.
+
+        There it is enough to see it less well: nothing else begins at the entry, and a needle that
+        waits for its first tip to be found never gets to where it is seen better.
+        """
+        if insertion is None or insertion > _YOUNG or measured.tip is None:
+            return False
+        if not is_sound(measured.image_tips, _YOUNG_PX, _YOUNG_ALONG_PX):
+            return False
+        reach = self.settings.gates.reach
+        entry = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
+        return TipMotion.start(entry).surprise(measured.tip) < _YOUNG_SURPRISE
 
     def _paths(self, image: Image, i: int, insertion: float | None) -> list[Path]:
         """Return what may be the needle in an image, as long as the insertion says."""
