@@ -118,12 +118,15 @@ class EmulatedBus:
         """Let a drive's processor hang: silent, while its motor ends at its set-point."""
         self.drives[axis].hung = True
 
-    def restore(self) -> None:
+    def restore(self, now: float) -> None:
         """End what goes on: cut bus, stalled motors, hung processors. Faults stay until reset."""
         self.is_cut = False
         for drive in self.drives.values():
             drive.motor.stalled = False
-            drive.hung = False
+            if drive.hung:
+                drive.hung = False
+                # Its timers went on: what it missed meanwhile is seen before what comes now.
+                drive.tick(now)
 
     def _move_until(self, now: float) -> None:
         if self._clock is not MotionClock.STEADY:

@@ -78,7 +78,7 @@ def obey(line: str, bus: EmulatedBus, now: float) -> PlugOrder | None:
     elif name == "unplug":
         return PlugOrder.OUT
     else:
-        bus.restore()
+        bus.restore(now)
         return PlugOrder.IN
     return None
 

@@ -342,7 +342,7 @@ def test_stalled_motor_is_a_following_error(master: Master) -> None:
     assert k in (9, 10)
     assert master.frames(0x81) == [bytes([0x11, 0x86, 0x21, 0, 0, 0, 0, 0])]
     assert master.true_counts() == at
-    master.bus.restore()
+    master.bus.restore(master.now)
     master.sync(10)
     assert master.true_counts() == at
 
@@ -391,8 +391,25 @@ def test_hung_drive_is_silent_and_ends_at_its_set_point(master: Master) -> None:
     master.sync(20)
     assert not [f for f in master.heard if f.identifier & 0x7F == INSERTION]
     assert master.true_counts() == 8_000.0
-    master.bus.restore()
+    master.bus.restore(master.now)
     assert master.state() == 0x27
+
+
+def test_drive_that_comes_back_has_missed_the_heartbeat_first(master: Master) -> None:
+    master.write(0x1016, 1, MASTER << 16 | 300, 4)
+    master.network.send_message(0x700 + MASTER, b"\5")
+    master.enable(CSP)
+    before = run_at(master, 800)
+    master.bus.hang("insertion")
+    master.sync(20)
+    at = master.true_counts()
+    assert at == before + 800
+    master.bus.restore(master.now)
+    master.network.send_message(0x700 + MASTER, b"\5")
+    master.target(round(at) + 800)
+    master.sync(5)
+    assert (master.state(), master.read(0x603F)) == (0x08, 0x8130)
+    assert master.true_counts() == at
 
 
 def test_cut_bus_loses_frames_both_ways() -> None:
