@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import numpy as np
+
 from needle_bringup.rerun import Output, stored
 from needle_common.conversions import to_nanoseconds, values_of
 from needle_common.errors import UserError
@@ -26,8 +28,11 @@ _MEMBERS = {
     2: "integer_value",
     3: "double_value",
     4: "string_value",
+    5: "byte_array_value",
+    6: "bool_array_value",
     7: "integer_array_value",
     8: "double_array_value",
+    9: "string_array_value",
 }
 
 
@@ -190,4 +195,4 @@ def plain_value(value: Any) -> Any:
     content = getattr(value, _MEMBERS.get(value.type, "string_value"))
     if isinstance(content, (bool, int, float, str)):
         return content
-    return tuple(element.item() for element in content)
+    return tuple(np.asarray(content).tolist())
