@@ -174,6 +174,11 @@ class Track:
         self.anchor = Anchor(motion, insertion)
         return tip if self.state is TrackState.TRACKING else None
 
+    @property
+    def is_unbroken(self) -> bool:
+        """Whether the pair before had a believed tip."""
+        return self._misses == 0 and self._hidden == 0
+
     def is_certain(self, insertion: float | None) -> bool:
         """Return whether the tip's place is known so well that half a sight of it is enough."""
         predicted = self.predict(insertion)

@@ -261,7 +261,9 @@ class StereoTracker:
             sights = weighed(self.views, found, predicted.motion)
             contradicted = sights is not None and sights.contradicted
             self._contradicted = self._contradicted + 1 if contradicted else 0
-            if sights is None or self._contradicted > _CONTRADICTED:
+            # One view alone bridges what passes; it does not take up a track that has gaps.
+            alone = contradicted and not self.track.is_unbroken
+            if sights is None or alone or self._contradicted > _CONTRADICTED:
                 return None
             found = sights.tips
         if not (found[0].clear or found[1].clear or self._goes_on(found, insertion)):
