@@ -12,6 +12,7 @@ from typing import Any
 
 from needle_bringup.drive_hand_node import INSERTION_COUNT, DriveHand
 from needle_bringup.trial_processes import TrialProcesses, drives_and_driver
+from needle_common.conversions import NANOSECONDS
 from needle_common.errors import UserError
 
 AXES = ("insertion", "rotation")
@@ -26,7 +27,13 @@ _STILL = 0.3
 
 
 def fault_trials(
-    folder: Path, domain: int, kinds: Sequence[str], count: int, seed: int
+    folder: Path,
+    domain: int,
+    kinds: Sequence[str],
+    count: int,
+    seed: int,
+    *,
+    watchdog: float | None = None,
 ) -> Iterator[dict[str, Any]]:
     """Yield what came of each trial, in real time.
 
@@ -42,11 +49,16 @@ def fault_trials(
         Trials of each.
     seed : int
         Of moments and motions.
+    watchdog : float, optional
+        How long driver and drives wait for each other, in place of the driver's defaults [s].
     """
     for kind in kinds:
         if kind not in FAULTS:
             raise UserError(f"fault {kind!r} is not one of {', '.join(FAULTS)}")
-    processes = TrialProcesses(folder, domain, drives_and_driver({}, {"retraction_speed": _FAST}))
+    driver = {"retraction_speed": _FAST}
+    if watchdog is not None:
+        driver |= {"watchdog": watchdog, "reply_age_limit": watchdog}
+    processes = TrialProcesses(folder, domain, drives_and_driver({}, driver))
     hand = DriveHand()
     try:
         hand.until(hand.ready, "the driver", 60.0)
@@ -123,9 +135,12 @@ def _fault(
     give_up_at = time.monotonic() + _LONGEST
     while hand.status.get("state") in ("HOLDING", "MOVING") and time.monotonic() < give_up_at:
         stream.keep_going()
-    end = time.monotonic() + _AFTER_FAULT
-    while time.monotonic() < end:
+    # The motors' own time: on a starved machine the last that was heard may be old.
+    end_ns = time.time_ns() + round(_AFTER_FAULT * NANOSECONDS)
+    while hand.motors[-1].stamp_ns < end_ns:
         stream.keep_going()
+        if time.monotonic() > give_up_at + _LONGEST:
+            raise UserError("the drives tell no positions any more")
     stopped = hand.motors[-1]
     moving = [
         at

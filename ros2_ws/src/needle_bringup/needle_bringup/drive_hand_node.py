@@ -39,8 +39,9 @@ _PATIENCE = 20.0
 
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """Where the motors really were [m], [rad], and when that was heard, steady clock [s]."""
+    """Where the motors really were [m], [rad], at their time [ns], heard at steady time [s]."""
 
+    stamp_ns: int
     heard_at: float
     insertion: float
     rotation: float
@@ -200,7 +201,8 @@ class DriveHand(Node):
 
     def _on_positions(self, message: JointState) -> None:
         at = dict(zip(message.name, message.position, strict=True))
-        self.motors.append(Motors(time.monotonic(), at[JOINTS[0]], at[JOINTS[1]]))
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        self.motors.append(Motors(stamp_ns, time.monotonic(), at[JOINTS[0]], at[JOINTS[1]]))
 
     def _on_result(self, message: Header) -> None:
         self.results[to_nanoseconds(message.stamp)] = message.frame_id

@@ -30,6 +30,7 @@ def main() -> int:
     parser.add_argument("count", type=int)
     parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--watchdog", type=float, help="faults: in place of the driver's own [s]")
     given = parser.parse_args()
 
     def run() -> int:
@@ -49,7 +50,10 @@ def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Iterator[
     if given.trial == "steps":
         yield random_steps(folder, domain, given.count, given.seed)
     elif given.trial == "faults":
-        yield from fault_trials(folder, domain, given.kinds or FAULTS, given.count, given.seed)
+        kinds = given.kinds or FAULTS
+        yield from fault_trials(
+            folder, domain, kinds, given.count, given.seed, watchdog=given.watchdog
+        )
     else:
         yield from kill_trials(folder, domain, given.kinds or KILLED, given.count, given.seed)
 

@@ -35,8 +35,10 @@ def test_random_steps_add_up(tmp_path: Path) -> None:
 
 
 def test_faults_are_named_and_need_a_command_to_go_on() -> None:
-    outcomes = verify_step_d._trials("faults", 1, "cut_bus", "emcy", "kill_driver")
-    assert [found["fault"] for found in outcomes] == ["cut_bus", "emcy", "kill_driver"]
+    # Distances are not judged here: a busy machine gets more time.
+    kinds = ("cut_bus", "emcy", "kill_driver")
+    outcomes = verify_step_d._trials("faults", 1, *kinds, "--watchdog", 0.5)
+    assert tuple(found["fault"] for found in outcomes) == kinds
     for found in outcomes:
         findings = list(verify_step_d.judge_recovery(found["fault"], [found]))
         assert [finding for finding in findings if not finding.passed] == []
