@@ -14,6 +14,7 @@ from needle_bringup import control_studies, verify_step_b
 from needle_bringup.control_studies import TROUBLE, Measured, Study, judge
 from needle_bringup.verification import Finding, Workbench
 from needle_bringup.verify_step_b import Size
+from needle_common.errors import UserError
 from needle_sim import monte_carlo
 
 # The other troubles are steered on a plant of its own by needle_controller's tests.
@@ -84,5 +85,5 @@ def test_a_study_that_does_not_run_is_one_line(
 ) -> None:
     monkeypatch.setattr(control_studies, "find_executable", lambda *_: "/bin/false")
     study = Study("broken", "best", ())
-    with pytest.raises(verify_step_b.UserError, match="broken"):
+    with pytest.raises(UserError, match="broken"):
         control_studies.run(study, tmp_path, 1)

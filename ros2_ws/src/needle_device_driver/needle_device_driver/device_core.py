@@ -199,6 +199,11 @@ class DeviceCore:
         self.end_motion(f"aborted: {reason}", stop=True)
         self.go(trigger, reason)
         self.notice(reason, rule)
+        try:
+            # A drive that keeps its power pulls a blocked axis on as soon as it comes free.
+            self._axes.each(lambda axis: axis.power(False))
+        except AxisError as error:
+            self.notice(str(error), error.rule)
 
     # ---- the cycle ----------------------------------------------------------------------------
 

@@ -257,6 +257,7 @@ class ScriptedDrive:
         self.position = 0
         self.target = 0
         self.next_target = 0
+        self.demand = 0
         self.more_status = 0
         self.nmt = 0x7F
         self.silent = False
@@ -315,8 +316,17 @@ class ScriptedDrive:
                 self.homing_for = -1
                 self.position = 0
                 self.more_status = 0x1400
-        elif self.state == "enabled" and self.mode == 8 and not self.blocked:
-            self.position = self.target
+        else:
+            self.follow()
+
+    def follow(self) -> None:
+        """With power, also in a quick stop, the motor goes to the demand."""
+        if self.state == "enabled" and self.mode == 8:
+            self.demand = self.target
+        elif self.state != "quick stop":
+            self.demand = self.position
+        if not self.blocked:
+            self.position = self.demand
 
     def command(self, word: int) -> None:
         if self.state == "fault":
