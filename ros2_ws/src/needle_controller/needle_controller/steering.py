@@ -143,7 +143,7 @@ class Steering:
     def on_tip(self, tip: TipMeasurement) -> list[Action]:
         """Take a measured tip: used, kept until all that belongs to it has come, or refused."""
         wanted = self._steering and self.awaiting is Awaiting.TIP
-        refusal = self.intake.offer(tip, self.tip_after_ns if wanted else None)
+        refusal = self.intake.offer(tip, self.tip_after_ns if wanted else None, self.settings)
         return self._refuse(refusal) if refusal is not None else self._use_tip()
 
     def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:

@@ -48,7 +48,9 @@ class TipIntake:
         self._pending: TipMeasurement | None = None
         self._pending_since: float | None = None
 
-    def offer(self, tip: TipMeasurement, after_ns: int | None) -> Refusal | None:
+    def offer(
+        self, tip: TipMeasurement, after_ns: int | None, settings: SteeringSettings
+    ) -> Refusal | None:
         """Take a tip as it came; it waits if it is the first that is wanted.
 
         Parameters
@@ -57,6 +59,8 @@ class TipIntake:
             The tip.
         after_ns : int or None
             A tip exposed after this is wanted [ns]; None if none is.
+        settings : SteeringSettings
+            How far out a tip may be.
 
         Returns
         -------
@@ -71,7 +75,13 @@ class TipIntake:
         )
         if after_ns is not None and tip.stamp_ns > after_ns and self._pending is None:
             self._pending, self._pending_since = tip, None
-        return None
+            return None
+        # Nobody waits for this one, but a source that is far out is told of at once.
+        joints = self.joints.at(tip.stamp_ns) or self.joints.latest
+        if joints is None:
+            return None
+        refusal = refuse_position(tip, joints, None, settings.tip_margin)
+        return None if refusal is None else self._count(refusal)
 
     def take(self, settings: SteeringSettings) -> AcceptedTip | Refusal | None:
         """Return the waiting tip once all that belongs to it has come; None until then."""

@@ -352,6 +352,19 @@ def test_millimetres_are_a_jump_no_needle_makes() -> None:
     assert "jumped" in logged(rig.steering.on_tip(bad))
 
 
+def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    bad = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.1, 0.0, 1.0]))
+    assert "from the entry point" in logged(rig.steering.on_tip(bad))
+    assert rig.steering.tips_rejected == 1
+    good = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.0, 0.0, 1e-3]))
+    assert rig.steering.on_tip(good) == []
+    rig.run(step)
+    sent(rig.expose())
+
+
 def test_an_old_stamp_is_refused_and_does_not_set_the_clock_back() -> None:
     rig = Rig()
     rig.run(sent(rig.expose()))
