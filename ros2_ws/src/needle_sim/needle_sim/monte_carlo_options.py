@@ -30,7 +30,8 @@ figures (--json FILE has all of them, flat; null where there is none):
   rms, p95, max       of the distance over the last 20 steps of all runs
   settle              insertion of the last entry into +-1 mm, of the runs that end inside
   rotation_mean       how much the base turns, either way, summed over a run
-  wall_s, cpu_s       time of the study, by the clock and on the processor (one thread)
+  wall_s, cpu_s       time of the study, by the clock and on the processor (threads of numpy
+                      that wait count too: OPENBLAS_NUM_THREADS=1 keeps them out)
   diverged            share that ends outside, farther off than its start, and still moving away
 
 examples:
