@@ -9,7 +9,7 @@ import time
 from types import FrameType
 from typing import Any, TextIO
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -26,11 +26,13 @@ from needle_bringup.operator_sequence import (
     ServiceCall,
 )
 from needle_bringup.progress import PROGRESS_FD, Progress
+from needle_bringup.recorder_parameters import PARAMETERS_OF
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
-from needle_common.conversions import HOLD, LATCHED, to_stamp, values_of
+from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import RECORDER
 
 HELP = """\
 operator: stands in for the person who holds the needle's switch, in simulation.
@@ -69,6 +71,9 @@ class OperatorNode(Node):
             for call in PREPARATION
         }
         self._last_stamp = 0
+        self._recorded_nodes: set[str] = set()
+        if values.wait_for_recorder:
+            self.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
         self._hold = self.create_publisher(Joy, "device/hold", HOLD)
         self._controller_status = self.create_subscription(
             DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
@@ -142,6 +147,22 @@ class OperatorNode(Node):
         self._sequence.see_device(values_of(message), time.monotonic())
         self._advance()
 
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == f"{RECORDER}: {PARAMETERS_OF}":
+                self._recorded_nodes = set(status.message.split(", "))
+
+    def _unrecorded_nodes(self) -> list[str]:
+        """Return whose parameters are not in the bag yet: without them no run can be repeated."""
+        if not self._settings.values.wait_for_recorder:
+            return []
+        names = {
+            f"{namespace.rstrip('/')}/{name}"
+            for name, namespace in self.get_node_names_and_namespaces()
+            if not name.startswith("_")
+        }
+        return [f"recorder of {name}'s parameters" for name in sorted(names - self._recorded_nodes)]
+
     def _missing(self) -> list[str]:
         missing = [
             f"service {name}"
@@ -153,7 +174,7 @@ class OperatorNode(Node):
                 missing.append(f"publisher of {subscription.topic_name}")
         if not self._hold.get_subscription_count():
             missing.append("subscriber of device/hold")
-        return missing
+        return missing or self._unrecorded_nodes()
 
     def _call(self, call: ServiceCall) -> Future[Any]:
         request = Trigger.Request() if call.data is None else SetBool.Request(data=call.data)

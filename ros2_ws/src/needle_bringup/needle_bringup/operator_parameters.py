@@ -42,6 +42,12 @@ class OperatorParameters:
         read_only=True,
         description="The hold is released when the needle has not moved on for this long.",
     )
+    wait_for_recorder: bool = parameter(
+        False,
+        unit="-",
+        read_only=True,
+        description="Begin only when a node named recorder has the parameters of all nodes.",
+    )
 
     def __post_init__(self) -> None:
         check_fields(self)

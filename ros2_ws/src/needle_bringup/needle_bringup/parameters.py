@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
@@ -14,6 +13,8 @@ from rclpy.node import Node
 from rclpy.task import Future
 
 GIVE_UP_AFTER = 30.0
+# An answer can be lost when the node that gives it does not know the client yet [s].
+ASK_AGAIN = 0.5
 
 _FIELDS = {
     ParameterType.PARAMETER_BOOL: "bool_value",
@@ -59,7 +60,8 @@ class ParameterSnapshots:
         self._node = node
         self._on_snapshot = on_snapshot
         self._first_seen: dict[str, float] = {}
-        self._asked: set[str] = set()
+        self._asked: dict[str, float] = {}
+        self._settled: set[str] = set()
         self._clients: dict[str, tuple[Client, Client]] = {}
         self._values: dict[str, dict[str, Any]] = {}
         self._now: dict[str, dict[str, Any]] = {}
@@ -100,7 +102,9 @@ class ParameterSnapshots:
             full_name = f"{namespace.rstrip('/')}/{name}"
             if full_name == self._node.get_fully_qualified_name():
                 self._take_own(full_name)
-            elif full_name not in self._asked:
+            elif full_name in self._settled:
+                self._drop_clients(full_name)
+            else:
                 self._ask_when_ready(full_name)
 
     def _take_own(self, full_name: str) -> None:
@@ -117,13 +121,16 @@ class ParameterSnapshots:
                 self._node.create_client(GetParameters, f"{full_name}/get_parameters"),
             )
         names_of, values_of = self._clients[full_name]
-        if names_of.service_is_ready() and values_of.service_is_ready():
-            self._asked.add(full_name)
+        if now - self._first_seen[full_name] > GIVE_UP_AFTER:
+            self._settled.add(full_name)
+        elif (
+            now - self._asked.get(full_name, -ASK_AGAIN) >= ASK_AGAIN
+            and names_of.service_is_ready()
+            and values_of.service_is_ready()
+        ):
+            self._asked[full_name] = now
             future = names_of.call_async(ListParameters.Request())
             future.add_done_callback(lambda answer: self._ask_values(full_name, answer))
-        elif now - self._first_seen[full_name] > GIVE_UP_AFTER:
-            self._asked.add(full_name)
-            self._drop_clients(full_name)
 
     def _ask_values(self, full_name: str, answer: Future) -> None:
         response = answer.result()
@@ -135,9 +142,11 @@ class ParameterSnapshots:
 
     def _take_values(self, full_name: str, names: list[str], answer: Future) -> None:
         response = answer.result()
-        if response is not None:
-            values = [plain_value(value) for value in response.values]
-            self._take(full_name, dict(zip(names, values, strict=False)))
+        if response is None or full_name in self._settled:
+            return
+        values = [plain_value(value) for value in response.values]
+        self._settled.add(full_name)
+        self._take(full_name, dict(zip(names, values, strict=False)))
 
     def _take(self, full_name: str, values: dict[str, Any]) -> None:
         self._values[full_name] = {
@@ -149,49 +158,3 @@ class ParameterSnapshots:
     def _drop_clients(self, full_name: str) -> None:
         for client in self._clients.pop(full_name, ()):
             self._node.destroy_client(client)
-
-
-class AnsweringNodes:
-    """Which nodes have learnt of everything that this node has created.
-
-    Nodes learn of each other's publishers in the order of their creation. Who answers a question
-    by a client that was created last knows the publishers created before; a subscription that does
-    not yet know its publisher gets nothing, and neither side can tell.
-
-    Parameters
-    ----------
-    node : Node
-        The node that asks, after it has created its publishers.
-    """
-
-    ASK_AGAIN = 0.5
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._clients: dict[str, Client] = {}
-        self._asked: dict[str, float] = {}
-        self._answered: set[str] = set()
-
-    def all_of(self, names: set[str]) -> bool:
-        """Ask nodes (full names) that have not answered yet; return whether all have."""
-        for name in names - self._answered:
-            if name not in self._clients:
-                self._clients[name] = self._node.create_client(
-                    GetParameters, f"{name}/get_parameters"
-                )
-            now = time.monotonic()
-            due = now - self._asked.get(name, -self.ASK_AGAIN) >= self.ASK_AGAIN
-            if due and self._clients[name].service_is_ready():
-                self._asked[name] = now
-                future = self._clients[name].call_async(GetParameters.Request())
-                future.add_done_callback(partial(self._take_answer, name))
-        return names <= self._answered
-
-    def close(self) -> None:
-        """Drop the clients."""
-        for client in self._clients.values():
-            self._node.destroy_client(client)
-        self._clients.clear()
-
-    def _take_answer(self, name: str, _: Future) -> None:
-        self._answered.add(name)

@@ -26,7 +26,6 @@ from needle_bringup.bag_files import BagContents, raw_messages, read_contents
 from needle_bringup.bag_metadata import BagTopic
 from needle_bringup.conversions import recorded_offer
 from needle_bringup.message_definitions import full_definition, type_hash
-from needle_bringup.parameters import AnsweringNodes
 from needle_bringup.playback import PlaybackClock, ReadAhead
 from needle_bringup.player_options import PlayerOptions, parse_options, require_fits
 from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
@@ -37,6 +36,7 @@ from needle_common.conversions import RELIABLE, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import AnsweringNodes
 
 CLOCK: Final = "/clock"
 # How long a rig that is there has to show itself before the first message; how much longer those

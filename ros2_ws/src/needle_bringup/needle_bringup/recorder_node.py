@@ -30,7 +30,7 @@ from needle_bringup.message_loss import SequenceGaps
 from needle_bringup.parameters import ParameterSnapshots
 from needle_bringup.provenance import commit, distribution, versions
 from needle_bringup.recorder_health import RecorderHealth
-from needle_bringup.recorder_parameters import RecorderParameters
+from needle_bringup.recorder_parameters import PARAMETERS_OF, RecorderParameters
 from needle_bringup.recording import Recording
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
@@ -100,6 +100,7 @@ class Recorder(Node):
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics: dict[str, _Topic] = {}
         self._refused: dict[str, str] = {}
+        self._nodes: list[str] = []
         self._told: str = ""
         self.bag = Path(bag)
         self.recording = Recording(
@@ -139,6 +140,8 @@ class Recorder(Node):
     def _take_parameters(self, node: str, values: dict[str, Any]) -> None:
         document = {node: {"ros__parameters": values}}
         self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
+        self._nodes.append(node)
+        self._diagnostics.set(PARAMETERS_OF, Diagnostic(Level.OK, ", ".join(self._nodes)))
 
     def _take_parameter_event(self, data: bytes) -> None:
         changes = self._snapshots.take_event(deserialize_message(data, ParameterEvent))

@@ -8,6 +8,9 @@ from needle_bringup.bag_writer import COMPRESSIONS
 from needle_bringup.recording import RESERVE
 from needle_common.parameter_fields import check_fields, parameter
 
+# The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
+PARAMETERS_OF = "parameters_of"
+
 
 @dataclasses.dataclass(frozen=True)
 class RecorderParameters:

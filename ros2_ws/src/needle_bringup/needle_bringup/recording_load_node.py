@@ -26,10 +26,11 @@ from sensor_msgs.msg import CameraInfo, Image, JointState, Joy
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.base_node import run_node, unrecorded
+from needle_common.base_node import run_node
 from needle_common.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
 from needle_common.parameter_fields import check_fields, parameter
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import unrecorded
 
 HELP = """\
 recording_load: publishes stereo images and what goes with them, as a rig at full rate does.

@@ -58,8 +58,9 @@ OPTIONS = {
     "depth": "--depth-mm",
 }
 
-# The longest that the driver lets its drives and itself wait for each other [s].
-PATIENT_WATCHDOG = 0.5
+# How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
+# seven processes that start on two cores keep one waiting for a second [s].
+PATIENT_WATCHDOG = 5.0
 
 Parameters = dict[str, dict[str, Any]]
 
@@ -160,7 +161,7 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
             "target_offset": -options.initial_x_mm * 1e-3,
             "wait_for_recorder": True,
         },
-        "operator": {},
+        "operator": {"wait_for_recorder": True},
     }
     if options.noise_mm is not None:
         # The sensor's own data sheet: the controllers know how far off a tip can be.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -11,7 +11,6 @@ from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
@@ -22,32 +21,6 @@ from needle_common.errors import UserError
 from needle_common.parameter_fields import describe
 
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
-
-
-RECORDER = "recorder"
-
-
-def unrecorded(node: Node, publishers: Iterable[Publisher]) -> list[str]:
-    """Return what `node` publishes without a node named `recorder` listening, as `recorder of T`.
-
-    A first message that is sent before the recorder's subscription is known here is not in the
-    bag: whoever makes things happen waits until this is empty.
-
-    Parameters
-    ----------
-    node : Node
-        The node that publishes.
-    publishers : iterable of Publisher
-        Its publishers.
-    """
-    return [
-        f"recorder of {publisher.topic_name}"
-        for publisher in publishers
-        if all(
-            info.node_name != RECORDER
-            for info in node.get_subscriptions_info_by_topic(publisher.topic_name)
-        )
-    ]
 
 
 class DiagnosticsPublisher:

@@ -155,7 +155,8 @@ class PlaneControllerParameters:
         False,
         unit="-",
         read_only=True,
-        description="Steering starts only when a node named recorder listens to everything.",
+        description="Steering starts only when a node named recorder listens to everything and all "
+        "partners know this node.",
     )
     state_weights: tuple[float, ...] = parameter(
         ControlSettings.state_weights,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import (
@@ -16,12 +17,13 @@ from geometry_msgs.msg import (
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.conversions import (
     JOINT_STATES,
     LATCHED,
@@ -32,6 +34,7 @@ from needle_common.conversions import (
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.plane_control import PlaneControl
@@ -99,14 +102,19 @@ class PlaneControllerNode(Node):
         )
         self._inputs = self.create_publisher(Vector3Stamped, "needle/control_input", RELIABLE)
         self._status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
-        self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
-        self.create_subscription(DiagnosticStatus, "device/status", self._on_device, LATCHED)
-        self.create_subscription(Header, "device/result", self._on_result, RELIABLE)
+        self._sources: list[Subscription[Any]] = [
+            self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES),
+            self.create_subscription(DiagnosticStatus, "device/status", self._on_device, LATCHED),
+            self.create_subscription(Header, "device/result", self._on_result, RELIABLE),
+            self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE),
+        ]
         self.create_subscription(PoseStamped, "target_plane", self._on_plane, LATCHED)
-        self._tips = self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE)
-        self._tip_poses = self.create_subscription(
+        tip_poses = self.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip_pose, RELIABLE
         )
+        if values.tip_covariance == "from_tip_pose":
+            self._sources.append(tip_poses)
+        self._partners = AnsweringNodes(self)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
@@ -131,28 +139,21 @@ class PlaneControllerNode(Node):
 
     def _missing(self) -> list[str]:
         """Return who must be there before a message counts, where a recorder is waited for."""
-        values = self._settings.values
-        if not values.wait_for_recorder:
+        if not self._settings.values.wait_for_recorder:
             return []
-        sources = [self._tips]
-        if values.tip_covariance == "from_tip_pose":
-            sources.append(self._tip_poses)
-        silent = [
-            f"publisher of {source.topic_name}"
-            for source in sources
-            if source.get_publisher_count() == 0
-        ]
-        return silent + unrecorded(
-            self,
-            (
-                self._commands,
-                self._estimates,
-                self._reduced,
-                self._linearized,
-                self._inputs,
-                self._status,
-            ),
+        mine = (
+            self._commands,
+            self._estimates,
+            self._reduced,
+            self._linearized,
+            self._inputs,
+            self._status,
         )
+        return [
+            *self._partners.unaware_sources(self._sources),
+            *unheard(self, [self._commands]),
+            *unrecorded(self, mine),
+        ]
 
     def _on_joints(self, message: JointState) -> None:
         try:

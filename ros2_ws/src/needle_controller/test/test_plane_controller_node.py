@@ -319,10 +319,11 @@ def test_a_recorded_start_waits_for_the_tips_sources_too(context: Context) -> No
         context, target_offset=0.003, wait_for_recorder=True, tip_covariance="from_tip_pose"
     )
     said = bench.call("start").message
-    assert said.startswith("waiting for publisher of /needle/tip_pose, recorder of")
+    assert said.startswith("waiting for publisher of /needle/tip_pose, ")
+    assert "recorder of /needle/estimate" in said
     bench.outside.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
-    bench.until(lambda: bench.node._tip_poses.get_publisher_count() > 0)
-    assert bench.call("start").message.startswith("waiting for recorder of")
+    # Each source has to have said that it knows this node, too.
+    bench.until(lambda: bench.call("start").message.startswith("waiting for recorder of"))
     bench.close()
 
 

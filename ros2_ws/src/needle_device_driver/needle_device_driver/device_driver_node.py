@@ -17,12 +17,13 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_device_driver.can_link import CanLink
 from needle_device_driver.cia402_axis import Cia402Axis
 from needle_device_driver.device_interface_node import DeviceInterface
@@ -110,8 +111,11 @@ class DeviceDriverNode(LifecycleNode):
         self.get_logger().info(f"looking for the drives on {values.link_settings}")
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
+        self._sources = [self._device.commands]
         if self._sim_time:
-            self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+            clock = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+            self._sources.append(clock)
+        self._partners = AnsweringNodes(self)
 
     def _why_not_ready(self) -> str:
         if not self._active:
@@ -119,13 +123,10 @@ class DeviceDriverNode(LifecycleNode):
         missing = []
         publishers = [self._device.joint_states, self._device.results, self._device.statuses]
         if self._settings.lock_step:
-            missing += [
-                f"subscriber of {publisher.topic_name}"
-                for publisher in publishers
-                if publisher.get_subscription_count() == 0
-            ]
+            missing += unheard(self, publishers)
         if self._settings.wait_for_recorder:
             missing += unrecorded(self, publishers)
+            missing += self._partners.unaware_sources(self._sources)
         return f"waiting for {', '.join(missing)}" if missing else ""
 
     # ---- the cycle ----------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from needle_common.errors import UserError
+from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_device_driver.can_link import LINKS, LinkSettings
 from needle_device_driver.drive_settings import DriveSettings
@@ -14,6 +14,8 @@ from needle_device_driver.limits import HARD_SPEED_CAP, HARD_STEP_LENGTH_CAP, Sa
 
 # Beyond the supervisor's own limits, a drive's limits leave room for its following error.
 _LIMIT_MARGIN = 2.0
+# The longest that drives whose motors turn by themselves may go unheard [s].
+LONGEST_WATCHDOG = 0.5
 
 
 def _fixed(default: Any, unit: str, description: str, *bounds: float, **more: Any) -> Any:
@@ -55,13 +57,24 @@ class _RigParameters:
         False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
     )
     wait_for_recorder: bool = _fixed(
-        False, "-", "Refuse services until a node named recorder listens to everything."
+        False,
+        "-",
+        "Refuse services until a node named recorder listens to everything, and all partners know "
+        "this node.",
     )
     watchdog: float = _fixed(
-        0.1, "s", "A drive stops without the computer's heartbeat for so long.", 0.05, 0.5
+        0.1,
+        "s",
+        "A drive stops without the computer's heartbeat for so long; over 0.5 s in lock step only.",
+        0.05,
+        10.0,
     )
     reply_age_limit: float = _fixed(
-        SafetyLimits.reply_age_limit, "s", "A drive silent for longer has failed.", 0.05, 0.5
+        SafetyLimits.reply_age_limit,
+        "s",
+        "A drive silent for longer has failed; over 0.5 s in lock step only.",
+        0.05,
+        10.0,
     )
     hold_timeout: float = _fixed(
         SafetyLimits.hold_timeout, "s", "A hold message counts so long.", 0.05, 0.5
@@ -119,6 +132,11 @@ class _RigParameters:
             raise UserError("insertion_node_id and rotation_node_id are the same")
         if not self.drive("rotation").actuated:
             raise UserError("rotation_actuated = False: nobody would turn the needle")
+        for name in ("watchdog", "reply_age_limit"):
+            value = getattr(self, name)
+            # In lock step motors stand still while nobody sends SYNC; real ones do not.
+            if value > LONGEST_WATCHDOG and not self.lock_step:
+                raise OutOfBoundsError(name, value, 0.05, LONGEST_WATCHDOG, "s")
         _ = self.link_settings, self.limits
 
     @property

@@ -522,6 +522,8 @@ def test_services_wait_for_the_recorder_where_they_shall(make_rig: Make) -> None
         ({"insertion_count_per_unit": 1.0}, "did you mean 'insertion_counts_per_unit'"),
         ({"max_speed": 0.006}, "max_speed = 0.006"),
         ({"rotation_node_id": 1}, "the same"),
+        ({"lock_step": False, "watchdog": 0.6}, "watchdog = 0.6 s is outside"),
+        ({"lock_step": False, "reply_age_limit": 0.6}, "reply_age_limit = 0.6 s is outside"),
     ],
 )
 def test_bad_parameters_are_refused(make_rig: Make, parameters: dict[str, Any], text: str) -> None:

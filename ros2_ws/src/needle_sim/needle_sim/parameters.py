@@ -119,7 +119,8 @@ class SimRigParameters:
         False,
         unit="-",
         read_only=True,
-        description="Time starts only when a node named recorder listens to everything.",
+        description="Time starts only when a node named recorder listens to everything and all "
+        "partners know this node.",
     )
     reexpose_after: float = parameter(
         2.0,

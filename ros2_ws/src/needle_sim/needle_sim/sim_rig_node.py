@@ -21,7 +21,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.base_node import DiagnosticsPublisher, run_node, unrecorded
+from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import (
     IMAGES,
@@ -34,6 +34,7 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_sim.bench import SimulatedBench
 from needle_sim.conversions import to_camera_info, to_image, to_tip, to_tip_pose, to_truth
 from needle_sim.driven_device_node import DrivenDevice
@@ -151,6 +152,7 @@ class SimRigNode(Node):
         else:
             self._tip = self._publisher(PointStamped, "needle/tip")
             self._tip_pose = self._publisher(PoseWithCovarianceStamped, "needle/tip_pose")
+        self._partners = AnsweringNodes(self)
 
     # ---- the loop -----------------------------------------------------------------------------
 
@@ -341,11 +343,7 @@ class SimRigNode(Node):
             subscriptions.append(self._answers)
         else:
             publishers.append(self._tip)
-        missing = [
-            f"subscriber of {publisher.topic_name}"
-            for publisher in publishers
-            if publisher.get_subscription_count() == 0
-        ]
+        missing = unheard(self, publishers)
         missing += [
             f"publisher of {subscription.topic_name}"
             for subscription in subscriptions
@@ -355,6 +353,7 @@ class SimRigNode(Node):
         if not missing and self._settings.wait_for_recorder:
             publishers += [self._truth, *self._measurements]
             missing += unrecorded(self, publishers)
+            missing += self._partners.unaware_sources(subscriptions)
         return missing
 
     def _why_not_ready(self) -> str:

@@ -48,7 +48,8 @@ class StereoTrackerParameters:
     wait_for_recorder: bool = parameter(
         False,
         unit="-",
-        description="Take images only when a node named recorder listens to what is found.",
+        description="Take images only when a node named recorder listens to what is found, and "
+        "those who publish joints and estimates know this node.",
         read_only=True,
     )
     needle_width: float = parameter(

@@ -13,9 +13,10 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node, unrecorded
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.conversions import (
     IMAGES,
     IMAGES_BEST_EFFORT,
@@ -26,6 +27,7 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import AnsweringNodes, unrecorded
 from needle_tracker.annotation import annotate
 from needle_tracker.calibration import SIDES, load_calibration
 from needle_tracker.conversions import (
@@ -93,12 +95,16 @@ class StereoTrackerNode(Node):
         )
         self._annotated = self.create_publisher(Image, "~/annotated_image", IMAGES)
         self._diagnostics = DiagnosticsPublisher(self)
+        self._sources: list[Subscription[Any]] = [
+            self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
+        ]
         if parameters.heading_from_estimate:
-            self.create_subscription(
+            estimates = self.create_subscription(
                 PoseWithCovarianceStamped, "needle/estimate", self._on_estimate, RELIABLE
             )
+            self._sources.append(estimates)
             self.create_subscription(PoseStamped, "target_plane", self._on_target, LATCHED)
-        self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
+        self._partners = AnsweringNodes(self)
         self._image_quality = IMAGES if parameters.reliable_images else IMAGES_BEST_EFFORT
         self._hears_images = False
         if not parameters.wait_for_recorder:
@@ -143,8 +149,13 @@ class StereoTrackerNode(Node):
         self._publish(self._answers.add_image(side, stamp, frame, now))
 
     def _check(self) -> None:
-        # An answer that is sent before the recorder listens is not in the bag.
-        if not self._hears_images and not unrecorded(self, (self._tip, self._tip_pose)):
+        # An answer that is sent before the recorder listens is not in the bag; a joint state that
+        # is sent before its publisher knows this node comes never.
+        if not (
+            self._hears_images
+            or unrecorded(self, (self._tip, self._tip_pose))
+            or self._partners.unaware_sources(self._sources)
+        ):
             self._hear_images()
         self._publish(self._answers.ready(time.monotonic()))
         self._report()

@@ -186,6 +186,12 @@ def test_no_image_is_taken_before_the_recorder_listens(context: Context) -> None
         recorder.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", lambda _: None, RELIABLE
         )
+        spin_until(lambda: node._tip_pose.get_subscription_count() == 1)
+        node._check()
+        # Nor before those who publish joints and estimates know this node.
+        assert node.count_subscribers("stereo/left/image_raw") == 0
+        recorder.create_publisher(JointState, "joint_states", JOINT_STATES)
+        recorder.create_publisher(PoseWithCovarianceStamped, "needle/estimate", RELIABLE)
         spin_until(
             lambda: all(
                 node.count_subscribers(f"stereo/{side}/image_raw") for side in ("left", "right")

@@ -1,0 +1,133 @@
+"""Whether the nodes that this one works with have found it: what is sent before is lost.
+
+Two nodes learn of each other one after the other. A subscription that its publisher does not know
+yet gets nothing, and neither side can tell. So whoever makes things happen asks first.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+from rcl_interfaces.srv import GetParameters
+from rclpy.client import Client
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from rclpy.task import Future
+
+RECORDER = "recorder"
+# What the graph calls a node whose endpoint has come and whose name has not.
+_UNKNOWN = "_NODE_NAME_UNKNOWN_"
+
+
+def unrecorded(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
+    """Return what `node` publishes without a node named `recorder` listening, as `recorder of T`.
+
+    A first message that is sent before the recorder's subscription is known here is not in the
+    bag: whoever makes things happen waits until this is empty.
+
+    Parameters
+    ----------
+    node : Node
+        The node that publishes.
+    publishers : iterable of Publisher
+        Its publishers.
+    """
+    return [
+        f"recorder of {publisher.topic_name}"
+        for publisher in publishers
+        if RECORDER not in _listeners(node, publisher)
+    ]
+
+
+def unheard(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
+    """Return what `node` publishes and nobody but a recorder listens to, as `subscriber of T`.
+
+    Parameters
+    ----------
+    node : Node
+        The node that publishes.
+    publishers : iterable of Publisher
+        Its publishers.
+    """
+    return [
+        f"subscriber of {publisher.topic_name}"
+        for publisher in publishers
+        if not _listeners(node, publisher) - {RECORDER, _UNKNOWN}
+    ]
+
+
+def _listeners(node: Node, publisher: Publisher[Any]) -> set[str]:
+    infos = node.get_subscriptions_info_by_topic(publisher.topic_name)
+    return {info.node_name for info in infos}
+
+
+class AnsweringNodes:
+    """Which nodes have learnt of everything that this node has created.
+
+    Nodes learn of each other's endpoints in the order of their creation. Who answers a question
+    by a client that was created last knows all that was created before.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks, after it has created its publishers and subscriptions.
+    """
+
+    ASK_AGAIN = 0.5
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._clients: dict[str, Client[Any, Any]] = {}
+        self._asked: dict[str, float] = {}
+        self._answered: set[str] = set()
+
+    def all_of(self, names: set[str]) -> bool:
+        """Ask nodes (full names) that have not answered yet; return whether all have."""
+        for name in names - self._answered:
+            if name not in self._clients:
+                self._clients[name] = self._node.create_client(
+                    GetParameters, f"{name}/get_parameters"
+                )
+            now = time.monotonic()
+            due = now - self._asked.get(name, -self.ASK_AGAIN) >= self.ASK_AGAIN
+            if due and self._clients[name].service_is_ready():
+                self._asked[name] = now
+                future = self._clients[name].call_async(GetParameters.Request())
+                future.add_done_callback(partial(self._take_answer, name))
+        return names <= self._answered
+
+    def unaware_sources(self, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
+        """Return what keeps subscriptions from hearing everything from now on; empty: nothing.
+
+        Parameters
+        ----------
+        subscriptions : iterable of Subscription
+            The node's own; each wants a publisher, `publisher of T`, and each publisher's node has
+            to answer, `answer of N`.
+        """
+        missing, names = [], set()
+        for subscription in subscriptions:
+            infos = self._node.get_publishers_info_by_topic(subscription.topic_name)
+            known = {
+                f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                for info in infos
+                if info.node_name != _UNKNOWN
+            } - {self._node.get_fully_qualified_name()}
+            if not known:
+                missing.append(f"publisher of {subscription.topic_name}")
+            names |= known
+        self.all_of(names)
+        return missing + [f"answer of {name}" for name in sorted(names - self._answered)]
+
+    def close(self) -> None:
+        """Drop the clients."""
+        for client in self._clients.values():
+            self._node.destroy_client(client)
+        self._clients.clear()
+
+    def _take_answer(self, name: str, _: Future[Any]) -> None:
+        self._answered.add(name)
