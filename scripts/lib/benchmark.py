@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import itertools
 import sys
@@ -10,8 +9,6 @@ import time
 import tracemalloc
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
-from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -21,6 +18,7 @@ import reference_loop
 import tracker_benchmark
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser, output_file
 from needle_controller.control_settings import ControlSettings
 from needle_controller.gains import sampled_observer_gain
 from needle_controller.joint_history import JointSample
@@ -79,29 +77,17 @@ class Row:
         return self.reference / self.value
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `bench`; returns its exit code."""
     return run_command(lambda: _bench(sys.argv[1:] if arguments is None else arguments))
 
 
 def _bench(arguments: Sequence[str]) -> int:
-    parser = _Parser(
-        prog="bench",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("bench", DESCRIPTION, EPILOG)
     parser.add_argument("--json", metavar="FILE", help="write the figures as one flat JSON object")
     parser.add_argument("--only", metavar="WORD", help="only rows whose name has this in it")
     given = parser.parse_args(arguments)
-    if given.json and not Path(given.json).absolute().parent.is_dir():
-        raise UserError(f"--json {given.json}: its folder must exist")
+    file = output_file("--json", given.json)
     benches = {name: bench for name, bench in BENCHES.items() if (given.only or "") in name}
     if not benches:
         raise UserError(f"--only {given.only!r} is in none of {', '.join(BENCHES)}")
@@ -118,8 +104,8 @@ def _bench(arguments: Sequence[str]) -> int:
         name = row.against.replace(" ", "_").replace("-", "_").replace(",", "").lower()
         values[f"{row.key}_{name}_{unit}"] = row.reference
         values[f"{row.key}_{name}_ratio"] = row.ratio
-    if given.json:
-        write_json(Path(given.json), values)
+    if file is not None:
+        write_json(file, values)
     return EXIT_DONE
 
 

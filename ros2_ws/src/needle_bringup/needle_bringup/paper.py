@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from needle_common.cli import EXIT_DONE, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser, output_file
 
 PAGE = "paper.md"
 IMAGES = "images"
@@ -30,24 +29,13 @@ exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `paper`; returns its exit code."""
     return run_command(lambda: _paper(sys.argv[1:] if arguments is None else arguments))
 
 
 def _paper(arguments: Sequence[str]) -> int:
-    parser = _Parser(
-        prog="paper",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("paper", DESCRIPTION, EPILOG)
     parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
     parser.add_argument("--out", metavar="DIR", help="where to write (default: docs/)")
     parser.add_argument("--runs", metavar="DIR", help="keep bags and studies there and use them")
@@ -56,8 +44,7 @@ def _paper(arguments: Sequence[str]) -> int:
     given = parser.parse_args(arguments)
     if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
         raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
-    if given.json and not Path(given.json).absolute().parent.is_dir():
-        raise UserError(f"--json {given.json}: its folder must exist")
+    file = output_file("--json", given.json)
     checkout = _checkout()
     out = checkout / "docs" if given.out is None else Path(given.out).expanduser().absolute()
     _make(out / IMAGES, "--out")
@@ -76,8 +63,8 @@ def _paper(arguments: Sequence[str]) -> int:
     (out / PAGE).write_text(page(results), encoding="utf-8")
     print(as_text(list(table(results))))
     print(f"written: {out / PAGE}")
-    if given.json:
-        write_json(Path(given.json), key_figures(results))
+    if file is not None:
+        write_json(file, key_figures(results))
     return EXIT_DONE
 
 

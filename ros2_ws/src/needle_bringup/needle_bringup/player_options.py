@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from needle_bringup.bag_files import BagContents
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.options import CommandParser
 
 _DESCRIPTION = """\
 Plays a bag: sends its messages again, in their order and at their distances, with the quality of
@@ -81,11 +80,6 @@ class PlayerOptions:
             raise UserError(f"--end {self.end:g} s is not after --start {self.start:g} s")
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     """Return the options of a command line (without ROS arguments).
 
@@ -94,13 +88,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     UserError
         If they are not what `--help` says.
     """
-    parser = _Parser(
-        prog="player",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("player", _DESCRIPTION, _EPILOG)
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin here [s]")

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from tqdm import tqdm
 
 from needle_bringup.bag_recovery import BagRecovery, recover_bag
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.errors import UserError
+from needle_common.options import CommandParser, output_file
 
 _DESCRIPTION = """
 Makes a bag whole again whose recording was cut off: by a crash, kill -9, a power cut or a full
@@ -30,20 +28,9 @@ is still being recorded, or the disk refuses the changes; 130 interrupted (run i
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = _Parser(
-        prog="recover",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("recover", _DESCRIPTION, _EXAMPLES)
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write what was done as flat JSON"
@@ -51,14 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def command() -> int:
         options = parser.parse_args(arguments)
-        if options.json is not None and not options.json.absolute().parent.is_dir():
-            raise UserError(f"--json {options.json}: its folder must exist")
+        file = output_file("--json", options.json)
         with _Bar() as bar:
             recovery = recover_bag(options.bag, bar.show)
         for line in _lines(options.bag, recovery):
             print(line)
-        if options.json is not None:
-            write_json(options.json, _flat(recovery))
+        if file is not None:
+            write_json(file, _flat(recovery))
         return EXIT_DONE
 
     return run_command(command)

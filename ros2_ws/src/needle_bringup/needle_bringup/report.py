@@ -7,7 +7,6 @@ import io
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from matplotlib.figure import Figure
 
@@ -25,6 +24,7 @@ from needle_bringup.stage_timing import StageTiming, stage_timings
 from needle_bringup.step_figures import innovation_figure, timing_figure
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser
 
 PAGE = "report.html"
 
@@ -150,13 +150,7 @@ def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = _Parser(
-        prog="report",
-        description=_DESCRIPTION,
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("report", _DESCRIPTION, _EXAMPLES)
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
     parser.add_argument(
         "other", type=Path, nargs="?", metavar="OTHER_BAG", help="compare BAG with this one"
@@ -189,11 +183,6 @@ def _report(given: argparse.Namespace) -> int:
     if given.json is not None:
         write_json(given.json, summary)
     return EXIT_DONE
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
 
 
 if __name__ == "__main__":

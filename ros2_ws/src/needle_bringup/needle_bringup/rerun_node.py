@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 import yaml
 
@@ -29,6 +28,7 @@ from needle_bringup.rig_configuration import read_parameters
 from needle_bringup.tracker_rerun_node import TrackerStage
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser, output_file
 from needle_controller.control_settings import PRESETS
 from needle_controller.parameters import PlaneControllerParameters
 from needle_tracker.calibration import parse_calibration
@@ -62,11 +62,6 @@ TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
 _OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 P = TypeVar("P")
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,8 +108,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     given = _parser().parse_args(words)
-    if given.json is not None and not given.json.absolute().parent.is_dir():
-        raise UserError(f"--json {given.json}: its folder must exist")
+    file = output_file("--json", given.json)
     if given.output is not None:
         refuse_existing_bag(given.output)
     changes = read_parameters(given.params) if given.params is not None else {}
@@ -131,8 +125,8 @@ def _run(words: Sequence[str]) -> int:
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
 
-    if given.json is not None:
-        write_json(given.json, flat(run, comparison, rerun.outputs))
+    if file is not None:
+        write_json(file, flat(run, comparison, rerun.outputs))
     if given.output is not None:
         outputs = rerun.outputs
         answers = [output for output in outputs if output.topic in TIP_TOPICS]
@@ -155,14 +149,8 @@ def _run(words: Sequence[str]) -> int:
     return EXIT_MISSED if comparison.changed else EXIT_DONE
 
 
-def _parser() -> _Parser:
-    parser = _Parser(
-        prog="rerun",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("rerun", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="the bag's directory")
     add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")

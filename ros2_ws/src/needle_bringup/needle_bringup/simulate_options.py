@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.options import (
+    CommandParser,
+    join_start,
+    number,
+    output_file,
+    start,
+    whole_number,
+)
 
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
@@ -68,11 +73,6 @@ class SimulateOptions:
     json: Path | None = None
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def parse(arguments: Sequence[str]) -> SimulateOptions:
     """Return the options of a command line (without the program's name).
 
@@ -81,16 +81,16 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     UserError
         Anything that cannot be run as asked.
     """
-    given = _parser().parse_args(_join_initial(arguments))
+    given = _parser().parse_args(join_start(arguments))
     _one_of("--level", given.level, LEVELS)
     _one_of("--controller", given.controller, CONTROLLERS)
     noise = None
     if given.level == "tip":
-        noise = _number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
+        noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
     elif given.noise_mm is not None:
         raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
-    x_mm, pitch_deg, roll_deg = _initial(given.initial)
-    factor = _number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
+    x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
+    factor = number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
     return SimulateOptions(
         level=given.level,
         controller=given.controller,
@@ -98,25 +98,19 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         initial_pitch_deg=pitch_deg,
         initial_roll_deg=roll_deg,
         noise_mm=noise,
-        depth_mm=_number("--depth-mm", given.depth_mm, 1.0, 150.0, "mm"),
-        play_deg=_number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
-        lag_mm=_number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
+        depth_mm=number("--depth-mm", given.depth_mm, 1.0, 150.0, "mm"),
+        play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
+        lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
-        seed=_seed(given.seed),
+        seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         bag=_new_bag(given.bag),
         params=_readable(given.params),
-        json=_writable(given.json),
+        json=output_file("--json", given.json),
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="simulate",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("simulate", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add(
         "--level",
@@ -176,53 +170,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _join_initial(arguments: Sequence[str]) -> list[str]:
-    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] == "--initial" and argument[1:2] in "0123456789.ni":
-            joined[-1] = f"--initial={argument}"
-        else:
-            joined.append(argument)
-    return joined
-
-
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
         raise UserError(f"{name} {value!r} is not one of {', '.join(known)}")
-
-
-def _number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a number") from None
-    if not math.isfinite(value):
-        raise UserError(f"{name} {text!r} is not finite")
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)
-    return value
-
-
-def _initial(text: str) -> tuple[float, float, float]:
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise UserError(f"--initial {text!r} is not X_MM,PITCH_DEG,ROLL_DEG, such as -3,2,15")
-    return (
-        _number("--initial X_MM", parts[0], -50.0, 50.0, "mm"),
-        _number("--initial PITCH_DEG", parts[1], -45.0, 45.0, "deg"),
-        _number("--initial ROLL_DEG", parts[2], -180.0, 180.0, "deg"),
-    )
-
-
-def _seed(text: str) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise UserError(f"--seed {text!r} is not a whole number") from None
-    if not 0 <= value < 2**31:
-        raise OutOfBoundsError("--seed", value, 0, 2**31 - 1, "-")
-    return value
 
 
 def _new_bag(text: str | None) -> Path | None:
@@ -241,13 +191,4 @@ def _readable(text: str | None) -> Path | None:
     path = Path(text).expanduser()
     if not path.is_file():
         raise UserError(f"--params {text}: no such file")
-    return path
-
-
-def _writable(text: str | None) -> Path | None:
-    if text is None:
-        return None
-    path = Path(text).expanduser()
-    if path.is_dir() or not path.parent.is_dir():
-        raise UserError(f"--json {text}: its folder must exist, and it must not be a folder")
     return path

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import shutil
 import sys
@@ -10,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 from tqdm import tqdm
 
@@ -24,6 +23,7 @@ from needle_bringup import (
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser
 
 STEPS: Mapping[str, tuple[Check, ...]] = {
     "A": verify_step_a.CHECKS,
@@ -46,24 +46,13 @@ exit codes: 0 all as wanted, 1 something falls short, 2 bad input, 130 interrupt
 """
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `verify`; returns its exit code."""
     return run_command(lambda: _verify(sys.argv[1:] if arguments is None else arguments))
 
 
 def _verify(arguments: Sequence[str]) -> int:
-    parser = _Parser(
-        prog="verify",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("verify", DESCRIPTION, EPILOG)
     parser.add_argument("steps", nargs="*", metavar="STEP", help=f"{', '.join(STEPS)}; all if none")
     parser.add_argument("--only", action="append", metavar="NAME", help="only this check")
     parser.add_argument("--list", action="store_true", help="say what there is to check")

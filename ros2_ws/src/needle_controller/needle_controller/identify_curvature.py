@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
@@ -20,7 +18,8 @@ from needle_common.cli import (
     run_command,
     write_json,
 )
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.options import CommandParser, number, output_file
 from needle_controller.circle_fit import circle_curvature
 from needle_controller.curvature_checks import CheckedFit, fit_checked
 from needle_controller.curvature_data import InsertionRecord, read_record
@@ -77,20 +76,9 @@ class Options:
     rotation_tolerance_deg: float
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def parse(arguments: Sequence[str]) -> Options:
     """Return the options of a command line (without the program's name); raises UserError."""
-    parser = _Parser(
-        prog="identify_curvature",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+    parser = CommandParser("identify_curvature", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("source", type=Path, metavar="BAG_OR_CSV", help="a bag's directory, or a CSV of tips")
     add("--insertion", type=Path, metavar="FILE", help="CSV name,insertion_m for a CSV of tips")
@@ -124,20 +112,18 @@ def parse(arguments: Sequence[str]) -> Options:
         help="what the base may turn on the way (default: 1)",
     )
     given = parser.parse_args(arguments)
-    if given.json is not None and not given.json.parent.is_dir():
-        raise UserError(f"--json {given.json}: no folder {given.json.parent}")
     return Options(
         source=given.source,
         insertion=given.insertion,
-        json=given.json,
-        from_mm=_number("--from-mm", given.from_mm, 0.0, 1000.0, "mm"),
-        until_mm=_number("--until-mm", given.until_mm, 0.0, math.inf, "mm"),
-        entry_std_mm=_number("--entry-std-mm", given.entry_std_mm, 0.001, math.inf, "mm"),
-        heading_std_deg=_number("--heading-std-deg", given.heading_std_deg, 0.01, math.inf, "deg"),
-        repeating_error_mm=_number(
+        json=output_file("--json", given.json),
+        from_mm=number("--from-mm", given.from_mm, 0.0, 1000.0, "mm"),
+        until_mm=number("--until-mm", given.until_mm, 0.0, math.inf, "mm"),
+        entry_std_mm=number("--entry-std-mm", given.entry_std_mm, 0.001, math.inf, "mm"),
+        heading_std_deg=number("--heading-std-deg", given.heading_std_deg, 0.01, math.inf, "deg"),
+        repeating_error_mm=number(
             "--repeating-error-mm", given.repeating_error_mm, 0.0, 100.0, "mm"
         ),
-        rotation_tolerance_deg=_number(
+        rotation_tolerance_deg=number(
             "--rotation-tolerance-deg", given.rotation_tolerance_deg, 0.0, 10.0, "deg"
         ),
     )
@@ -216,16 +202,6 @@ def _run(arguments: Sequence[str]) -> int:
         print("the tips cannot tell this path from a straight line: insert deeper")
         return EXIT_MISSED
     return EXIT_DONE
-
-
-def _number(name: str, text: str, least: float, most: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{name} {text} is not a number") from None
-    if not least <= value <= most:
-        raise OutOfBoundsError(name, value, least, most, unit)
-    return value
 
 
 if __name__ == "__main__":

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.options import (
+    CommandParser,
+    join_start,
+    number,
+    output_file,
+    start,
+    whole_number,
+)
 from needle_sim.disturbances import Disturbances
 from needle_sim.start_grids import GRIDS, Bounds
 
@@ -61,11 +67,6 @@ class MonteCarloOptions:
     csv: Path | None
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     """Return the options of a command line (without the program's name).
 
@@ -74,48 +75,42 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     UserError
         Anything that cannot be run as asked.
     """
-    given = _parser().parse_args(_join_initial(arguments))
+    given = _parser().parse_args(join_start(arguments))
     if given.grid not in GRIDS:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
     return MonteCarloOptions(
         controller=given.controller,
         grid=given.grid,
-        draws=_whole("--draws", given.draws, 1, 1000),
+        draws=whole_number("--draws", given.draws, 1, 1000),
         bounds=Bounds(
-            x=_number("--x-mm", given.x_mm, 0.0, 100.0, "mm") * 1e-3,
-            pitch=math.radians(_number("--pitch-deg", given.pitch_deg, 0.0, 80.0, "deg")),
-            roll=math.radians(_number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
+            x=number("--x-mm", given.x_mm, 0.0, 100.0, "mm") * 1e-3,
+            pitch=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 80.0, "deg")),
+            roll=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         ),
         initial=None if given.initial is None else _initial(given.initial),
-        depth=_number("--depth-mm", given.depth_mm, 1.0, 1000.0, "mm") * 1e-3,
+        depth=number("--depth-mm", given.depth_mm, 1.0, 1000.0, "mm") * 1e-3,
         disturbances=Disturbances(
-            noise=_number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
-            outliers=_number("--outliers", given.outliers, 0.0, 1.0, "-"),
-            dropped=_number("--dropped", given.dropped, 0.0, 1.0, "-"),
+            noise=number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
+            outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
+            dropped=number("--dropped", given.dropped, 0.0, 1.0, "-"),
             pitch_noise=math.radians(
-                _number("--pitch-noise-deg", given.pitch_noise_deg, 0.0, 90.0, "deg")
+                number("--pitch-noise-deg", given.pitch_noise_deg, 0.0, 90.0, "deg")
             ),
-            delay=_whole("--delay", given.delay, 0, 100),
-            curvature_scale=_number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
-            curvature_patches=_number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
-            play=math.radians(_number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
-            lag_length=_number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
+            delay=whole_number("--delay", given.delay, 0, 100),
+            curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
+            curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
+            play=math.radians(number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
+            lag_length=number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
         ),
-        flips=_whole("--flips", given.flips, 0, 100),
-        seed=_whole("--seed", given.seed, 0, 2**31 - 1),
-        json=_writable("--json", given.json),
-        csv=_writable("--csv", given.csv),
+        flips=whole_number("--flips", given.flips, 0, 100),
+        seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
+        json=output_file("--json", given.json),
+        csv=output_file("--csv", given.csv),
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="monte_carlo",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("monte_carlo", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add(
         "--controller",
@@ -159,54 +154,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _join_initial(arguments: Sequence[str]) -> list[str]:
-    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] == "--initial" and argument[1:2] in "0123456789.":
-            joined[-1] = f"--initial={argument}"
-        else:
-            joined.append(argument)
-    return joined
-
-
-def _number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a number") from None
-    if not math.isfinite(value):
-        raise UserError(f"{name} {text!r} is not finite")
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)
-    return value
-
-
-def _whole(name: str, text: str, lower: int, upper: int) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a whole number") from None
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, "-")
-    return value
-
-
 def _initial(text: str) -> tuple[float, float, float]:
-    parts = text.split(",")
-    if len(parts) != 3:
-        raise UserError(f"--initial {text!r} is not X_MM,PITCH_DEG,ROLL_DEG, such as -3,2,15")
-    return (
-        _number("--initial X_MM", parts[0], -100.0, 100.0, "mm") * 1e-3,
-        math.radians(_number("--initial PITCH_DEG", parts[1], -80.0, 80.0, "deg")),
-        math.radians(_number("--initial ROLL_DEG", parts[2], -180.0, 180.0, "deg")),
-    )
-
-
-def _writable(name: str, text: str | None) -> Path | None:
-    if text is None:
-        return None
-    path = Path(text).expanduser()
-    if path.is_dir() or not path.parent.is_dir():
-        raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
-    return path
+    x_mm, pitch_deg, roll_deg = start(text, largest_x=100.0, largest_pitch=80.0)
+    return x_mm * 1e-3, math.radians(pitch_deg), math.radians(roll_deg)

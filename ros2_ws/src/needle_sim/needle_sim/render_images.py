@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from ament_index_python.packages import get_package_share_directory
 from tqdm import tqdm
 
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.options import CommandParser, number, output_file, whole_number
 from needle_sim.image_folder import ImageFolder
 from needle_sim.insertions import CURVATURE, render_insertion
 from needle_sim.scenarios import SCENARIOS, Scenario, find_scenario
@@ -52,11 +50,6 @@ class RenderOptions:
     curvature: float
     calibration: Path | None
     json: Path | None
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -115,38 +108,36 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
         Anything that cannot be rendered as asked.
     """
     given = _parser().parse_args(arguments)
-    depth = _number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
-    step = _number("--step-mm", given.step_mm, 0.001, 50.0, "mm") / 1e3
+    depth = number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
+    step = number("--step-mm", given.step_mm, 0.001, 50.0, "mm") / 1e3
     frames = math.ceil(depth / step - 1e-9) + 1
     if given.frames is not None:
-        frames = _whole("--frames", given.frames, 1, 999_999)
+        frames = whole_number("--frames", given.frames, 1, 999_999)
     scenario = find_scenario(given.scenario)
     if given.noise is not None:
-        noise = _number("--noise", given.noise, 0.0, 50.0, "grey levels")
+        noise = number("--noise", given.noise, 0.0, 50.0, "grey levels")
         scenario = dataclasses.replace(scenario, noise=noise)
     return RenderOptions(
         output=Path(given.output).expanduser(),
         scenario=scenario,
         frames=frames,
-        seed=_whole("--seed", given.seed, 0, 2**31 - 1),
+        seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         depth=depth,
         step=step,
-        curvature=_number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
+        curvature=number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
         calibration=None if given.calibration is None else Path(given.calibration).expanduser(),
-        json=_writable("--json", given.json),
+        json=output_file("--json", given.json),
     )
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="render_images",
-        description=DESCRIPTION,
-        epilog="scenarios:\n"
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        "render_images",
+        DESCRIPTION,
+        "scenarios:\n"
         + "".join(f"  {name:15}{one.summary}\n" for name, one in SCENARIOS.items())
         + "\n"
         + EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
     )
     add = parser.add_argument
     add("--output", required=True, metavar="DIR", help="new or empty folder")
@@ -165,37 +156,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's own)")
     add("--json", metavar="FILE", help="write what was done as one flat JSON object")
     return parser
-
-
-def _number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a number") from None
-    if not math.isfinite(value):
-        raise UserError(f"{name} {text!r} is not finite")
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)
-    return value
-
-
-def _whole(name: str, text: str, lower: int, upper: int) -> int:
-    try:
-        value = int(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a whole number") from None
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, "-")
-    return value
-
-
-def _writable(name: str, text: str | None) -> Path | None:
-    if text is None:
-        return None
-    path = Path(text).expanduser()
-    if path.is_dir() or not path.parent.is_dir():
-        raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
-    return path
 
 
 if __name__ == "__main__":

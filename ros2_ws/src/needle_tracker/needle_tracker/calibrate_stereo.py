@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.options import CommandParser
 from needle_tracker.board_views import nothing_seen, views_in_folders
 from needle_tracker.calibration import SIDES
 from needle_tracker.calibration_figures import residual_figure, rig_figure, save_figure
@@ -56,11 +55,6 @@ examples:
 exit codes: 0 done; 1 calibrated and written, but tips are not expected within --goal-mm; 2 bad
 input or a set of views that cannot determine the rig (nothing written); 130 interrupted
 """
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -192,13 +186,8 @@ def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
     return values
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="calibrate_stereo",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("calibrate_stereo", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
     add("--right", type=Path, metavar="DIR", help="images of the right camera, of the same names")

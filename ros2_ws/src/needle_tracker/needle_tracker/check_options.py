@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from needle_common.cli import JsonValue
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.options import CommandParser
 from needle_tracker.calibration_check import CAMERAS, CAUSES, CheckResult, Deviation
 
 _DESCRIPTION = """\
@@ -49,11 +48,6 @@ class CheckOptions:
     pair_tolerance: float
     limit: float
     json: Path | None
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
 
 
 def parse(arguments: Sequence[str]) -> CheckOptions:
@@ -152,13 +146,8 @@ def _unit(cause: str) -> tuple[float, str, str]:
     return (1e3, "_mm", " mm") if cause == "surface_height" else (1.0, "", "")
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="check_calibration",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("check_calibration", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--calibration", type=Path, required=True, metavar="FILE", help="what is checked")
     add("--session", type=Path, required=True, metavar="FILE", help="board and places (YAML)")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import csv
 import dataclasses
 import math
@@ -11,12 +10,12 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from tqdm import tqdm
 
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.options import CommandParser, number, output_file
 from needle_tracker.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.track import TrackState
@@ -51,11 +50,6 @@ _NAMED = 5  # so many names are shown, the others counted
 _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
 
 
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see --help")
-
-
 @dataclasses.dataclass(frozen=True)
 class TrackedSequence:
     """What a sequence gave: CSV rows, reasons for missing tips, names that nothing was made of."""
@@ -74,9 +68,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _run(words: Sequence[str]) -> int:
     given = _parser().parse_args(words)
-    output = _writable("--output", given.output)
-    json = None if given.json is None else _writable("--json", given.json)
-    width = _number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm") * 1e-3
+    output = output_file("--output", given.output)
+    json = output_file("--json", given.json)
+    width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm") * 1e-3
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
@@ -226,14 +220,8 @@ def _warn(what: str, names: Sequence[str]) -> None:
     print(f"warning: {len(names)} images {what}: {shown}{more}", file=sys.stderr)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = _Parser(
-        prog="track_images",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
-    )
+def _parser() -> CommandParser:
+    parser = CommandParser("track_images", DESCRIPTION, EPILOG)
     add = parser.add_argument
     add("--calibration", required=True, metavar="FILE", help="calibration file of the stereo rig")
     add("--left", required=True, metavar="DIR", help="folder of the left images, or a video")
@@ -248,23 +236,6 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--json", metavar="FILE", help="write the counts as one flat JSON object")
     return parser
-
-
-def _number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise UserError(f"{name} {text!r} is not a number") from None
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)
-    return value
-
-
-def _writable(name: str, text: str) -> Path:
-    path = Path(text)
-    if path.is_dir() or not path.absolute().parent.is_dir():
-        raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
-    return path
 
 
 if __name__ == "__main__":
