@@ -16,7 +16,7 @@ from sensor_msgs.msg import Image, JointState
 from needle_common.base_node import run_node
 from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.errors import UserError
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
 
 HELP = """\
@@ -30,20 +30,11 @@ LEFT_IMAGE = "left_image"
 class BadInputParameters:
     """What to send."""
 
-    kinds: tuple[str, ...] = parameter(
-        ("not_finite",),
-        unit="-",
-        choices=(*TIPS, LEFT_IMAGE),
-        read_only=True,
-        description="What is bad; several take turns.",
+    kinds: tuple[str, ...] = fixed_parameter(
+        ("not_finite",), "-", "What is bad; several take turns.", choices=(*TIPS, LEFT_IMAGE)
     )
-    every: int = parameter(
-        40,
-        unit="-",
-        lower=1,
-        upper=10000,
-        read_only=True,
-        description="Joint states from one bad message to the next.",
+    every: int = fixed_parameter(
+        40, "-", "Joint states from one bad message to the next.", 1, 10000
     )
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter, parameter
 
 
 @dataclasses.dataclass(frozen=True)
@@ -18,35 +18,25 @@ class OperatorParameters:
         upper=1.0,
         description="Share of the commanded speed that the held needle moves at.",
     )
-    hold_rate: float = parameter(
-        20.0,
-        unit="Hz",
-        lower=10.0,
-        upper=100.0,
-        read_only=True,
-        description="Rate of device/hold; the device wants 10 Hz or more.",
+    hold_rate: float = fixed_parameter(
+        20.0, "Hz", "Rate of device/hold; the device wants 10 Hz or more.", 10.0, 100.0
     )
-    wait_timeout: float = parameter(
+    wait_timeout: float = fixed_parameter(
         90.0,
-        unit="s",
-        lower=0.1,
-        upper=3600.0,
-        read_only=True,
-        description="How long the rig may take to get ready, and each service to answer.",
+        "s",
+        "How long the rig may take to get ready, and each service to answer.",
+        0.1,
+        3600.0,
     )
-    stall_timeout: float = parameter(
+    stall_timeout: float = fixed_parameter(
         60.0,
-        unit="s",
-        lower=0.1,
-        upper=3600.0,
-        read_only=True,
-        description="The hold is released when the needle has not moved on for this long.",
+        "s",
+        "The hold is released when the needle has not moved on for this long.",
+        0.1,
+        3600.0,
     )
-    wait_for_recorder: bool = parameter(
-        False,
-        unit="-",
-        read_only=True,
-        description="Begin only when a node named recorder has the parameters of all nodes.",
+    wait_for_recorder: bool = fixed_parameter(
+        False, "-", "Begin only when a node named recorder has the parameters of all nodes."
     )
 
     def __post_init__(self) -> None:

@@ -6,7 +6,7 @@ import dataclasses
 
 from needle_bringup.bag_writer import COMPRESSIONS
 from needle_bringup.recording import RESERVE
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 
 # The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
 PARAMETERS_OF = "parameters_of"
@@ -16,41 +16,30 @@ PARAMETERS_OF = "parameters_of"
 class RecorderParameters:
     """What the recorder can be told."""
 
-    bag: str = parameter(
-        "",
-        unit="-",
-        description="The bag's directory; empty: a new time-stamped one here.",
-        read_only=True,
+    bag: str = fixed_parameter("", "-", "The bag's directory; empty: a new time-stamped one here.")
+    calibration_file: str = fixed_parameter(
+        "", "-", "A file to keep in the bag as calibration.yaml."
     )
-    calibration_file: str = parameter(
-        "", unit="-", description="A file to keep in the bag as calibration.yaml.", read_only=True
+    run_info: str = fixed_parameter(
+        "", "-", "Text about the run to keep in the bag: YAML `key: value` lines or JSON."
     )
-    run_info: str = parameter(
-        "",
-        unit="-",
-        description="Text about the run to keep in the bag: YAML `key: value` lines or JSON.",
-        read_only=True,
-    )
-    max_file_size: int = parameter(
+    max_file_size: int = fixed_parameter(
         4_000_000_000,
-        unit="B",
+        "B",
+        "Messages in one data file, after which another is begun; 0: no bound.",
         lower=0,
-        description="Messages in one data file, after which another is begun; 0: no bound.",
-        read_only=True,
     )
-    compression: str = parameter(
+    compression: str = fixed_parameter(
         "none",
-        unit="-",
+        "-",
+        "Of the data: zstd takes a third of a core for noisy images.",
         choices=COMPRESSIONS,
-        description="Of the data: zstd takes a third of a core for noisy images.",
-        read_only=True,
     )
-    reserve: int = parameter(
+    reserve: int = fixed_parameter(
         RESERVE,
-        unit="B",
+        "B",
+        "Free space at which the recording ends; at most a tenth of the disk.",
         lower=0,
-        description="Free space at which the recording ends; at most a tenth of the disk.",
-        read_only=True,
     )
 
     def __post_init__(self) -> None:

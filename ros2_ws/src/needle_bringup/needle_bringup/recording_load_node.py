@@ -28,7 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.base_node import run_node
 from needle_common.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import unrecorded
 
@@ -64,12 +64,8 @@ _SPIN: Final = 0.002
 class LoadParameters:
     """How much to send."""
 
-    duration: float = parameter(
-        60.0, unit="s", lower=0.1, upper=3600.0, read_only=True, description="How long to send."
-    )
-    images: bool = parameter(
-        True, unit="-", read_only=True, description="Whether to send images too."
-    )
+    duration: float = fixed_parameter(60.0, "s", "How long to send.", 0.1, 3600.0)
+    images: bool = fixed_parameter(True, "-", "Whether to send images too.")
 
     def __post_init__(self) -> None:
         check_fields(self)

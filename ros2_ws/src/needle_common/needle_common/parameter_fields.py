@@ -53,6 +53,27 @@ def parameter(
     return dataclasses.field(default=default, metadata={_METADATA_KEY: spec})
 
 
+def fixed_parameter(
+    default: Any,
+    unit: str,
+    description: str,
+    lower: float = -math.inf,
+    upper: float = math.inf,
+    *,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    """Declare a field whose value is fixed once the node runs; otherwise as `parameter`."""
+    return parameter(
+        default,
+        unit=unit,
+        description=description,
+        lower=lower,
+        upper=upper,
+        choices=choices,
+        read_only=True,
+    )
+
+
 def specs(parameters: Any) -> Iterator[tuple[str, ParameterSpec, Any]]:
     """Yield (name, spec, default) of each parameter of a parameter dataclass or instance."""
     for field in dataclasses.fields(parameters):

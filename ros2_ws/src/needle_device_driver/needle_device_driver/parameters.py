@@ -7,10 +7,11 @@ import math
 from typing import Any
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.can_link import LINKS, LinkSettings
 from needle_device_driver.drive_settings import DriveSettings
-from needle_device_driver.limits import HARD_SPEED_CAP, HARD_STEP_LENGTH_CAP, SafetyLimits
+from needle_device_driver.limit_parameters import limit_parameter, limits_of
+from needle_device_driver.limits import SafetyLimits
 
 # Beyond the supervisor's own limits, a drive's limits leave room for its following error.
 _LIMIT_MARGIN = 2.0
@@ -18,106 +19,67 @@ _LIMIT_MARGIN = 2.0
 LONGEST_WATCHDOG = 0.5
 
 
-def _fixed(default: Any, unit: str, description: str, *bounds: float, **more: Any) -> Any:
-    lower, upper = bounds or (-math.inf, math.inf)
-    return parameter(
-        default,
-        unit=unit,
-        description=description,
-        lower=lower,
-        upper=upper,
-        read_only=True,
-        **more,
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class _RigParameters:
-    link: str = _fixed(
+    link: str = fixed_parameter(
         "slcan",
         "-",
         "slcan: serial adapter or pseudo-terminal; socketcan: Linux CAN interface; socketcand: one "
         "over TCP; virtual: inside one process.",
         choices=LINKS,
     )
-    channel: str = _fixed("/dev/ttyACM0", "-", "Device file (slcan) or name of the interface.")
-    bitrate: int = _fixed(500_000, "bit/s", "Of the CAN bus; slcan only.", 10_000, 1_000_000)
-    tty_baudrate: int = _fixed(
+    channel: str = fixed_parameter(
+        "/dev/ttyACM0", "-", "Device file (slcan) or name of the interface."
+    )
+    bitrate: int = fixed_parameter(
+        500_000, "bit/s", "Of the CAN bus; slcan only.", 10_000, 1_000_000
+    )
+    tty_baudrate: int = fixed_parameter(
         115_200, "bit/s", "Of the serial port; slcan only, USB adapters ignore it.", 9600, 4_000_000
     )
-    host: str = _fixed("localhost", "-", "Where socketcand runs.")
-    port: int = _fixed(29536, "-", "Where socketcand listens.", 1, 65535)
-    autostart: bool = _fixed(
+    host: str = fixed_parameter("localhost", "-", "Where socketcand runs.")
+    port: int = fixed_parameter(29536, "-", "Where socketcand listens.", 1, 65535)
+    autostart: bool = fixed_parameter(
         True, "-", "Configure and activate at start; false: a lifecycle manager does."
     )
-    connect_timeout: float = _fixed(
+    connect_timeout: float = fixed_parameter(
         10.0, "s", "Autostart: how long adapter and drives may take to be there.", 0.0, 3600.0
     )
-    lock_step: bool = _fixed(
+    lock_step: bool = fixed_parameter(
         False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
     )
-    wait_for_recorder: bool = _fixed(
+    wait_for_recorder: bool = fixed_parameter(
         False,
         "-",
         "Refuse services until a node named recorder listens to everything, and all partners know "
         "this node.",
     )
-    watchdog: float = _fixed(
+    watchdog: float = fixed_parameter(
         0.1,
         "s",
         "A drive stops without the computer's heartbeat for so long; over 0.5 s in lock step only.",
         0.05,
         10.0,
     )
-    reply_age_limit: float = _fixed(
+    reply_age_limit: float = fixed_parameter(
         SafetyLimits.reply_age_limit,
         "s",
         "A drive silent for longer has failed; over 0.5 s in lock step only.",
         0.05,
         10.0,
     )
-    hold_timeout: float = _fixed(
-        SafetyLimits.hold_timeout, "s", "A hold message counts so long.", 0.05, 0.5
-    )
-    tip_age_limit: float = _fixed(
-        SafetyLimits.tip_age_limit, "s", "An older tip moves nothing.", 0.05, 60.0
-    )
-    max_depth: float = _fixed(SafetyLimits.max_depth, "m", "Deepest insertion.", 0.001, 0.5)
-    max_step_length: float = _fixed(
-        SafetyLimits.max_step_length,
-        "m",
-        "Longest insertion of one command.",
-        1e-5,
-        HARD_STEP_LENGTH_CAP,
-    )
-    max_speed: float = _fixed(
-        SafetyLimits.max_speed, "m/s", "Fastest insertion.", 1e-5, HARD_SPEED_CAP
-    )
-    max_rotation_step: float = _fixed(
-        SafetyLimits.max_rotation_step,
-        "rad",
-        "Largest rotation of one command.",
-        0.01,
-        2 * math.pi,
-    )
-    max_rotation_rate: float = _fixed(
-        SafetyLimits.max_rotation_rate, "rad/s", "Fastest rotation.", 0.01, 20.0
-    )
-    max_turns: float = _fixed(
-        SafetyLimits.max_turns, "turns", "Largest rotation either way from home.", 0.1, 1000.0
-    )
-    retraction_speed: float = _fixed(
-        SafetyLimits.retraction_speed, "m/s", "When the needle is drawn out.", 1e-5, HARD_SPEED_CAP
-    )
-    homing_speed: float = _fixed(
-        SafetyLimits.homing_speed, "m/s", "Towards the insertion switch.", 1e-5, HARD_SPEED_CAP
-    )
-    homing_rotation_rate: float = _fixed(
-        SafetyLimits.homing_rotation_rate, "rad/s", "Towards the rotation switch.", 0.01, 20.0
-    )
-    settling_time: float = _fixed(
-        SafetyLimits.settling_time, "s", "To reach the target after the last set-point.", 0.1, 10.0
-    )
+    hold_timeout: float = limit_parameter("hold_timeout")
+    tip_age_limit: float = limit_parameter("tip_age_limit")
+    max_depth: float = limit_parameter("max_depth")
+    max_step_length: float = limit_parameter("max_step_length")
+    max_speed: float = limit_parameter("max_speed")
+    max_rotation_step: float = limit_parameter("max_rotation_step")
+    max_rotation_rate: float = limit_parameter("max_rotation_rate")
+    max_turns: float = limit_parameter("max_turns")
+    retraction_speed: float = limit_parameter("retraction_speed")
+    homing_speed: float = limit_parameter("homing_speed")
+    homing_rotation_rate: float = limit_parameter("homing_rotation_rate")
+    settling_time: float = limit_parameter("settling_time")
 
     def __post_init__(self) -> None:
         """Refuse what cannot be.
@@ -156,14 +118,7 @@ class _RigParameters:
     @property
     def limits(self) -> SafetyLimits:
         """The motion supervisor's limits."""
-        own = {field.name for field in dataclasses.fields(self)}
-        shared = {
-            f.name: getattr(self, f.name) for f in dataclasses.fields(SafetyLimits) if f.name in own
-        }
-        for axis in ("insertion", "rotation"):
-            for name in ("following_error", "tolerance"):
-                shared[f"{axis}_{name}"] = getattr(self, f"{axis}_{name}")
-        return SafetyLimits(**shared)
+        return limits_of(self)
 
     def drive(self, axis: str) -> DriveSettings:
         """Return the settings of the `insertion` or `rotation` drive."""
@@ -198,25 +153,27 @@ def _axis(
 ) -> list[tuple[str, type, Any]]:
     ramp = f"{unit}/s^2"
     fields = {
-        "node_id": _fixed(node_id, "-", "CANopen node id of the drive.", 1, 126),
-        "counts_per_unit": _fixed(
+        "node_id": fixed_parameter(node_id, "-", "CANopen node id of the drive.", 1, 126),
+        "counts_per_unit": fixed_parameter(
             counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
         ),
-        "reverse": _fixed(False, "-", "Whether the drive counts the other way."),
-        "acceleration": _fixed(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
-        "quick_stop_deceleration": _fixed(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
-        "homing_method": _fixed(
+        "reverse": fixed_parameter(False, "-", "Whether the drive counts the other way."),
+        "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
+        "quick_stop_deceleration": fixed_parameter(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
+        "homing_method": fixed_parameter(
             homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 where it stands.", 1, 37
         ),
-        "following_error": _fixed(
+        "following_error": fixed_parameter(
             following_error, unit, "Largest distance from the set-point.", 1e-6, 10.0
         ),
-        "following_error_time": _fixed(
+        "following_error_time": fixed_parameter(
             0.05, "s", "How long the drive itself lets that be exceeded.", 0.001, 10.0
         ),
-        "max_torque": _fixed(0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0),
-        "tolerance": _fixed(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
-        "actuated": _fixed(
+        "max_torque": fixed_parameter(
+            0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0
+        ),
+        "tolerance": fixed_parameter(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
+        "actuated": fixed_parameter(
             True, "-", "False: a hand moves the axis, its drive only says where it is."
         ),
     }

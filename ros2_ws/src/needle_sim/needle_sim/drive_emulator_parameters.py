@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from needle_common.errors import UserError
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import MotionClock
@@ -22,111 +22,54 @@ _LAST_NODE = 127
 class DriveEmulatorParameters:
     """Parameters of drive_emulator, fixed at start."""
 
-    pty: str = parameter(
-        "",
-        unit="-",
-        read_only=True,
-        description="Link to the serial port that appears; empty: the port's own name is logged.",
+    pty: str = fixed_parameter(
+        "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
     )
-    socketcand_port: int = parameter(
+    socketcand_port: int = fixed_parameter(
         0,
-        unit="-",
-        lower=0,
-        upper=65535,
-        read_only=True,
-        description="Serve TCP clients of socketcand on this port of localhost, in place of a pty.",
+        "-",
+        "Serve TCP clients of socketcand on this port of localhost, in place of a pty.",
+        0,
+        65535,
     )
-    motion_clock: str = parameter(
+    motion_clock: str = fixed_parameter(
         MotionClock.STEADY.value,
-        unit="-",
+        "-",
+        "steady: motors move as time goes by; sync: one SYNC period with every SYNC.",
         choices=tuple(clock.value for clock in MotionClock),
-        read_only=True,
-        description="steady: motors move as time goes by; sync: one SYNC period with every SYNC.",
     )
-    limit_action: str = parameter(
+    limit_action: str = fixed_parameter(
         LimitAction.CLAMP.value,
-        unit="-",
+        "-",
+        "What a drive does with a target beyond 0x607D once it is homed.",
         choices=tuple(action.value for action in LimitAction),
-        read_only=True,
-        description="What a drive does with a target beyond 0x607D once it is homed.",
     )
-    boot_time: float = parameter(
-        0.5,
-        unit="s",
-        lower=0.0,
-        upper=60.0,
-        read_only=True,
-        description="From power-up to the boot-up message.",
+    boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
+    insertion_node_id: int = fixed_parameter(1, "-", "Of the stepper drive.", 1, _LAST_NODE)
+    insertion_counts_per_unit: float = fixed_parameter(
+        2.0e7, "1/m", "Position counts of the insertion axis.", 1.0, 1e12
     )
-    insertion_node_id: int = parameter(
-        1, unit="-", lower=1, upper=_LAST_NODE, read_only=True, description="Of the stepper drive."
+    insertion_max_speed: float = fixed_parameter(
+        0.01, "m/s", "Fastest that the insertion motor can go.", 1e-6, 1.0
     )
-    insertion_counts_per_unit: float = parameter(
-        2.0e7,
-        unit="1/m",
-        lower=1.0,
-        upper=1e12,
-        read_only=True,
-        description="Position counts of the insertion axis.",
+    insertion_lag: float = fixed_parameter(
+        0.0, "s", "Time constant with which the insertion motor follows its drive.", 0.0, 1.0
     )
-    insertion_max_speed: float = parameter(
-        0.01,
-        unit="m/s",
-        lower=1e-6,
-        upper=1.0,
-        read_only=True,
-        description="Fastest that the insertion motor can go.",
+    insertion_start: float = fixed_parameter(
+        0.0, "m", "Where the insertion axis stands at power-up, from its home switch.", -0.003, 1.0
     )
-    insertion_lag: float = parameter(
-        0.0,
-        unit="s",
-        lower=0.0,
-        upper=1.0,
-        read_only=True,
-        description="Time constant with which the insertion motor follows its drive.",
+    insertion_travel: float = fixed_parameter(
+        0.25, "m", "From the home switch to the other limit switch.", 0.001, 2.0
     )
-    insertion_start: float = parameter(
-        0.0,
-        unit="m",
-        lower=-0.003,
-        upper=1.0,
-        read_only=True,
-        description="Where the insertion axis stands at power-up, from its home switch.",
+    rotation_node_id: int = fixed_parameter(2, "-", "Of the servo drive.", 1, _LAST_NODE)
+    rotation_counts_per_unit: float = fixed_parameter(
+        COUNTS_PER_RADIAN, "1/rad", "Position counts of the rotation axis.", 1.0, 1e12
     )
-    insertion_travel: float = parameter(
-        0.25,
-        unit="m",
-        lower=0.001,
-        upper=2.0,
-        read_only=True,
-        description="From the home switch to the other limit switch.",
+    rotation_max_speed: float = fixed_parameter(
+        20.0, "rad/s", "Fastest that the rotation motor can go.", 1e-3, 1e4
     )
-    rotation_node_id: int = parameter(
-        2, unit="-", lower=1, upper=_LAST_NODE, read_only=True, description="Of the servo drive."
-    )
-    rotation_counts_per_unit: float = parameter(
-        COUNTS_PER_RADIAN,
-        unit="1/rad",
-        lower=1.0,
-        upper=1e12,
-        read_only=True,
-        description="Position counts of the rotation axis.",
-    )
-    rotation_max_speed: float = parameter(
-        20.0,
-        unit="rad/s",
-        lower=1e-3,
-        upper=1e4,
-        read_only=True,
-        description="Fastest that the rotation motor can go.",
-    )
-    rotation_lag: float = parameter(
-        0.005,
-        unit="s",
-        lower=0.0,
-        upper=1.0,
-        read_only=True,
-        description="Time constant with which the rotation motor follows its drive.",
+    rotation_lag: float = fixed_parameter(
+        0.005, "s", "Time constant with which the rotation motor follows its drive.", 0.0, 1.0
     )
 
     def __post_init__(self) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from needle_common.errors import UserError
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.calibration import Phantom
 from needle_tracker.gates import GateSettings
 from needle_tracker.pair_answers import AnsweringSettings
@@ -17,205 +17,131 @@ from needle_tracker.tracker_settings import TrackerSettings
 class StereoTrackerParameters:
     """Parameters of the node; all are fixed at start, so that a run is of one piece."""
 
-    calibration_file: str = parameter(
-        "",
-        unit="-",
-        description="Calibration file of the stereo rig; empty: the simulated bench's.",
-        read_only=True,
+    calibration_file: str = fixed_parameter(
+        "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
     )
-    reliable_images: bool = parameter(
-        True,
-        unit="-",
-        description="Take images reliably, for simulation; false: best effort, for hardware.",
-        read_only=True,
+    reliable_images: bool = fixed_parameter(
+        True, "-", "Take images reliably, for simulation; false: best effort, for hardware."
     )
-    pair_tolerance: float = parameter(
+    pair_tolerance: float = fixed_parameter(
         0.0,
-        unit="s",
-        description="Largest difference of the stamps of a left and a right image of one pair.",
-        lower=0.0,
-        upper=0.1,
-        read_only=True,
+        "s",
+        "Largest difference of the stamps of a left and a right image of one pair.",
+        0.0,
+        0.1,
     )
-    joint_timeout: float = parameter(
+    joint_timeout: float = fixed_parameter(
         1.0,
-        unit="s",
-        description="How long a pair waits for the joint state that follows it (steady clock).",
-        lower=0.0,
-        upper=60.0,
-        read_only=True,
+        "s",
+        "How long a pair waits for the joint state that follows it (steady clock).",
+        0.0,
+        60.0,
     )
-    wait_for_recorder: bool = parameter(
+    wait_for_recorder: bool = fixed_parameter(
         False,
-        unit="-",
-        description="Take images only when a node named recorder listens to what is found, and "
+        "-",
+        "Take images only when a node named recorder listens to what is found, and "
         "those who publish joints and estimates know this node.",
-        read_only=True,
     )
-    needle_width: float = parameter(
-        0.7e-3,
-        unit="m",
-        description="Diameter of the needle.",
-        lower=0.2e-3,
-        upper=3e-3,
-        read_only=True,
-    )
-    needle_polarity: str = parameter(
+    needle_width: float = fixed_parameter(0.7e-3, "m", "Diameter of the needle.", 0.2e-3, 3e-3)
+    needle_polarity: str = fixed_parameter(
         "auto",
-        unit="-",
-        description="Whether the needle is darker or brighter than what is around it; auto: found.",
+        "-",
+        "Whether the needle is darker or brighter than what is around it; auto: found.",
         choices=("auto", "dark", "bright"),
-        read_only=True,
     )
-    min_contrast: float = parameter(
-        10.0,
-        unit="-",
-        description="Least contrast of the needle that counts [grey levels].",
-        lower=1.0,
-        upper=255.0,
-        read_only=True,
+    min_contrast: float = fixed_parameter(
+        10.0, "-", "Least contrast of the needle that counts [grey levels].", 1.0, 255.0
     )
-    noise_factor: float = parameter(
-        5.0,
-        unit="-",
-        description="Detection threshold in standard deviations of the images' noise.",
-        lower=1.0,
-        upper=50.0,
-        read_only=True,
+    noise_factor: float = fixed_parameter(
+        5.0, "-", "Detection threshold in standard deviations of the images' noise.", 1.0, 50.0
     )
-    entry_zone: float = parameter(
+    entry_zone: float = fixed_parameter(
         4.5e-3,
-        unit="m",
-        description="Insertion below which the tip is taken from the insertion, not looked for.",
-        lower=0.0,
-        upper=0.05,
-        read_only=True,
+        "m",
+        "Insertion below which the tip is taken from the insertion, not looked for.",
+        0.0,
+        0.05,
     )
-    hole_clearance: float = parameter(
-        2.0e-3,
-        unit="m",
-        description="Radius about the entry point that is not looked at (hole, rim).",
-        lower=0.5e-3,
-        upper=0.02,
-        read_only=True,
+    hole_clearance: float = fixed_parameter(
+        2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02
     )
-    hole_tolerance: float = parameter(
-        0.5e-3,
-        unit="m",
-        description="How far from the entry point the needle may pass.",
-        lower=0.01e-3,
-        upper=5e-3,
-        read_only=True,
+    hole_tolerance: float = fixed_parameter(
+        0.5e-3, "m", "How far from the entry point the needle may pass.", 0.01e-3, 5e-3
     )
-    entry_angle: float = parameter(
-        0.1745,
-        unit="rad",
-        description="Largest angle of the needle to rig's z at the entry.",
-        lower=0.0,
-        upper=0.7,
-        read_only=True,
+    entry_angle: float = fixed_parameter(
+        0.1745, "rad", "Largest angle of the needle to rig's z at the entry.", 0.0, 0.7
     )
-    max_curvature: float = parameter(
-        9.0,
-        unit="1/m",
-        description="Largest curvature of the needle's path.",
-        lower=0.1,
-        upper=50.0,
-        read_only=True,
+    max_curvature: float = fixed_parameter(
+        9.0, "1/m", "Largest curvature of the needle's path.", 0.1, 50.0
     )
-    max_insertion: float = parameter(
-        0.15,
-        unit="m",
-        description="Longest insertion; nothing is looked for farther from the entry.",
-        lower=0.01,
-        upper=1.0,
-        read_only=True,
+    max_insertion: float = fixed_parameter(
+        0.15, "m", "Longest insertion; nothing is looked for farther from the entry.", 0.01, 1.0
     )
-    tip_lean: float = parameter(
+    tip_lean: float = fixed_parameter(
         0.21,
-        unit="rad",
-        description="Largest angle between the visible end and the needle's path (pre-bend).",
-        lower=0.0,
-        upper=0.8,
-        read_only=True,
+        "rad",
+        "Largest angle between the visible end and the needle's path (pre-bend).",
+        0.0,
+        0.8,
     )
-    lean: float = parameter(
+    lean: float = fixed_parameter(
         0.0977,
-        unit="rad",
-        description="Angle between heading and visible end; taken off with heading_from_estimate.",
-        lower=0.0,
-        upper=0.7,
-        read_only=True,
+        "rad",
+        "Angle between heading and visible end; taken off with heading_from_estimate.",
+        0.0,
+        0.7,
     )
-    heading_from_estimate: bool = parameter(
-        False,
-        unit="-",
-        description="Publish the heading (lean taken off) where needle/estimate knows the roll.",
-        read_only=True,
+    heading_from_estimate: bool = fixed_parameter(
+        False, "-", "Publish the heading (lean taken off) where needle/estimate knows the roll."
     )
-    annotated_rate: float = parameter(
+    annotated_rate: float = fixed_parameter(
         2.0,
-        unit="Hz",
-        description="Most annotated images per second, while someone subscribes; 0: none.",
-        lower=0.0,
-        upper=100.0,
-        read_only=True,
+        "Hz",
+        "Most annotated images per second, while someone subscribes; 0: none.",
+        0.0,
+        100.0,
     )
-    insertion_margin: float = parameter(
+    insertion_margin: float = fixed_parameter(
         2.0e-3,
-        unit="m",
-        description="Tolerance between the tip's distance from the entry and the insertion.",
-        lower=0.1e-3,
-        upper=0.05,
-        read_only=True,
+        "m",
+        "Tolerance between the tip's distance from the entry and the insertion.",
+        0.1e-3,
+        0.05,
     )
-    step_margin: float = parameter(
+    step_margin: float = fixed_parameter(
         1.0e-3,
-        unit="m",
-        description="Tolerance of the tip against where the last tip and the insertion have it.",
-        lower=0.1e-3,
-        upper=0.05,
-        read_only=True,
+        "m",
+        "Tolerance of the tip against where the last tip and the insertion have it.",
+        0.1e-3,
+        0.05,
     )
-    free_step: float = parameter(
+    free_step: float = fixed_parameter(
         5.0e-3,
-        unit="m",
-        description="Largest move of the tip per pair where the insertion is not known.",
-        lower=0.1e-3,
-        upper=0.1,
-        read_only=True,
+        "m",
+        "Largest move of the tip per pair where the insertion is not known.",
+        0.1e-3,
+        0.1,
     )
-    max_disagreement: float = parameter(
+    max_disagreement: float = fixed_parameter(
         1.5e-3,
-        unit="m",
-        description="Largest disagreement of the cameras about the end along the needle.",
-        lower=0.05e-3,
-        upper=0.05,
-        read_only=True,
+        "m",
+        "Largest disagreement of the cameras about the end along the needle.",
+        0.05e-3,
+        0.05,
     )
-    confirm_pairs: int = parameter(
-        3,
-        unit="-",
-        description="Pairs in a row that must agree, where the insertion is not known.",
-        lower=1,
-        upper=100,
-        read_only=True,
+    confirm_pairs: int = fixed_parameter(
+        3, "-", "Pairs in a row that must agree, where the insertion is not known.", 1, 100
     )
-    lost_after: int = parameter(
-        10,
-        unit="-",
-        description="Pairs in a row without a tip after which the track is lost.",
-        lower=1,
-        upper=1000,
-        read_only=True,
+    lost_after: int = fixed_parameter(
+        10, "-", "Pairs in a row without a tip after which the track is lost.", 1, 1000
     )
-    forget_after: int = parameter(
+    forget_after: int = fixed_parameter(
         30,
-        unit="-",
-        description="Pairs in a row without a tip after which the last place no longer counts.",
-        lower=1,
-        upper=10000,
-        read_only=True,
+        "-",
+        "Pairs in a row without a tip after which the last place no longer counts.",
+        1,
+        10000,
     )
 
     def __post_init__(self) -> None:

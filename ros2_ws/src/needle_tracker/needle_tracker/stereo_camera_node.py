@@ -21,7 +21,7 @@ from needle_common.cli import EXIT_DONE
 from needle_common.conversions import IMAGES, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
-from needle_common.parameter_fields import check_fields, parameter
+from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
 from needle_tracker.calibration import SIDES, Camera, load_calibration
 from needle_tracker.image_files import Image as GreyImage
@@ -51,54 +51,25 @@ _LAST_IMAGES = 2.0  # [s] for subscribers to take a recording's last images
 class StereoCameraParameters:
     """Parameters of the node; all are fixed at start."""
 
-    left: str = parameter(
-        "",
-        unit="-",
-        description="Left source: device number or /dev/..., folder of images, or video file.",
-        read_only=True,
+    left: str = fixed_parameter(
+        "", "-", "Left source: device number or /dev/..., folder of images, or video file."
     )
-    right: str = parameter(
-        "", unit="-", description="Right source, of the same kind.", read_only=True
+    right: str = fixed_parameter("", "-", "Right source, of the same kind.")
+    calibration_file: str = fixed_parameter(
+        "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
     )
-    calibration_file: str = parameter(
-        "",
-        unit="-",
-        description="Calibration file of the stereo rig; empty: the simulated bench's.",
-        read_only=True,
+    rate: float = fixed_parameter(20.0, "Hz", "Image pairs a second.", 0.1, 1000.0)
+    loop: bool = fixed_parameter(
+        False, "-", "Begin a recording again at its end, instead of ending with it."
     )
-    rate: float = parameter(
-        20.0,
-        unit="Hz",
-        description="Image pairs a second.",
-        lower=0.1,
-        upper=1000.0,
-        read_only=True,
+    latency: float = fixed_parameter(
+        0.0, "s", "Time from exposure to grab, taken off the stamp (cameras only).", 0.0, 1.0
     )
-    loop: bool = parameter(
-        False,
-        unit="-",
-        description="Begin a recording again at its end, instead of ending with it.",
-        read_only=True,
+    triggered: bool = fixed_parameter(
+        False, "-", "One trigger line exposes both cameras: both images get the left's stamp."
     )
-    latency: float = parameter(
-        0.0,
-        unit="s",
-        description="Time from exposure to grab, taken off the stamp (cameras only).",
-        lower=0.0,
-        upper=1.0,
-        read_only=True,
-    )
-    triggered: bool = parameter(
-        False,
-        unit="-",
-        description="One trigger line exposes both cameras: both images get the left's stamp.",
-        read_only=True,
-    )
-    wait_for_subscribers: bool = parameter(
-        False,
-        unit="-",
-        description="Begin when somebody subscribes to both images (for recordings).",
-        read_only=True,
+    wait_for_subscribers: bool = fixed_parameter(
+        False, "-", "Begin when somebody subscribes to both images (for recordings)."
     )
 
     def __post_init__(self) -> None:
