@@ -18,10 +18,6 @@ _NO_REMOTE = 1 << 30
 _MOST_ENTRIES = 8
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = 254
-RECEIVE_PARAMETERS = 0x1400
-RECEIVE_MAPPING = 0x1600
-TRANSMIT_PARAMETERS = 0x1800
-TRANSMIT_MAPPING = 0x1A00
 
 
 class _Pdo:
@@ -30,28 +26,30 @@ class _Pdo:
     Parameters
     ----------
     dictionary : ObjectDictionary
-        Where the parameters live.
-    parameters, mapping : int
-        Indices of the communication and the mapping parameter.
+        The device's, where the parameters live.
+    number : int
+        0 is the first of its direction.
     cob_id : int
         Identifier after power-up, with bit 31 where the PDO is off.
     mapped : tuple of int
         Mapping after power-up: index << 16 | subindex << 8 | bits.
     """
 
+    # Of each direction: indices of the first communication and mapping parameters, and how many
+    # subindices the former has.
+    _first_parameters: int
+    _first_mapping: int
+    _last_parameter: int
+
     def __init__(
-        self,
-        dictionary: ObjectDictionary,
-        parameters: int,
-        mapping: int,
-        cob_id: int,
-        mapped: tuple[int, ...],
+        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
     ) -> None:
         self._dictionary = dictionary
-        self._parameters = parameters
-        self._mapping = mapping
+        self._parameters = parameters = self._first_parameters + number
+        self._mapping = mapping = self._first_mapping + number
         add = dictionary.add
         writable = partial(add, access=Access.READ_WRITE)
+        add(parameters, 0, Kind.U8, self._last_parameter)
         writable(parameters, 1, Kind.U32, cob_id)
         writable(parameters, 2, Kind.U8, 255)
         writable(mapping, 0, Kind.U8, len(mapped))
@@ -116,26 +114,14 @@ class _Pdo:
 
 
 class ReceivePdo(_Pdo):
-    """Takes values from the bus.
+    """Takes values from the bus; parameters as of `_Pdo`."""
 
-    Parameters
-    ----------
-    dictionary : ObjectDictionary
-        The device's.
-    number : int
-        0 is the first.
-    cob_id : int
-        After power-up.
-    mapped : tuple of int
-        Mapping after power-up.
-    """
+    _first_parameters, _first_mapping, _last_parameter = 0x1400, 0x1600, 2
 
     def __init__(
         self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
     ) -> None:
-        parameters = RECEIVE_PARAMETERS + number
-        super().__init__(dictionary, parameters, RECEIVE_MAPPING + number, cob_id, mapped)
-        dictionary.add(parameters, 0, Kind.U8, 2)
+        super().__init__(dictionary, number, cob_id, mapped)
         self._waiting: bytes | None = None
 
     def take(self, data: bytes) -> None:
@@ -171,26 +157,17 @@ class ReceivePdo(_Pdo):
 class TransmitPdo(_Pdo):
     """Puts values on the bus: with every n-th SYNC, on change, by timer or on request.
 
-    Parameters
-    ----------
-    dictionary : ObjectDictionary
-        The device's.
-    number : int
-        0 is the first.
-    cob_id : int
-        After power-up.
-    mapped : tuple of int
-        Mapping after power-up.
+    Parameters as of `_Pdo`.
     """
+
+    _first_parameters, _first_mapping, _last_parameter = 0x1800, 0x1A00, 5
 
     def __init__(
         self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
     ) -> None:
-        parameters = TRANSMIT_PARAMETERS + number
-        super().__init__(dictionary, parameters, TRANSMIT_MAPPING + number, cob_id, mapped)
-        dictionary.add(parameters, 0, Kind.U8, 5)
-        dictionary.add(parameters, 3, Kind.U16, 0, access=Access.READ_WRITE)
-        dictionary.add(parameters, 5, Kind.U16, 0, access=Access.READ_WRITE)
+        super().__init__(dictionary, number, cob_id, mapped)
+        dictionary.add(self._parameters, 3, Kind.U16, 0, access=Access.READ_WRITE)
+        dictionary.add(self._parameters, 5, Kind.U16, 0, access=Access.READ_WRITE)
         self._syncs = 0
         self._sent: bytes | None = None
         self._sent_at = 0.0
