@@ -53,11 +53,10 @@ class _Pdo:
         writable(parameters, 1, Kind.U32, cob_id)
         writable(parameters, 2, Kind.U8, 255)
         writable(mapping, 0, Kind.U8, len(mapped))
-        for number in range(1, _MOST_ENTRIES + 1):
-            value = mapped[number - 1] if number <= len(mapped) else 0
-            writable(mapping, number, Kind.U32, value)
-            check = partial(self._check_entry, number)
-            dictionary.on_write(mapping, number, check=check)
+        for entry in range(1, _MOST_ENTRIES + 1):
+            value = mapped[entry - 1] if entry <= len(mapped) else 0
+            writable(mapping, entry, Kind.U32, value)
+            dictionary.on_write(mapping, entry, check=self._check_entry)
         dictionary.on_write(parameters, 1, check=self._check_cob_id)
         dictionary.on_write(mapping, 0, check=self._check_count)
 
@@ -91,7 +90,7 @@ class _Pdo:
         if self.cob_id is not None:
             raise SdoAbortError(Abort.DEVICE_STATE)
 
-    def _check_entry(self, number: int, value: int) -> None:
+    def _check_entry(self, value: int) -> None:
         self._check_off()
         if self._dictionary.value(self._mapping, 0) != 0:
             raise SdoAbortError(Abort.DEVICE_STATE)
