@@ -5,12 +5,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import importlib
-import signal
 import sys
 import time
 from collections.abc import Iterator
 from functools import partial
-from types import FrameType
 from typing import Any, Final, cast
 
 from rclpy.duration import Duration
@@ -34,6 +32,7 @@ from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.conversions import RELIABLE, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes
@@ -270,7 +269,7 @@ def _message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
-def _play(player: Player, loop: bool, stopped: list[bool]) -> int:
+def _play(player: Player, loop: bool, end: EndRequest) -> int:
     executor = SingleThreadedExecutor()
     executor.add_node(player)
     bar = tqdm(
@@ -296,7 +295,7 @@ def _play(player: Player, loop: bool, stopped: list[bool]) -> int:
                             wait = player.clock.wait(message[1], time.monotonic())
                     executor.spin_once(min(wait, PATIENCE))
                     player.look_around()
-                    if stopped:
+                    if end.wanted:
                         return EXIT_DONE
                     if keys.pressed() == " ":
                         player.pause(not player.clock.is_paused)
@@ -318,18 +317,12 @@ def main(args: list[str] | None = None) -> int:
         options = parse_options(own)
         contents = read_contents(options.bag)
         require_fits(options, contents)
-        stopped: list[bool] = []
-
-        def stop(_number: int, _frame: FrameType | None) -> None:
-            stopped.append(True)
-
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, stop)
+        end = EndRequest()
 
         def spin(node: Node) -> int:
             player = cast(Player, node)
             try:
-                code = _play(player, options.loop, stopped)
+                code = _play(player, options.loop, end)
             except RigAppearedError as error:
                 print(
                     f"error: a rig came up on this graph ({error}): playing ended; give one of "

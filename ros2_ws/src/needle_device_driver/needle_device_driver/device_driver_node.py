@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import gc
 import logging
-import signal
 import sys
 import time
-from types import FrameType
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
@@ -21,6 +19,7 @@ from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
@@ -299,15 +298,8 @@ def main() -> int:
     # What canopen and python-can have to say comes as faults of the axes.
     for name in ("canopen", "can"):
         logging.getLogger(name).addHandler(logging.NullHandler())
-    ended = False
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
     # rclpy's own handlers would shut the context down before the axes are off.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    end = EndRequest()
 
     def spin(node: Node) -> int:
         assert isinstance(node, DeviceDriverNode)
@@ -316,7 +308,7 @@ def main() -> int:
         # What is there stays: no collection need look through it while the drives wait.
         gc.freeze()
         try:
-            while not (ended or node.ended):
+            while not (end.wanted or node.ended):
                 executor.spin_once(timeout_sec=0.1)
         finally:
             node.close()

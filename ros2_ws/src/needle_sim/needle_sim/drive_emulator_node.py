@@ -8,7 +8,6 @@ import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
@@ -21,6 +20,7 @@ from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
@@ -174,15 +174,8 @@ class DriveEmulatorNode(Node):
 
 def main() -> int:
     """Run the emulator; returns its exit code."""
-    ended = False
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
     # rclpy's own handlers would leave the link to the port behind.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, on_signal)
+    end = EndRequest(signal.SIGHUP)
 
     def spin(node: Node) -> int:
         assert isinstance(node, DriveEmulatorNode)
@@ -191,7 +184,7 @@ def main() -> int:
         commands = _CommandInput()
         looked_at = 0.0
         try:
-            while not ended:
+            while not end.wanted:
                 waits = node.turn()
                 for line in commands.lines():
                     node.obey(line)

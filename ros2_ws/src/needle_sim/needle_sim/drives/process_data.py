@@ -35,8 +35,8 @@ class _Pdo:
         Mapping after power-up: index << 16 | subindex << 8 | bits.
     """
 
-    # Of each direction: indices of the first communication and mapping parameters, and how many
-    # subindices the former has.
+    # Of each direction: indices of the first communication and mapping parameters, and the highest
+    # subindex of the former.
     _first_parameters: int
     _first_mapping: int
     _last_parameter: int
