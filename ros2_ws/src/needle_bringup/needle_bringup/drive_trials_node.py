@@ -19,8 +19,8 @@ import rclpy
 from needle_bringup.drive_faults_node import FAULTS, fault_trials
 from needle_bringup.drive_steps_node import random_steps
 from needle_bringup.graph_kills_node import KILLED, kill_trials
-from needle_bringup.ros_domain import own_domain
 from needle_common.cli import EXIT_DONE, run_command
+from needle_common.ros_domain import own_domain
 
 
 def main() -> int:

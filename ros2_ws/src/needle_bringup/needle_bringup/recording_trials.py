@@ -18,9 +18,9 @@ from rosbags.rosbag2 import Reader
 
 from needle_bringup.bag_files import read_contents
 from needle_bringup.bag_recovery import recover_bag
-from needle_bringup.ros_domain import own_domain
 from needle_bringup.verification import unreadable
 from needle_common.errors import UserError
+from needle_common.ros_domain import own_domain
 
 # The first bytes of every message: the encoding, then the stamp's seconds; its nanoseconds are the
 # message's number.

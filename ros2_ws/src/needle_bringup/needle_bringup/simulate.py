@@ -28,7 +28,6 @@ from needle_bringup.rig_configuration import (
     rig_parameters,
     write_parameters,
 )
-from needle_bringup.ros_domain import own_domain
 from needle_bringup.simulate_options import SimulateOptions, parse
 from needle_common.cli import (
     EXIT_BAD_INPUT,
@@ -39,6 +38,7 @@ from needle_common.cli import (
     write_json,
 )
 from needle_common.errors import UserError
+from needle_common.ros_domain import own_domain
 
 LOGS = "logs"
 PARAMETERS = "parameters.yaml"

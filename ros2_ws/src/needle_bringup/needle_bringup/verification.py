@@ -19,9 +19,9 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.ros_domain import ports_of
-from needle_bringup.shared_memory import ports_left
 from needle_common.errors import UserError
+from needle_common.ros_domain import ports_of
+from needle_common.shared_memory import ports_left
 
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"

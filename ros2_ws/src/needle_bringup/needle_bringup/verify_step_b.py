@@ -21,9 +21,9 @@ from needle_bringup.control_studies import BEST, FIGURE_3, PAPER, SPEED, TROUBLE
 from needle_bringup.installed import find_executable
 from needle_bringup.node_process import NodeProcess, stop
 from needle_bringup.pure_insertions import NOISE, RADIUS, curvature_errors, pure_insertions
-from needle_bringup.ros_domain import own_domain
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.errors import UserError
+from needle_common.ros_domain import own_domain
 from needle_controller.control_settings import ControlSettings
 from needle_controller.gains import design_gains
 from needle_controller.joint_history import JointSample

@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Int32, String
 
-from needle_bringup.ros_domain import own_domain
+from needle_common.ros_domain import own_domain
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 PATIENCE = 20.0

@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 
 from needle_bringup.node_process import NodeProcess, stop, wait_for
-from needle_bringup.ros_domain import own_domain
+from needle_common.ros_domain import own_domain
 
 
 def start(tmp_path: Path, script: str) -> NodeProcess:

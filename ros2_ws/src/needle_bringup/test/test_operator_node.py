@@ -16,8 +16,8 @@ from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
 from needle_bringup.installed import find_executable
-from needle_bringup.ros_domain import own_domain
 from needle_common.conversions import HOLD, LATCHED, to_nanoseconds
+from needle_common.ros_domain import own_domain
 
 LIMIT = 20.0
 

@@ -31,7 +31,7 @@ from needle_bringup import player_node
 from needle_bringup.bag_metadata import BagTopic, OfferedQos
 from needle_bringup.bag_writer import BagWriter
 from needle_bringup.message_definitions import full_definition, type_hash
-from needle_bringup.ros_domain import own_domain
+from needle_common.ros_domain import own_domain
 
 PATIENCE = 30.0
 START = 1_700_000_000_000_000_000

@@ -3,8 +3,8 @@
 import fcntl
 from pathlib import Path
 
-from needle_bringup.ros_domain import own_domain, ports_of
-from needle_bringup.shared_memory import ports_left, remove_dead_ports
+from needle_common.ros_domain import own_domain, ports_of
+from needle_common.shared_memory import ports_left, remove_dead_ports
 
 PORTS = range(7400, 7410)
 

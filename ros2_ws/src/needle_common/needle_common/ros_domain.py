@@ -7,8 +7,8 @@ import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from needle_bringup.shared_memory import remove_dead_ports
 from needle_common.errors import UserError
+from needle_common.shared_memory import remove_dead_ports
 
 # Above 101 the ports reach into the range that Linux gives out to outgoing connections; 0 is where
 # everything runs that was not told otherwise.
