@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -10,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
     PointStamped,
@@ -39,22 +37,19 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
+from needle_common.own_context_node import own_context
 from needle_controller.conversions import to_tip_covariance
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.plane_controller_node import PlaneControllerNode, main
 
-# Runs of these tests at the same time on one machine must not hear each other.
-DOMAIN = 81 + os.getpid() % 9
 LIMIT = 20.0
 TICK = 20_000_000
 
 
 @pytest.fixture
 def context() -> Iterator[Context]:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
+    with own_context() as context:
+        yield context
 
 
 class Bench:

@@ -6,18 +6,15 @@ import itertools
 import math
 import os
 import signal
-import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import can
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
@@ -41,9 +38,10 @@ from needle_common.conversions import (
     values_of,
 )
 from needle_common.errors import UserError
+from needle_common.own_context_node import own_context
+from needle_common.ros_domain import own_domain
 from needle_device_driver.device_driver_node import DeviceDriverNode
 
-DOMAINS = range(71, 79)
 LIMIT = 20.0
 CHANNELS = itertools.count()
 JOINTS = ["insertion_joint", "rotation_joint"]
@@ -284,25 +282,6 @@ class Rig:
         self.peer.close()
 
 
-@contextmanager
-def own_context() -> Iterator[Context]:
-    """Give a context in a domain that nobody else has who takes the same lock."""
-    for domain in DOMAINS:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
-            try:
-                lock.bind(f"\0needle_ros_domain_{domain}")
-            except OSError:
-                continue
-            context = Context()
-            rclpy.init(context=context, domain_id=domain)
-            try:
-                yield context
-            finally:
-                context.try_shutdown()
-            return
-    raise AssertionError(f"no free domain in {DOMAINS}")
-
-
 @pytest.fixture
 def make_rig(scripted_drive: Any) -> Iterator[Callable[..., Rig]]:
     with own_context() as context:
@@ -531,10 +510,16 @@ def test_bad_parameters_are_refused(make_rig: Make, parameters: dict[str, Any], 
         make_rig(**parameters)
 
 
-def test_the_executable_says_in_one_line_what_is_missing_and_ends_on_a_signal() -> None:
+@pytest.fixture
+def domain() -> Iterator[int]:
+    with own_domain() as domain:
+        yield domain
+
+
+def test_the_executable_says_in_one_line_what_is_missing_and_ends_on_a_signal(domain: int) -> None:
     command = [sys.executable, "-m", "needle_device_driver.device_driver_node", "--ros-args"]
     command += ["-p", "channel:=/dev/there-is-none"]
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(DOMAINS[-1] + 1)}
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
     missing = subprocess.run(
         [*command, "-p", "connect_timeout:=0.0"],
         env=environment,

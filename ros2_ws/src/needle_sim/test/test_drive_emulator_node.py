@@ -20,6 +20,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from needle_common.conversions import JOINT_STATES, to_nanoseconds
+from needle_common.ros_domain import own_domain
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
 LIMIT = 20.0
@@ -77,12 +78,13 @@ class Emulator:
 
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[Emulator]:
-    emulator = Emulator(145, tmp_path, "insertion_start:=0.001", "motion_clock:=sync")
-    try:
-        yield emulator
-    finally:
-        emulator.process.kill()
-        emulator.process.wait()
+    with own_domain() as domain:
+        emulator = Emulator(domain, tmp_path, "insertion_start:=0.001", "motion_clock:=sync")
+        try:
+            yield emulator
+        finally:
+            emulator.process.kill()
+            emulator.process.wait()
 
 
 def test_tells_where_the_motors_are_and_leaves_nothing(emulator: Emulator) -> None:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import functools
 import math
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
@@ -30,9 +28,9 @@ from needle_common.conversions import (
     to_nanoseconds,
     to_stamp,
 )
+from needle_common.own_context_node import own_context
 from needle_sim.sim_rig_node import SimRigNode
 
-DOMAINS = range(70, 79)
 LIMIT = 20.0
 TICK_NS = 20_000_000
 WAY_PER_TICK = 4e-5
@@ -173,22 +171,12 @@ class Rig:
 
 @contextmanager
 def running(**parameters: Any) -> Iterator[Rig]:
-    for domain in DOMAINS:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
-            try:
-                lock.bind(f"\0needle_ros_domain_{domain}")
-            except OSError:
-                continue
-            context = Context()
-            rclpy.init(context=context, domain_id=domain)
-            rig = Rig(context, **parameters)
-            try:
-                yield rig
-            finally:
-                rig.close()
-                context.try_shutdown()
-            return
-    raise AssertionError(f"no free domain in {DOMAINS}")
+    with own_context() as context:
+        rig = Rig(context, **parameters)
+        try:
+            yield rig
+        finally:
+            rig.close()
 
 
 def test_needle_is_moved_by_the_drives_in_step_with_the_driver() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,7 +13,6 @@ from typing import Any
 
 import cv2
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
@@ -38,9 +36,9 @@ from needle_common.conversions import (
     values_of,
 )
 from needle_common.errors import UserError
+from needle_common.own_context_node import own_context
 from needle_sim.sim_rig_node import SimRigNode
 
-DOMAINS = range(61, 70)
 LIMIT = 20.0
 
 
@@ -222,25 +220,6 @@ class Rig:
         self._executor.shutdown()
         self.sim.destroy_node()
         self.partner.destroy_node()
-
-
-@contextmanager
-def own_context() -> Iterator[Context]:
-    """Give a context in a domain that nobody else has who takes the same lock."""
-    for domain in DOMAINS:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
-            try:
-                lock.bind(f"\0needle_ros_domain_{domain}")
-            except OSError:
-                continue
-            context = Context()
-            rclpy.init(context=context, domain_id=domain)
-            try:
-                yield context
-            finally:
-                context.try_shutdown()
-            return
-    raise AssertionError(f"no free domain in {DOMAINS}")
 
 
 @contextmanager

@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
@@ -23,6 +22,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from needle_common.conversions import IMAGES, RELIABLE, to_nanoseconds
 from needle_common.errors import UserError
+from needle_common.own_context_node import own_context
+from needle_common.ros_domain import own_domain
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.stereo_camera_node import StereoCameraNode
 from needle_tracker.stereo_source import (
@@ -34,7 +35,6 @@ from needle_tracker.stereo_source import (
     open_source,
 )
 
-DOMAIN = 81 + os.getpid() % 9
 LIMIT = 20.0
 SIZES = {"left": (64, 48), "right": (64, 48)}
 
@@ -204,10 +204,8 @@ def test_the_rate_is_that_of_the_last_seconds() -> None:
 
 @pytest.fixture
 def context() -> Iterator[Context]:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
+    with own_context() as context:
+        yield context
 
 
 def test_the_node_publishes_pairs_with_their_calibration(
@@ -249,10 +247,16 @@ def test_the_node_publishes_pairs_with_their_calibration(
     np.testing.assert_allclose(info.d, calibration.right.distortion)
 
 
-def run(module: str, *words: str) -> subprocess.CompletedProcess[str]:
+@pytest.fixture
+def environment() -> Iterator[dict[str, str]]:
+    with own_domain() as domain:
+        yield os.environ | {"ROS_DOMAIN_ID": str(domain)}
+
+
+def run(environment: dict[str, str], module: str, *words: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         [sys.executable, "-m", f"needle_tracker.{module}", *words],
-        env=os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)},
+        env=environment,
         capture_output=True,
         text=True,
         timeout=60,
@@ -260,22 +264,22 @@ def run(module: str, *words: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_end_of_a_recording_is_a_clean_end(tmp_path: Path) -> None:
+def test_the_end_of_a_recording_is_a_clean_end(tmp_path: Path, environment: dict[str, str]) -> None:
     left, right = write_pairs(tmp_path, 2, (1024, 768))
     given = ["-p", f"left:={left}", "-p", f"right:={right}", "-p", "rate:=100.0"]
-    ended = run("stereo_camera_node", "--ros-args", *given)
+    ended = run(environment, "stereo_camera_node", "--ros-args", *given)
     assert (ended.returncode, "2 pairs" in ended.stdout + ended.stderr) == (0, True)
 
 
-def test_a_missing_camera_is_one_line_and_exit_2() -> None:
+def test_a_missing_camera_is_one_line_and_exit_2(environment: dict[str, str]) -> None:
     given = ["-p", "left:=/dev/no_camera", "-p", "right:=/dev/no_other"]
-    ended = run("stereo_camera_node", "--ros-args", *given)
+    ended = run(environment, "stereo_camera_node", "--ros-args", *given)
     assert ended.returncode == 2
     assert ended.stderr.splitlines() == ["error: left camera /dev/no_camera does not exist"]
 
 
 def test_a_live_check_takes_its_images_from_the_topics(
-    tmp_path: Path, calibration_path: Path
+    tmp_path: Path, calibration_path: Path, environment: dict[str, str]
 ) -> None:
     """Images without a board come through, and are refused for that."""
     left, right = write_pairs(tmp_path, 2, (1024, 768))
@@ -286,18 +290,18 @@ def test_a_live_check_takes_its_images_from_the_topics(
         "places: {top: {origin: [0.018, -0.045, 0.0]}}\n"
     )
     words = ["--calibration", str(calibration_path), "--session", str(session), "--live", "top"]
-    silent = run("check_calibration_node", *words, "--timeout", "0.5")
+    silent = run(environment, "check_calibration_node", *words, "--timeout", "0.5")
     assert silent.returncode == 2
     assert silent.stderr.startswith("error: 0 image pairs of 10 in 0.5 s")
 
     camera = subprocess.Popen(
         [sys.executable, "-m", "needle_tracker.stereo_camera_node", "--ros-args", "-p",
          f"left:={left}", "-p", f"right:={right}", "-p", "loop:=true", "-p", "rate:=10.0"],
-        env=os.environ | {"ROS_DOMAIN_ID": str(DOMAIN)},
+        env=environment,
         stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
-        seen = run("check_calibration_node", *words, "--timeout", "40", "--count", "3")
+        seen = run(environment, "check_calibration_node", *words, "--timeout", "40", "--count", "3")
     finally:
         camera.terminate()
         assert camera.wait(timeout=LIMIT) == 0

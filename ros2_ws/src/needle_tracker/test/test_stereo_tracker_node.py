@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import math
-import os
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
@@ -23,10 +21,9 @@ from sensor_msgs.msg import CameraInfo, Image, JointState
 
 from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.errors import UserError
+from needle_common.own_context_node import own_context
 from needle_tracker.stereo_tracker_node import StereoTrackerNode
 
-# Runs of these tests at the same time on one machine must not hear each other.
-DOMAIN = 71 + os.getpid() % 9
 LIMIT = 20.0
 INSERTION = 0.05
 
@@ -41,10 +38,8 @@ def images(draw_pair: Drawer, make_arc: Callable[..., np.ndarray]) -> Images:
 
 @pytest.fixture
 def context() -> Iterator[Context]:
-    context = Context()
-    rclpy.init(context=context, domain_id=DOMAIN)
-    yield context
-    rclpy.try_shutdown(context=context)
+    with own_context() as context:
+        yield context
 
 
 class Bench:
