@@ -14,10 +14,7 @@ from needle_common.errors import UserError
 from needle_controller import conversions
 from needle_controller.joint_history import JointSample
 from needle_controller.parameters import PlaneControllerParameters
-from needle_controller.plane_control import PlaneControl
-from needle_controller.steering import Steering
 from needle_controller.steering_types import Action, Awaiting, PublishUpdate, SendStep, State
-from needle_controller.target_plane import check_within_reach, offset_plane
 
 _STEERING = (State.STEERING.value, State.WAITING_FOR_TIP.value)
 # A controller that is asked at the end of a motion may not have heard its last joints yet [ns].
@@ -66,8 +63,7 @@ class ControllerStage:
         self._parameters = parameters
         self._node = node
         self._unheard = unheard
-        control = PlaneControl(parameters.control(), offset_plane(parameters.target_offset))
-        self._steering = Steering(parameters.steering(), control)
+        self._steering = parameters.make_steering()
         self._sent: int | None = None
         self._recorded_state = ""
         self.tips = 0
@@ -128,7 +124,7 @@ class ControllerStage:
     def _take_plane(self, message: Any) -> Iterable[Action]:
         try:
             plane = conversions.to_plane(message)
-            check_within_reach(plane, self._parameters.curvature, self._parameters.depth)
+            self._parameters.check_plane(plane)
         except UserError as error:
             self.notes.append(f"target_plane refused: {error}")
             return ()
@@ -172,11 +168,8 @@ class ControllerStage:
             self.notes.append(f"change of parameters refused: {error}")
             return ()
         if values != self._parameters:
-            before, self._parameters = self._parameters, values
-            self._steering.settings = values.steering()
-            self._steering.control.configure(values.control())
-            if values.target_offset != before.target_offset:
-                self._steering.control.plane = offset_plane(values.target_offset)
+            values.change_steering(self._steering, self._parameters)
+            self._parameters = values
         return ()
 
 

@@ -11,9 +11,11 @@ from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, parameter
 from needle_controller.control_settings import PRESETS, TIP_NOISES, ControlSettings
 from needle_controller.flip_plan import FlipPlan
+from needle_controller.plane_control import PlaneControl
 from needle_controller.presets import make_controller
+from needle_controller.steering import Steering
 from needle_controller.steering_types import TIP_COVARIANCES, SteeringSettings
-from needle_controller.target_plane import check_within_reach, offset_plane
+from needle_controller.target_plane import TargetPlane, check_within_reach, offset_plane
 
 
 @dataclasses.dataclass(frozen=True)
@@ -232,7 +234,7 @@ class PlaneControllerParameters:
                 "preset measured_pitch takes the pitch from needle/tip_pose: wants tip_covariance "
                 f"from_tip_pose, is {self.tip_covariance}"
             )
-        check_within_reach(offset_plane(self.target_offset), self.curvature, self.depth)
+        self.check_plane(self.plane())
         FlipPlan(self.flip_depths).check_within(self.depth)
         self.control().gains()
         make_controller(self.control(), np.eye(3))
@@ -243,8 +245,30 @@ class PlaneControllerParameters:
             **{f.name: getattr(self, f.name) for f in dataclasses.fields(ControlSettings)}
         )
 
+    def plane(self) -> TargetPlane:
+        """Return the wanted plane, until another one is given."""
+        return offset_plane(self.target_offset)
+
+    def check_plane(self, plane: TargetPlane) -> None:
+        """Refuse a wanted plane that is out of reach; raises UserError."""
+        check_within_reach(plane, self.curvature, self.depth)
+
     def steering(self) -> SteeringSettings:
         """Return the step protocol's numbers."""
         return SteeringSettings(
             **{f.name: getattr(self, f.name) for f in dataclasses.fields(SteeringSettings)}
         )
+
+    def make_steering(self) -> Steering:
+        """Return a step protocol with its estimator and law."""
+        return Steering(self.steering(), PlaneControl(self.control(), self.plane()))
+
+    def change_steering(self, steering: Steering, before: PlaneControllerParameters) -> None:
+        """Have a step protocol that was made or changed by `before` go on with these parameters.
+
+        A plane that was given meanwhile stays, unless `target_offset` is another.
+        """
+        steering.settings = self.steering()
+        steering.control.configure(self.control())
+        if self.target_offset != before.target_offset:
+            steering.control.plane = self.plane()

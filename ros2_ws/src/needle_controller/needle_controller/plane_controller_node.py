@@ -37,10 +37,7 @@ from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
-from needle_controller.plane_control import PlaneControl
-from needle_controller.steering import Steering
 from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep
-from needle_controller.target_plane import check_within_reach, offset_plane
 
 HELP = """
 plane_controller: steers the needle into the target plane, one insertion step per measured tip.
@@ -82,9 +79,8 @@ class PlaneControllerNode(Node):
         )
         self._settings = NodeParameters(self, PlaneControllerParameters, self._on_parameters)
         values = self._settings.values
-        self._target_offset = values.target_offset
-        control = PlaneControl(values.control(), offset_plane(values.target_offset))
-        self._steering = Steering(values.steering(), control)
+        self._steering_has = values
+        self._steering = values.make_steering()
         self._logged: dict[str, float] = {}
         self._bad_joints = 0
         self._joints_complaint = ""
@@ -181,8 +177,7 @@ class PlaneControllerNode(Node):
     def _on_plane(self, message: PoseStamped) -> None:
         try:
             plane = conversions.to_plane(message)
-            values = self._settings.values
-            check_within_reach(plane, values.curvature, values.depth)
+            self._settings.values.check_plane(plane)
         except UserError as error:
             self._plane_complaint = f"{error}; the last plane stays"
             self._do([Log("warning", self._plane_complaint)])
@@ -192,11 +187,8 @@ class PlaneControllerNode(Node):
         self._do([Log("info", f"target_plane at offset {plane.offset:g} m")])
 
     def _on_parameters(self, values: PlaneControllerParameters) -> None:
-        self._steering.settings = values.steering()
-        self._steering.control.configure(values.control())
-        if values.target_offset != self._target_offset:
-            self._target_offset = values.target_offset
-            self._steering.control.plane = offset_plane(values.target_offset)
+        values.change_steering(self._steering, self._steering_has)
+        self._steering_has = values
         self._do([Log("info", "parameters changed")])
 
     def _on_timer(self) -> None:
