@@ -29,6 +29,7 @@ from needle_bringup.tracker_rerun_node import TrackerStage
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
 from needle_common.options import CommandParser, output_file
+from needle_common.parameters import OF_EVERY_NODE
 from needle_controller.control_settings import PRESETS
 from needle_controller.parameters import PlaneControllerParameters
 from needle_tracker.calibration import parse_calibration
@@ -58,8 +59,6 @@ exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing
 """
 FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
-# What rclpy declares on every node.
-_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
 
 P = TypeVar("P")
 
@@ -86,7 +85,7 @@ class Node:
         """Return them as a node's parameter class has them; warn of those it no longer has."""
         names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
         known = {name: value for name, value in self.values.items() if name in names}
-        unknown = [n for n in self.values if n not in names and not n.startswith(_OF_EVERY_NODE)]
+        unknown = [n for n in self.values if n not in names and not n.startswith(OF_EVERY_NODE)]
         refused = self.given.intersection(unknown)
         if refused:
             raise UserError(f"--params: {self.name} has no parameter {', '.join(sorted(refused))}")

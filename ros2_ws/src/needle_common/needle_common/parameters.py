@@ -19,8 +19,8 @@ from needle_common.parameter_fields import ParameterSpec, specs
 
 P = TypeVar("P")
 
-# Parameters that every rclpy node declares for itself.
-_FROM_RCLPY = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+"""How the names of parameters begin that every rclpy node declares for itself."""
 
 
 class NodeParameters(Generic[P]):
@@ -106,7 +106,7 @@ def _plain(value: Any) -> Any:
 def _refuse_unknown(node: Node, known: list[str]) -> None:
     # rclpy drops overrides that nobody declares without a word: a misspelt gain would do nothing.
     for name in node._parameter_overrides:
-        if name in known or name.startswith(_FROM_RCLPY):
+        if name in known or name.startswith(OF_EVERY_NODE):
             continue
         close = difflib.get_close_matches(name, known, n=1)
         hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
