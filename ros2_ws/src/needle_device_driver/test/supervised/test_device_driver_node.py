@@ -1,294 +1,38 @@
-"""device_driver on scripted drives behind python-can's virtual bus, with a clock of the test's."""
+"""The device_driver node: steps, refusals, lifecycle, start and end."""
 
 from __future__ import annotations
 
-import itertools
 import math
 import os
 import signal
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-import can
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import JointState, Joy
-from std_msgs.msg import Bool, Header
-from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from std_msgs.msg import Bool
+from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.conversions import (
-    HOLD,
-    JOINT_STATES,
-    LATCHED,
     RELIABLE,
     to_nanoseconds,
-    to_stamp,
-    values_of,
 )
 from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 from needle_common.ros_domain import own_domain
-from needle_device_driver.device_driver_node import DeviceDriverNode
 
-LIMIT = 20.0
-CHANNELS = itertools.count()
-JOINTS = ["insertion_joint", "rotation_joint"]
-
-
-class Peer:
-    """Two scripted drives on the far end of a virtual bus."""
-
-    def __init__(self, channel: str, drive: Any) -> None:
-        self.drives = [drive(1), drive(2)]
-        self.syncs = 0
-        self._bus = can.Bus(interface="virtual", channel=channel)
-        self._ended = False
-        self._thread = threading.Thread(target=self._serve, daemon=True)
-        self._thread.start()
-
-    def _serve(self) -> None:
-        beat_at = 0.0
-        while not self._ended:
-            message = self._bus.recv(0.02)
-            beat, now = beat_at <= time.monotonic(), time.monotonic()
-            if beat:
-                beat_at = now + 0.02
-            self.syncs += message is not None and message.arbitration_id == 0x80
-            for drive in self.drives:
-                if beat:
-                    drive.say(0x700, bytes([drive.nmt]))
-                if message is not None:
-                    drive.take(message.arbitration_id, bytes(message.data))
-                for cob_id, data in drive.out:
-                    self._bus.send(
-                        can.Message(arbitration_id=cob_id, data=data, is_extended_id=False)
-                    )
-                drive.out.clear()
-
-    def close(self) -> None:
-        self._ended = True
-        self._thread.join()
-        self._bus.shutdown()
-
-
-class Partner(Node):
-    """Plays clock, operator and controller, and keeps what it hears."""
-
-    def __init__(self, context: Context) -> None:
-        super().__init__("partner", context=context)
-        self.joints: list[JointState] = []
-        self.results: list[Header] = []
-        self.status: dict[str, str] = {}
-        self.clock = self.create_publisher(Clock, "/clock", RELIABLE)
-        self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
-        self.holds = self.create_publisher(Joy, "device/hold", HOLD)
-        self.estops = self.create_publisher(Bool, "device/estop", RELIABLE)
-        self.create_subscription(JointState, "joint_states", self.joints.append, JOINT_STATES)
-        self.create_subscription(Header, "device/result", self.results.append, RELIABLE)
-        self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
-        self.device: dict[str, Any] = {
-            name: self.create_client(kind, f"device/{name}")
-            for kind, names in (
-                (Trigger, ("home", "retract", "stop", "reset")),
-                (SetBool, ("enable", "confirm_needle_out")),
-            )
-            for name in names
-        }
-        self.change = self.create_client(ChangeState, "device_driver/change_state")
-        self.get = self.create_client(GetState, "device_driver/get_state")
-
-    def _on_status(self, message: DiagnosticStatus) -> None:
-        self.status = values_of(message)
-
-
-class Rig:
-    """Driver, drives and partner on one executor; time is what the test says."""
-
-    def __init__(self, context: Context, drive: Any, **parameters: Any) -> None:
-        channel = f"node-{next(CHANNELS)}"
-        self.peer = Peer(channel, drive)
-        overrides = {
-            "link": "virtual",
-            "channel": channel,
-            "use_sim_time": True,
-            # A machine under load is no reason to stop.
-            "reply_age_limit": 0.5,
-            "hold_timeout": 0.5,
-            **parameters,
-        }
-        self.driver = DeviceDriverNode(
-            context=context,
-            parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
-        )
-        self.partner = Partner(context)
-        self.time_ns = 1_000_000_000
-        self.stamps = itertools.count(1)
-        self.holding = False
-        self._held_at = 0.0
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.driver)
-        self._executor.add_node(self.partner)
-
-    def until(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + LIMIT
-        while not condition():
-            now = time.monotonic()
-            assert now < deadline, f"timed out: {what}; {self.partner.status}"
-            if self.holding and now > self._held_at + 0.05:
-                self.hold()
-            self._executor.spin_once(timeout_sec=0.01)
-
-    def matched(self) -> None:
-        self.until(lambda: all(c.service_is_ready() for c in self.partner.device.values()), "?")
-        self.until(
-            lambda: (
-                all(
-                    publisher.get_subscription_count() > 0
-                    for publisher in (
-                        self.partner.clock,
-                        self.partner.commands,
-                        self.partner.holds,
-                        self.partner.estops,
-                    )
-                )
-                and self.partner.count_publishers("joint_states") > 0
-            ),
-            "endpoints",
-        )
-
-    def hold(self, pressed: bool = True) -> None:
-        self.holding = pressed
-        self._held_at = time.monotonic()
-        message = Joy(axes=[1.0], buttons=[int(pressed)])
-        message.header.frame_id = "partner"
-        message.header.stamp = to_stamp(next(self.stamps))
-        self.partner.holds.publish(message)
-
-    def tell_time(self) -> None:
-        self.partner.clock.publish(Clock(clock=to_stamp(self.time_ns)))
-
-    def tick(self, count: int = 1) -> None:
-        """Let 20 ms go by, `count` times, each when the driver is through with the last."""
-        for _ in range(count):
-            self.time_ns += 20_000_000
-            if self.holding:
-                self.hold()
-            self.tell_time()
-            self.until(
-                lambda: (
-                    bool(self.partner.joints)
-                    and to_nanoseconds(self.partner.joints[-1].header.stamp) == self.time_ns
-                ),
-                "joints of this tick",
-            )
-
-    def until_refused(self, count: int) -> None:
-        self.until(lambda: self.partner.status["commands_refused"] == str(count), "counted")
-
-    def until_answered(self, before: int) -> None:
-        self.until(lambda: len(self.partner.results) > before, "an answer")
-
-    def tick_until(self, condition: Callable[[], bool], what: str, most: int = 200) -> None:
-        for _ in range(most):
-            if condition():
-                return
-            self.tick()
-        raise AssertionError(f"not within {most} ticks: {what}; {self.partner.status}")
-
-    def call(self, name: str, data: bool | None = None) -> Any:
-        request = Trigger.Request() if data is None else SetBool.Request(data=data)
-        future = self.partner.device[name].call_async(request)
-        self.until(future.done, name)
-        return future.result()
-
-    def transition(self, number: int) -> bool:
-        future = self.partner.change.call_async(
-            ChangeState.Request(transition=Transition(id=number))
-        )
-        self.until(future.done, "transition")
-        return bool(future.result().success)
-
-    @property
-    def label(self) -> str:
-        future = self.partner.get.call_async(GetState.Request())
-        self.until(future.done, "state")
-        return str(future.result().current_state.label)
-
-    def ready(self) -> None:
-        self.matched()
-        self.until(lambda: self.partner.status.get("state") == "DISABLED", "configured")
-        self.tick(2)
-        assert self.call("confirm_needle_out", True).success
-        answer = self.call("home")
-        assert answer.success, answer.message
-        self.tick_until(lambda: self.partner.status["homed"] == "true", "homed")
-        self.tick_until(lambda: self.partner.status["needs_time"] == "false", "off")
-        answer = self.call("enable", True)
-        assert answer.success, answer.message
-        self.tick_until(lambda: self.partner.status["needs_time"] == "false", "on")
-        self.hold(False)
-        self.hold(True)
-        self.until(lambda: self.partner.status["hold_owner"] == "partner", "hold")
-
-    def message(
-        self,
-        positions: list[float] | None = None,
-        *,
-        names: list[str] = JOINTS,
-        points: int = 1,
-        stamp_ns: int | None = None,
-        duration: float = 0.2,
-    ) -> JointTrajectory:
-        at = self.partner.joints[-1].position
-        wanted = [at[0] + 0.001, at[1] + 0.1] if positions is None else positions
-        point = JointTrajectoryPoint(positions=wanted)
-        point.time_from_start.nanosec = round(duration * 1e9)
-        message = JointTrajectory(joint_names=names, points=[point] * points)
-        message.header.stamp = to_stamp(self.time_ns if stamp_ns is None else stamp_ns)
-        return message
-
-    def send(self, message: JointTrajectory) -> Header:
-        """Send a command and return what was answered, time going by as long as it takes."""
-        before = len(self.partner.results)
-        self.partner.commands.publish(message)
-        self.until(
-            lambda: self.partner.status["state"] == "MOVING" or len(self.partner.results) > before,
-            "an answer",
-        )
-        self.tick_until(lambda: len(self.partner.results) > before, "the step's end")
-        return self.partner.results[-1]
-
-    @property
-    def positions(self) -> list[int]:
-        return [drive.position for drive in self.peer.drives]
-
-    def close(self) -> None:
-        self.driver.close()
-        self._executor.shutdown()
-        self.driver.destroy_node()
-        self.partner.destroy_node()
-        self.peer.close()
+from .node_bench import Rig
 
 
 @pytest.fixture
-def make_rig(scripted_drive: Any) -> Iterator[Callable[..., Rig]]:
+def make_rig() -> Iterator[Callable[..., Rig]]:
     with own_context() as context:
         rigs: list[Rig] = []
 
         def make(**parameters: Any) -> Rig:
-            rigs.append(Rig(context, scripted_drive, **parameters))
+            rigs.append(Rig(context, **parameters))
             return rigs[-1]
 
         yield make

@@ -7,23 +7,22 @@ drives are told. Lines that begin with # explain.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import pytest
 
-# conftest's; test modules cannot import it.
-Bench: TypeAlias = Any
+from .drive_bench import DriveBench
 
 FOLDER = Path(__file__).resolve().parent / "transcripts"
 HEARTBEAT = 0x77F
 
 
-def set_up(bench: Bench) -> int:
+def set_up(bench: DriveBench) -> int:
     bench.supervisor.configure(bench.clock())
     return 0
 
 
-def home(bench: Bench) -> int:
+def home(bench: DriveBench) -> int:
     bench.configured()
     start = len(bench.bus.sent)
     bench.supervisor.confirm_needle_out(True)
@@ -32,7 +31,7 @@ def home(bench: Bench) -> int:
     return start
 
 
-def move(bench: Bench) -> int:
+def move(bench: DriveBench) -> int:
     bench.homed()
     start = len(bench.bus.sent)
     bench.supervisor.enable(True, bench.clock())
@@ -45,7 +44,7 @@ def move(bench: Bench) -> int:
     return start
 
 
-def quick_stop(bench: Bench) -> int:
+def quick_stop(bench: DriveBench) -> int:
     bench.moving()
     start = len(bench.bus.sent)
     bench.cycle(1, holding=True)
@@ -54,7 +53,7 @@ def quick_stop(bench: Bench) -> int:
     return start
 
 
-def fault_and_reset(bench: Bench) -> int:
+def fault_and_reset(bench: DriveBench) -> int:
     bench.moving()
     start = len(bench.bus.sent)
     bench.rotation.fail(0x8611)
@@ -67,7 +66,7 @@ def fault_and_reset(bench: Bench) -> int:
 
 
 @pytest.mark.parametrize("scene", [set_up, home, move, quick_stop, fault_and_reset])
-def test_the_bytes_are_those_of_the_transcript(drive_bench: Bench, scene: Any) -> None:
+def test_the_bytes_are_those_of_the_transcript(drive_bench: DriveBench, scene: Any) -> None:
     start = scene(drive_bench)
     sent = [
         f"{cob_id:03X}#{data.hex().upper()}"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeAlias
 
 import can
 import hypothesis.strategies as st
@@ -12,41 +11,40 @@ from hypothesis import HealthCheck, given, settings
 
 from needle_device_driver.states import Activity, State
 
-# conftest's; test modules cannot import it.
-Bench: TypeAlias = Any
+from .drive_bench import DriveBench
 
 FURTHEST = {0x301: 0.005 * 0.02 * 20e6 * 1.02 + 2, 0x302: 3.1416 * 0.02 * 10430.4 * 1.02 + 2}
 
 
-def retract(bench: Bench) -> None:
+def retract(bench: DriveBench) -> None:
     bench.supervisor.retract(bench.clock())
 
 
-def step(bench: Bench) -> None:
+def step(bench: DriveBench) -> None:
     if bench.supervisor.joints(bench.clock()) is not None:
         bench.step(0.001, 0.3, 0.25)
 
 
-def home(bench: Bench) -> None:
+def home(bench: DriveBench) -> None:
     bench.supervisor.confirm_needle_out(True)
     bench.supervisor.home(bench.clock())
 
 
-def reboot(bench: Bench) -> None:
+def reboot(bench: DriveBench) -> None:
     bench.rotation.reboot()
     bench.deliver(bench.rotation)
 
 
-def fail(bench: Bench) -> None:
+def fail(bench: DriveBench) -> None:
     bench.insertion.fail(0x7121)
     bench.deliver(bench.insertion)
 
 
-def lose(bench: Bench) -> None:
+def lose(bench: DriveBench) -> None:
     bench.bus.error = can.CanOperationError("gone")
 
 
-EVENTS: dict[str, Callable[[Bench], object]] = {
+EVENTS: dict[str, Callable[[DriveBench], object]] = {
     "press": lambda bench: bench.hold(True),
     "release": lambda bench: bench.hold(False),
     "silence": lambda bench: setattr(bench, "skipped", bench.skipped + 0.3),
@@ -76,7 +74,7 @@ def targets(frames: list[tuple[int, bytes]]) -> list[tuple[int, int]]:
     ]
 
 
-def cycle(bench: Bench) -> None:
+def cycle(bench: DriveBench) -> None:
     """Run a cycle and check what must hold of each."""
     before = bench.positions
     may_move = bench.supervisor.activity is not Activity.NONE
@@ -109,7 +107,7 @@ def cycle(bench: Bench) -> None:
 )
 @pytest.mark.usefixtures("make_drive_bench")
 def test_nothing_moves_that_was_not_let_go(
-    make_drive_bench: Any, prefix: list[str], names: list[str]
+    make_drive_bench: Callable[..., DriveBench], prefix: list[str], names: list[str]
 ) -> None:
     bench = make_drive_bench()
     bench.wait = 0.01

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from needle_device_driver.states import Activity, State
 
-# conftest's; test modules cannot import it.
-Bench: TypeAlias = Any
+from .ideal_axes import Bench
+
 Event: TypeAlias = Callable[[Bench], object]
 
 _LIMITS = {"max_depth": 0.006, "max_turns": 0.3}
@@ -87,9 +87,9 @@ class Witness:
         self.heard: dict[str, tuple[float, bool]] = {}
         self._hold, self._advance = bench.hold, bench.insertion.advance
         self._advance_rotation = bench.rotation.advance
-        bench.hold = self.hold
-        bench.insertion.advance = self.advance
-        bench.rotation.advance = self.advance_rotation
+        bench.hold = self.hold  # type: ignore[method-assign]
+        bench.insertion.advance = self.advance  # type: ignore[method-assign]
+        bench.rotation.advance = self.advance_rotation  # type: ignore[method-assign]
 
     def hold(self, pressed: bool = True, *, sender: str = "a", **more: Any) -> None:
         good = 0.0 <= more.get("scale", 1.0) <= 1.0
@@ -144,7 +144,7 @@ def _run(bench: Bench, events: list[Event]) -> None:
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(events=_events, pause=st.booleans())
 def test_never_without_hold_never_beyond_limits_from_the_start(
-    make_bench: Any, events: list[Event], pause: bool
+    make_bench: type[Bench], events: list[Event], pause: bool
 ) -> None:
     bench = make_bench(pause_on_lapse=pause, **_LIMITS)
     bench.supervisor.configure(bench.now)
@@ -154,7 +154,7 @@ def test_never_without_hold_never_beyond_limits_from_the_start(
 @settings(max_examples=150, deadline=None, derandomize=True)
 @given(events=_events, pause=st.booleans())
 def test_never_without_hold_never_beyond_limits_once_ready(
-    make_bench: Any, events: list[Event], pause: bool
+    make_bench: type[Bench], events: list[Event], pause: bool
 ) -> None:
     bench = make_bench(pause_on_lapse=pause, **_LIMITS)
     bench.ready(holding=False)
@@ -167,7 +167,7 @@ def test_never_without_hold_never_beyond_limits_once_ready(
     rotation=st.floats(-1.2, 1.2),
 )
 def test_rotation_stays_in_proportion_at_any_speed(
-    make_bench: Any, scales: list[float], rotation: float
+    make_bench: type[Bench], scales: list[float], rotation: float
 ) -> None:
     bench = make_bench()
     bench.ready()

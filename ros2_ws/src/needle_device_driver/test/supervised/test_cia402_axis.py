@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeAlias
+from collections.abc import Callable
 
 import pytest
 
 from needle_device_driver.states import State
 
-# conftest's; test modules cannot import it.
-Bench: TypeAlias = Any
+from .drive_bench import DriveBench
 
 
-def in_state(bench: Bench, state: State) -> bool:
+def in_state(bench: DriveBench, state: State) -> bool:
     """Return whether the device is in a state, in a way that no type checker remembers."""
     return bool(bench.state is state)
 
 
-def test_a_step_ends_at_its_target_to_the_count(drive_bench: Bench) -> None:
+def test_a_step_ends_at_its_target_to_the_count(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.ready()
     bench.cycle(1, holding=True)
@@ -28,7 +27,7 @@ def test_a_step_ends_at_its_target_to_the_count(drive_bench: Bench) -> None:
     assert in_state(bench, State.HOLDING)
 
 
-def test_a_step_right_after_a_release_and_press_waits_for_the_axes(drive_bench: Bench) -> None:
+def test_a_step_right_after_a_release_and_press_waits_for_the_axes(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
     # All between two cycles.
@@ -43,7 +42,7 @@ def test_a_step_right_after_a_release_and_press_waits_for_the_axes(drive_bench: 
     assert bench.outcomes == ["aborted: hold released", "succeeded"]
 
 
-def test_enable_and_home_wait_until_the_axes_are_off(drive_bench: Bench) -> None:
+def test_enable_and_home_wait_until_the_axes_are_off(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.ready()
     bench.cycle(1, holding=True)
@@ -60,7 +59,9 @@ def test_enable_and_home_wait_until_the_axes_are_off(drive_bench: Bench) -> None
     assert bench.supervisor.enable(True, bench.clock()).success
 
 
-def test_a_drive_without_transition_16_is_switched_off_and_on_again(drive_bench: Bench) -> None:
+def test_a_drive_without_transition_16_is_switched_off_and_on_again(
+    drive_bench: DriveBench,
+) -> None:
     bench = drive_bench
     bench.moving()
     bench.insertion.keeps_quick_stop = True
@@ -74,7 +75,7 @@ def test_a_drive_without_transition_16_is_switched_off_and_on_again(drive_bench:
     assert bench.positions[0] == at[0] + 20_000
 
 
-def test_a_homing_from_before_does_not_count(drive_bench: Bench) -> None:
+def test_a_homing_from_before_does_not_count(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.homed()
     bench.insertion.position, bench.insertion.home_after = 3000, 40
@@ -83,7 +84,7 @@ def test_a_homing_from_before_does_not_count(drive_bench: Bench) -> None:
     bench.supervisor.confirm_needle_out(True)
     assert bench.supervisor.home(bench.clock()).success
     bench.cycle(30)
-    assert not bench.status.homed
+    assert not bool(bench.status.homed)
     bench.insertion.stale_homing = False
     bench.insertion.more_status = 0
     bench.cycle(30)
@@ -92,7 +93,7 @@ def test_a_homing_from_before_does_not_count(drive_bench: Bench) -> None:
 
 
 def test_a_homing_where_it_stands_ends_on_a_drive_that_never_takes_its_end_back(
-    drive_bench: Bench,
+    drive_bench: DriveBench,
 ) -> None:
     bench = drive_bench
     bench.configured()
@@ -104,7 +105,7 @@ def test_a_homing_where_it_stands_ends_on_a_drive_that_never_takes_its_end_back(
     assert bench.status.homed
 
 
-def test_a_homing_that_fails_is_a_fault(drive_bench: Bench) -> None:
+def test_a_homing_that_fails_is_a_fault(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.configured()
     bench.insertion.home_after = 1000
@@ -118,7 +119,7 @@ def test_a_homing_that_fails_is_a_fault(drive_bench: Bench) -> None:
     assert bench.insertion.state == "quick stop"
 
 
-def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed(drive_bench: Bench) -> None:
+def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.configured()
     bench.insertion.home_after = 1000
@@ -133,10 +134,10 @@ def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed(drive_bench: Bench
     assert in_state(bench, State.DISABLED)
 
 
-def test_a_drive_that_does_not_switch_on_is_a_fault_with_its_state(drive_bench: Bench) -> None:
+def test_a_drive_that_does_not_switch_on_is_a_fault_with_its_state(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.configured()
-    bench.rotation.command = lambda word: None
+    bench.rotation.command = lambda word: None  # type: ignore[method-assign]
     assert bench.supervisor.enable(True, bench.clock()).success
     bench.cycle(99)
     assert in_state(bench, State.HOLDING)
@@ -154,7 +155,7 @@ def test_a_drive_that_does_not_switch_on_is_a_fault_with_its_state(drive_bench: 
     ],
 )
 def test_a_drive_that_lacks_what_is_needed_is_refused(
-    drive_bench: Bench, change: dict[tuple[int, int], bytes], text: str
+    drive_bench: DriveBench, change: dict[tuple[int, int], bytes], text: str
 ) -> None:
     drive_bench.rotation.objects |= change
     reply = drive_bench.supervisor.configure(drive_bench.clock())
@@ -163,7 +164,7 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
     assert "rotation axis" in reply.message
 
 
-def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: Bench) -> None:
+def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> None:
     drive_bench.insertion.lacking = {0x1006, 0x1029, 0x6007, 0x60C2}
     assert drive_bench.supervisor.configure(drive_bench.clock()).success
     assert [text.partition(":")[0] for text in drive_bench.drives.lacking] == [
@@ -173,7 +174,7 @@ def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: Bench) -> None:
     ]
 
 
-def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: Bench) -> None:
+def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.insertion.lacking = {0x60FD}
     bench.insertion.status_size = 3
@@ -185,31 +186,35 @@ def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: Bench
     assert bench.outcomes == ["succeeded"]
 
 
-def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: Bench) -> None:
+def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: DriveBench) -> None:
     drive_bench.insertion.lacking = {0x1016}
     reply = drive_bench.supervisor.configure(drive_bench.clock())
     assert "refuses to write 0 to 0x1016:1 consumer heartbeat time" in reply.message
 
 
-def test_a_drive_that_is_not_there_is_named(drive_bench: Bench) -> None:
+def test_a_drive_that_is_not_there_is_named(drive_bench: DriveBench) -> None:
     drive_bench.rotation.silent = True
     assert "rotation axis: node 2 does not answer" in drive_bench.drives.probe()
 
 
-def test_a_drive_that_was_left_on_is_switched_off_by_the_set_up(drive_bench: Bench) -> None:
+def test_a_drive_that_was_left_on_is_switched_off_by_the_set_up(drive_bench: DriveBench) -> None:
     drive_bench.insertion.state = "enabled"
     drive_bench.configured()
     assert drive_bench.insertion.state == "disabled"
 
 
-def test_a_torque_bound_is_given_only_where_wanted(make_drive_bench: Any) -> None:
+def test_a_torque_bound_is_given_only_where_wanted(
+    make_drive_bench: Callable[..., DriveBench],
+) -> None:
     bench = make_drive_bench(rotation_max_torque=0.8)
     bench.configured()
     assert (0x6072, 0) not in bench.insertion.objects
     assert bench.rotation.objects[0x6072, 0] == (800).to_bytes(2, "little")
 
 
-def test_an_axis_in_reverse_moves_the_other_way(make_drive_bench: Any) -> None:
+def test_an_axis_in_reverse_moves_the_other_way(
+    make_drive_bench: Callable[..., DriveBench],
+) -> None:
     bench = make_drive_bench(insertion_reverse=True)
     bench.ready()
     bench.cycle(1, holding=True)
@@ -220,7 +225,7 @@ def test_an_axis_in_reverse_moves_the_other_way(make_drive_bench: Any) -> None:
     assert bench.status.insertion == pytest.approx(0.001)
 
 
-def test_rotation_stays_in_proportion_when_the_speed_changes(drive_bench: Bench) -> None:
+def test_rotation_stays_in_proportion_when_the_speed_changes(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.ready()
     bench.cycle(1, holding=True)
@@ -233,7 +238,9 @@ def test_rotation_stays_in_proportion_when_the_speed_changes(drive_bench: Bench)
     assert bench.outcomes == ["succeeded"]
 
 
-def test_many_steps_end_where_their_sum_is_to_the_count(make_drive_bench: Any) -> None:
+def test_many_steps_end_where_their_sum_is_to_the_count(
+    make_drive_bench: Callable[..., DriveBench],
+) -> None:
     # `scripts/verify D` takes 10,000, on the emulator.
     bench = make_drive_bench(max_step_length=0.002)
     bench.ready()
@@ -256,19 +263,21 @@ def test_many_steps_end_where_their_sum_is_to_the_count(make_drive_bench: Any) -
 # ---- an insertion axis that a hand pushes ------------------------------------------------------
 
 
-def pushed(make_drive_bench: Any) -> Bench:
+def pushed(make_drive_bench: Callable[..., DriveBench]) -> DriveBench:
     bench = make_drive_bench(insertion_actuated=False)
     bench.insertion.position = 777
     bench.ready()
     return bench
 
 
-def push(bench: Bench, counts: int) -> None:
+def push(bench: DriveBench, counts: int) -> None:
     bench.insertion.position += counts
     bench.cycle(1, holding=True)
 
 
-def test_a_pushed_axis_is_told_nothing_that_moves(make_drive_bench: Any) -> None:
+def test_a_pushed_axis_is_told_nothing_that_moves(
+    make_drive_bench: Callable[..., DriveBench],
+) -> None:
     bench = pushed(make_drive_bench)
     assert bench.status.insertion == pytest.approx(0.0)
     bench.step(0.001, 0.2)
@@ -281,7 +290,7 @@ def test_a_pushed_axis_is_told_nothing_that_moves(make_drive_bench: Any) -> None
 
 
 def test_with_a_pushed_axis_rotation_follows_the_push_and_never_goes_back(
-    make_drive_bench: Any,
+    make_drive_bench: Callable[..., DriveBench],
 ) -> None:
     bench = pushed(make_drive_bench)
     bench.cycle(1, holding=True)
@@ -300,7 +309,9 @@ def test_with_a_pushed_axis_rotation_follows_the_push_and_never_goes_back(
     assert bench.rotation.position == round(whole)
 
 
-def test_with_a_pushed_axis_rotation_keeps_its_rate_and_its_hold(make_drive_bench: Any) -> None:
+def test_with_a_pushed_axis_rotation_keeps_its_rate_and_its_hold(
+    make_drive_bench: Callable[..., DriveBench],
+) -> None:
     bench = pushed(make_drive_bench)
     bench.cycle(1, holding=True)
     bench.step(0.001, 1.0)
@@ -313,7 +324,7 @@ def test_with_a_pushed_axis_rotation_keeps_its_rate_and_its_hold(make_drive_benc
     assert bench.outcomes == ["aborted: hold released"]
 
 
-def test_a_pushed_axis_is_retracted_by_hand(make_drive_bench: Any) -> None:
+def test_a_pushed_axis_is_retracted_by_hand(make_drive_bench: Callable[..., DriveBench]) -> None:
     bench = pushed(make_drive_bench)
     bench.cycle(1, holding=True)
     reply = bench.supervisor.retract(bench.clock())

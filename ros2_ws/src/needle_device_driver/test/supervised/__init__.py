@@ -1,0 +1,1 @@
+"""The supervisor on ideal axes, and on drives behind a CAN bus."""

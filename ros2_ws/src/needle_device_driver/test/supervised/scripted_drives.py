@@ -1,0 +1,205 @@
+"""CiA 402 drives as a script, behind a CAN bus."""
+
+from __future__ import annotations
+
+import queue
+
+import can
+
+
+class ScriptedDrive:
+    """One CiA 402 drive as a script: what it answers to each frame, written from the standard.
+
+    It moves ideally: at each SYNC it tells where it is, then it is at its set-point.
+    """
+
+    STATES = {
+        "disabled": 0x0250,
+        "ready": 0x0231,
+        "on": 0x0233,
+        "enabled": 0x0237,
+        "quick stop": 0x0217,
+        "fault": 0x0218,
+    }
+
+    def __init__(self, node: int) -> None:
+        self.node = node
+        self.objects: dict[tuple[int, int], bytes] = {
+            (0x1000, 0): (402).to_bytes(4, "little"),
+            (0x6502, 0): (0x000000A1).to_bytes(4, "little"),
+            (0x603F, 0): b"\x00\x00",
+        }
+        self.lacking: set[int] = set()
+        self.state = "disabled"
+        self.mode = 0
+        self.inputs = 0
+        self.status_size = 7
+        self.position = 0
+        self.target = 0
+        self.next_target = 0
+        self.demand = 0
+        self.more_status = 0
+        self.nmt = 0x7F
+        self.silent = False
+        self.deaf_to_reset = False
+        self.blocked = False
+        self.keeps_quick_stop = False
+        self.home_after = 3
+        self.homing_for = -1
+        self.last_word = 0
+        self.stale_homing = False
+        self.out: list[tuple[int, bytes]] = []
+
+    def say(self, function: int, data: bytes) -> None:
+        if not self.silent:
+            self.out.append((function + self.node, data))
+
+    def reboot(self) -> None:
+        self.nmt, self.state, self.position, self.mode = 0x7F, "disabled", 0, 0
+        self.say(0x700, b"\x00")
+
+    def fail(self, code: int) -> None:
+        self.state = "fault"
+        self.objects[0x603F, 0] = code.to_bytes(2, "little")
+        self.say(0x80, code.to_bytes(2, "little") + bytes(6))
+
+    @property
+    def statusword(self) -> int:
+        return self.STATES[self.state] | self.more_status
+
+    def take(self, cob_id: int, data: bytes) -> None:
+        if cob_id == 0x600 + self.node:
+            self.sdo(data)
+        elif cob_id == 0 and data[1] == self.node:
+            self.nmt = {0x01: 0x05, 0x80: 0x7F}[data[0]]
+        elif cob_id == 0x77F:
+            self.say(0x700, bytes([self.nmt]))
+        elif self.nmt != 0x05:
+            return
+        elif cob_id == 0x200 + self.node:
+            self.command(int.from_bytes(data[:2], "little"))
+            self.mode = data[2]
+        elif cob_id == 0x300 + self.node:
+            self.next_target = int.from_bytes(data, "little", signed=True)
+        elif cob_id == 0x80:
+            self.sync()
+
+    def sync(self) -> None:
+        status = self.statusword.to_bytes(2, "little") + bytes([self.mode])
+        status += self.inputs.to_bytes(4, "little")
+        self.say(0x180, status[: self.status_size])
+        self.say(0x280, self.position.to_bytes(4, "little", signed=True))
+        self.target = self.next_target
+        if self.homing_for >= 0:
+            self.homing_for += 1
+            if self.homing_for >= self.home_after:
+                self.homing_for = -1
+                self.position = 0
+                self.more_status = 0x1400
+        else:
+            self.follow()
+
+    def follow(self) -> None:
+        """With power, also in a quick stop, the motor goes to the demand."""
+        if self.state == "enabled" and self.mode == 8:
+            self.demand = self.target
+        elif self.state != "quick stop":
+            self.demand = self.position
+        if not self.blocked:
+            self.position = self.demand
+
+    def command(self, word: int) -> None:
+        if self.state == "fault":
+            if word & 0x80 and not self.deaf_to_reset:
+                self.state = "disabled"
+        elif not word & 0x02:
+            self.state = "disabled"
+        elif not word & 0x04:
+            self.state = "quick stop" if self.state in ("enabled", "quick stop") else "disabled"
+        elif word & 0x0F == 0x06 and self.state in ("disabled", "on", "enabled"):
+            self.state = "ready"
+        elif word & 0x0F == 0x07 and self.state in ("ready", "enabled"):
+            self.state = "on"
+        elif word & 0x0F == 0x0F and (
+            self.state == "on" or (self.state == "quick stop" and not self.keeps_quick_stop)
+        ):
+            self.state = "enabled"
+        rising = word & 0x10 and not self.last_word & 0x10
+        self.last_word = word
+        if rising and self.mode == 6 and self.state == "enabled":
+            self.homing_for = 0
+            if not self.stale_homing:
+                self.more_status = 0
+        if self.mode != 6:
+            self.homing_for = -1
+            self.more_status = 0x1400 if self.stale_homing else 0
+
+    def sdo(self, data: bytes) -> None:
+        index, sub = int.from_bytes(data[1:3], "little"), data[3]
+        head = data[1:4]
+        if data[0] == 0x80:
+            return
+        if index in self.lacking:
+            self.say(0x580, b"\x80" + head + bytes.fromhex("00000206"))
+        elif data[0] == 0x40:
+            live = {
+                (0x6041, 0): self.statusword.to_bytes(2, "little"),
+                (0x6061, 0): bytes([self.mode]),
+                (0x6064, 0): self.position.to_bytes(4, "little", signed=True),
+                (0x60FD, 0): self.inputs.to_bytes(4, "little"),
+            }
+            value = live.get((index, sub)) or self.objects.get((index, sub))
+            if value is None:
+                self.say(0x580, b"\x80" + head + bytes.fromhex("00000206"))
+                return
+            first = 0x43 | (4 - len(value)) << 2
+            self.say(0x580, bytes([first]) + head + value.ljust(4, b"\x00"))
+        else:
+            size = 4 - (data[0] >> 2 & 3)
+            value = data[4 : 4 + size]
+            self.objects[index, sub] = value
+            if index == 0x6040:
+                self.command(int.from_bytes(value, "little"))
+            self.say(0x580, b"\x60" + head + bytes(4))
+
+
+class ScriptedBus:
+    """python-can's bus with two scripted drives behind it; remembers what was sent."""
+
+    def __init__(self, drives: list[ScriptedDrive]) -> None:
+        self.drives = drives
+        self.sent: list[tuple[int, bytes]] = []
+        self.inbox: queue.Queue[can.Message] = queue.Queue()
+        self.error: Exception | None = None
+        self.cut = False
+        self.closed = False
+
+    def send(self, message: can.Message) -> None:
+        if self.error is not None:
+            raise self.error
+        self.sent.append((message.arbitration_id, bytes(message.data)))
+        for drive in self.drives:
+            if not self.cut:
+                drive.take(message.arbitration_id, bytes(message.data))
+        self.flush()
+
+    def flush(self) -> None:
+        for drive in self.drives:
+            for cob_id, data in drive.out:
+                if not self.cut:
+                    self.put(cob_id, data)
+            drive.out.clear()
+
+    def put(self, cob_id: int, data: bytes) -> None:
+        self.inbox.put(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
+
+    def recv(self, timeout: float) -> can.Message | None:
+        if self.error is not None:
+            raise self.error
+        try:
+            return self.inbox.get(timeout=timeout)
+        except queue.Empty:
+            return None
+
+    def shutdown(self) -> None:
+        self.closed = True
