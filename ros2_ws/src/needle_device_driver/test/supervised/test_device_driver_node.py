@@ -15,10 +15,7 @@ from lifecycle_msgs.msg import Transition
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.conversions import (
-    RELIABLE,
-    to_nanoseconds,
-)
+from needle_common.conversions import RELIABLE, to_nanoseconds
 from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 from needle_common.ros_domain import own_domain

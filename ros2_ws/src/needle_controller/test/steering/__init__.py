@@ -1,0 +1,1 @@
+"""The step protocol, transition by transition, without ROS."""
