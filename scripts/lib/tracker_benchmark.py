@@ -29,13 +29,12 @@ _DIFFERENCE = 25  # [grey levels]
 
 @dataclass(frozen=True)
 class Way:
-    """One way to find the tip: its key, speed [pairs/s] and 95 % errors [mm]."""
+    """One way to find the tip: its key, speed [pairs/s] and 95 % error [mm]."""
 
     key: str
     what: str
     pairs_per_s: float
     distance_p95_mm: float
-    depth_p95_mm: float
 
 
 class PlainTracker:
@@ -132,11 +131,5 @@ def _run_plain(
 
 def _way(key: str, what: str, seconds: float, errors: Array) -> Way:
     good = errors[np.all(np.isfinite(errors), axis=1)] * 1e3
-    distance, depth = np.linalg.norm(good, axis=1), np.abs(good[:, 0])
-    return Way(
-        key,
-        what,
-        1.0 / seconds,
-        float(np.percentile(distance, 95)),
-        float(np.percentile(depth, 95)),
-    )
+    distance = np.linalg.norm(good, axis=1)
+    return Way(key, what, 1.0 / seconds, float(np.percentile(distance, 95)))

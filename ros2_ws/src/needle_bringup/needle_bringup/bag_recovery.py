@@ -47,15 +47,12 @@ class BagRecovery:
         Whether nothing had to be done.
     files : dict of str to FileRecovery
         By file name.
-    metadata_was_missing : bool
-        Whether metadata.yaml had to be made.
     messages, topics : int
         What the bag holds now.
     """
 
     was_whole: bool
     files: dict[str, FileRecovery]
-    metadata_was_missing: bool
     messages: int
     topics: int
 
@@ -127,7 +124,6 @@ def _recover(path: Path, files: Sequence[Path], progress: Progress | None) -> Ba
     result = BagRecovery(
         was_whole=all(r.was_whole for r in recoveries.values()) and _agrees(old, data_files),
         files=recoveries,
-        metadata_was_missing=old is None,
         messages=sum(file.message_count for file in data_files),
         topics=len(topics),
     )

@@ -50,6 +50,8 @@ class PairSequence:
         containers promise.
     unpaired : list of str
         Names, with their side, that have no partner; of videos known at the end.
+    cut_off : int
+        Pairs that the videos' containers promised and their data did not give; known at the end.
     """
 
     names: list[str]
@@ -57,6 +59,17 @@ class PairSequence:
     _left: Path
     _right: Path
     _videos: bool
+    cut_off: int = 0
+
+    @property
+    def missing(self) -> str:
+        """What the videos did not give, in words, known at the end; empty where all is there."""
+        parts = []
+        if self.unpaired:
+            parts.append(f"{len(self.unpaired)} frames without a partner")
+        if self.cut_off:
+            parts.append(f"{self.cut_off} of {len(self.names)} pairs cannot be read: cut off?")
+        return ", ".join(parts)
 
     def __iter__(self) -> Iterator[NamedPair]:
         """Read pair after pair."""
@@ -70,6 +83,7 @@ class PairSequence:
         left, right = (cv2.VideoCapture(str(path)) for path in (self._left, self._right))
         try:
             number = 0
+            self.unpaired.clear()
             while True:
                 frames = [_next_frame(video) for video in (left, right)]
                 if frames[0] is None or frames[1] is None:
@@ -82,6 +96,7 @@ class PairSequence:
                     self.unpaired.append(f"{side} {unpaired:06d}")
                     unpaired += 1
                     rest = _next_frame(video)
+            self.cut_off = max(len(self.names) - number, 0)
         finally:
             left.release()
             right.release()
@@ -200,14 +215,15 @@ def _natural(name: str) -> tuple[list[tuple[int, str]], str]:
 
 
 def _read(path: Path) -> Image | None:
-    """Return a file's grey image, None where it is not one."""
+    """Return a file's grey image, None where it is not one of 8 bit."""
     try:
         data = np.fromfile(path, np.uint8)
     except OSError:
         return None
     if not data.size:
         return None
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+    # Without ANYDEPTH OpenCV would quietly make 8 bit of 16.
+    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         return _grey(cv2.imdecode(data, flags))
     except cv2.error:

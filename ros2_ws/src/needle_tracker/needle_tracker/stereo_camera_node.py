@@ -41,6 +41,7 @@ stereo_camera: image pairs from two V4L2/UVC cameras, two folders or two video f
 
 Publishes: stereo/{left,right}/image_raw (mono8), stereo/{left,right}/camera_info, /diagnostics.
 Both cameras are grabbed first, then decoded; the stamp is the time of the grab less `latency`.
+A camera by its number needs quotes within quotes: -p "left:='0'".
 Exit codes: 0 ended by a signal or at the end of the recording; 2 a camera, folder, file or size
 that is missing or wrong.
 """
@@ -142,6 +143,8 @@ class StereoCameraNode(Node):
             self.get_logger().info(
                 f"end of the recording: {self._pairs} pairs, {self._source.dropped} unreadable"
             )
+            if self._source.missing:
+                self.get_logger().warning(f"the recording is not whole: {self._source.missing}")
             return
         if pair is None:
             self.get_logger().warning("a pair could not be read", throttle_duration_sec=5.0)

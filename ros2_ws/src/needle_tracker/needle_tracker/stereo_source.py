@@ -35,6 +35,10 @@ class StereoSource(Protocol):
     dropped: int
     """Pairs that could not be read so far."""
 
+    @property
+    def missing(self) -> str:
+        """What a recording that has ended did not give; empty where nothing is missing."""
+
     def next(self) -> StampedPair | None:
         """Return the next pair; None where this one could not be read.
 
@@ -160,6 +164,11 @@ class CameraPair:
             ):
                 capture.set(key, value)
 
+    @property
+    def missing(self) -> str:
+        """Nothing: cameras do not end."""
+        return ""
+
     def next(self) -> StampedPair | None:
         """Return the next pair; None where a camera gave none."""
         stamps, grabbed = {}, True
@@ -220,6 +229,11 @@ class RecordedPairs:
         for pair in self._pairs:
             _check_sizes(pair, settings.sizes)
             break
+
+    @property
+    def missing(self) -> str:
+        """Frames of one video only, or that neither has though its file promises them."""
+        return self._pairs.missing
 
     def next(self) -> StampedPair | None:
         """Return the next pair; None where one of its images cannot be read."""
@@ -287,7 +301,10 @@ def _check_sizes(pair: NamedPair, sizes: Sizes) -> None:
 
 def _open_device(name: str) -> cv2.VideoCapture:
     # What goes wrong is said by us, in one line; OpenCV's own lines are for its developers.
-    cast(Any, cv2).setLogLevel(0)
+    opencv = cast(Any, cv2)
+    # OpenCV 5 has moved it.
+    logging = opencv if hasattr(opencv, "setLogLevel") else opencv.utils.logging
+    logging.setLogLevel(0)
     if name.isdecimal():
         return cv2.VideoCapture(int(name), cv2.CAP_V4L2)
     return cv2.VideoCapture(name, cv2.CAP_V4L2)

@@ -32,6 +32,7 @@ from needle_tracker.stereo_source import (
     EndOfRecordingError,
     RateMeter,
     SourceSettings,
+    StereoSource,
     open_source,
 )
 
@@ -155,22 +156,50 @@ def test_an_unreadable_image_is_dropped_with_its_partner(tmp_path: Path) -> None
     assert source.dropped == 1
 
 
-def test_videos_serve_as_folders_do(tmp_path: Path) -> None:
-    for side in ("left", "right"):
-        writer = cv2.VideoWriter(
-            str(tmp_path / f"{side}.avi"), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48)
-        )
-        for i in range(4):
-            writer.write(np.full((48, 64, 3), 40 * i, np.uint8))
-        writer.release()
-    source = open_source(settings(tmp_path / "left.avi", tmp_path / "right.avi"), Clock())
+def test_an_image_of_16_bit_is_none_of_the_camera(tmp_path: Path) -> None:
+    left, right = write_pairs(tmp_path, 2)
+    cv2.imwrite(str(left / "001.png"), np.full((48, 64), 3000, np.uint16))
+    source = open_source(settings(left, right), Clock())
+    assert [source.next() is None for _ in range(2)] == [False, True]
+
+
+def write_video(path: Path, count: int) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (64, 48))
+    for i in range(count):
+        writer.write(np.full((48, 64, 3), 40 * i, np.uint8))
+    writer.release()
+    return path
+
+
+def levels_of(source: StereoSource) -> list[int]:
     levels = []
     with pytest.raises(EndOfRecordingError):
         while True:
             pair = source.next()
             assert pair is not None
             levels.append(int(pair.left[24, 32]))
-    np.testing.assert_allclose(levels, [0, 40, 80, 120], atol=3)
+    return levels
+
+
+def test_videos_serve_as_folders_do(tmp_path: Path) -> None:
+    left, right = (write_video(tmp_path / f"{side}.avi", 4) for side in ("left", "right"))
+    source = open_source(settings(left, right), Clock())
+    np.testing.assert_allclose(levels_of(source), [0, 40, 80, 120], atol=3)
+    assert not source.missing
+
+
+def test_a_video_that_is_longer_or_cut_off_is_said(tmp_path: Path) -> None:
+    left, right = write_video(tmp_path / "left.avi", 6), write_video(tmp_path / "right.avi", 4)
+    source = open_source(settings(left, right), Clock())
+    assert len(levels_of(source)) == 4
+    assert source.missing == "2 frames without a partner"
+    whole = left.read_bytes()
+    for path in (left, right):
+        path.write_bytes(whole[: whole.index(b"movi") + (len(whole) - whole.index(b"movi")) // 2])
+    source = open_source(settings(left, right), Clock())
+    seen = len(levels_of(source))
+    assert seen < 6
+    assert f"{6 - seen} of 6 pairs cannot be read" in source.missing
 
 
 def test_sources_that_are_wrong(tmp_path: Path) -> None:
@@ -185,6 +214,8 @@ def test_sources_that_are_wrong(tmp_path: Path) -> None:
         ((3, 3), "same camera"),
         (("/dev/no_camera", "/dev/no_other"), "/dev/no_camera does not exist"),
         ((left, other), "80x60"),
+        ((62, 63), "left camera 62 cannot be opened"),
+        (("/dev/null", "/dev/zero"), "left camera /dev/null cannot be opened"),
     ):
         with pytest.raises(UserError, match=says):
             open_source(settings(*pair), Clock())

@@ -51,11 +51,6 @@ class Demand:
         self.position += self.velocity * period
         self._segment_left -= period
 
-    def end_segment_velocity(self) -> None:
-        """Be at rest if the segment has ended and nothing followed."""
-        if self._segment_left <= 0.0:
-            self.velocity = 0.0
-
     def brake(self, deceleration: float, period: float) -> None:
         """Slow down along a ramp."""
         self._segment_left = 0.0

@@ -22,7 +22,8 @@ SYNC_PERIOD = 0.02
 
 def settings(name: str, limit_action: LimitAction, *, start: float = 0.0, lag: float = 0.0) -> Any:
     if name == "insertion":
-        motor = MotorSettings(2.0e7, 2.0e5, lag, start, 0.25 * 2.0e7)
+        scale = COUNTS_PER_METRE
+        motor = MotorSettings(scale, 0.01 * scale, lag, start, 0.25 * scale)
         return DriveSettings(name, INSERTION, STEPPER, motor, limit_action, 0.3)
     motor = MotorSettings(COUNTS_PER_RADIAN, 20.0 * COUNTS_PER_RADIAN, lag)
     return DriveSettings(name, ROTATION, SERVO, motor, limit_action, 0.3)
