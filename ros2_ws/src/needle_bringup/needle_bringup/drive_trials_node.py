@@ -20,20 +20,21 @@ from needle_bringup.drive_faults_node import FAULTS, fault_trials
 from needle_bringup.drive_steps_node import random_steps
 from needle_bringup.graph_kills_node import KILLED, kill_trials
 from needle_common.cli import EXIT_DONE, run_command
+from needle_common.options import CommandParser
 from needle_common.ros_domain import own_domain
 
 
 def main() -> int:
     """Run trials; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = CommandParser("drive_trials", __doc__ or "", "")
     parser.add_argument("trial", choices=("steps", "faults", "kills"))
     parser.add_argument("count", type=int)
     parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--watchdog", type=float, help="faults: in place of the driver's own [s]")
-    given = parser.parse_args()
 
     def run() -> int:
+        given = parser.parse_args()
         with own_domain() as domain, tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
             rclpy.init(args=[], domain_id=domain)
             try:

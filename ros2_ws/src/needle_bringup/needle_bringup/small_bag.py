@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 from collections.abc import Sequence
@@ -23,6 +22,7 @@ from needle_bringup.bag_order import SentMessage, raw_as_sent
 from needle_bringup.bag_reader import Run, read_run
 from needle_common.cli import EXIT_DONE, run_command
 from needle_common.errors import UserError
+from needle_common.options import CommandParser
 
 _DESCRIPTION = """
 Copies a bag without what a rerun does not need, and with the images of a few exposures only,
@@ -124,12 +124,12 @@ def _custom_data(run: Run) -> dict[str, str]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="small_bag", description=_DESCRIPTION)
+    parser = CommandParser("small_bag", _DESCRIPTION, "")
     parser.add_argument("bag", type=Path, metavar="BAG", help="a bag with images")
     parser.add_argument("small_bag", type=Path, metavar="SMALL_BAG", help="the new bag")
-    given = parser.parse_args(arguments)
 
     def command() -> int:
+        given = parser.parse_args(arguments)
         write_small_bag(given.bag, given.small_bag)
         return EXIT_DONE
 
