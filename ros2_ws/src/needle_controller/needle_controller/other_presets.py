@@ -17,7 +17,8 @@ from needle_controller.law import Command, LinearizingLaw, StepLaw
 from needle_controller.linear_observer import LinearObserver, LinearObserverSettings
 from needle_controller.orientation_fit import OrientationFit, OrientationFitSettings
 from needle_controller.pitch_observer import PitchObserver, PitchObserverSettings
-from needle_controller.roll_law import RollLaw, RollLawSettings
+from needle_controller.roll_law import RollLaw
+from needle_controller.roll_steering import roll_law_settings, with_flips
 
 _CURVATURES = 15
 """Tried by the orientation fit."""
@@ -65,16 +66,7 @@ def make_other_controller(
             ),
             initial_rotation,
         )
-    roll_law = RollLaw(
-        RollLawSettings(
-            step_length=settings.step_length,
-            max_rotation_per_length=settings.max_rotation_per_length,
-            max_winding=settings.max_winding,
-        )
-    )
-    if not plan.depths:
-        return estimator, lambda estimate, _: roll_law(estimate)
-    return estimator, lambda estimate, insertion: roll_law(estimate, plan.bend_sign(insertion))
+    return estimator, with_flips(RollLaw(roll_law_settings(settings)), plan)
 
 
 def _on_linear_system(

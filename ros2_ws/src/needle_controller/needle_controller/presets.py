@@ -15,7 +15,7 @@ from needle_controller.gains import Gains
 from needle_controller.law import Law, LinearizingLaw, OpenLoopLaw, StepLaw
 from needle_controller.luenberger import LuenbergerObserver, LuenbergerSettings
 from needle_controller.other_presets import make_other_controller
-from needle_controller.roll_law import RollLawSettings
+from needle_controller.roll_steering import roll_law_settings, with_flips
 
 
 def make_law(settings: ControlSettings, gains: Gains) -> Law:
@@ -53,11 +53,7 @@ def best_settings(settings: ControlSettings) -> BestSettings:
         filter=FilterSettings(
             curvature=settings.curvature, tip_noise_bound=settings.tip_noise_bound
         ),
-        law=RollLawSettings(
-            step_length=settings.step_length,
-            max_rotation_per_length=settings.max_rotation_per_length,
-            max_winding=settings.max_winding,
-        ),
+        law=roll_law_settings(settings),
     )
 
 
@@ -81,11 +77,7 @@ def make_controller(
     plan = FlipPlan(settings.flip_depths)
     if settings.preset == "best":
         estimator, roll_law = make_best(best_settings(settings), initial_rotation)
-        if not plan.depths:
-            return estimator, lambda estimate, _: roll_law(estimate)
-        return estimator, lambda estimate, insertion: roll_law(
-            estimate, bend_sign=plan.bend_sign(insertion)
-        )
+        return estimator, with_flips(roll_law, plan)
     gains = settings.gains()
     if settings.preset in OTHER_PRESETS:
         law = linearizing_law(settings, gains)
