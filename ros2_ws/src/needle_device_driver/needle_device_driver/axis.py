@@ -34,6 +34,9 @@ class AxisSnapshot:
         When the reply arrived, on the steady clock [s].
     position : float
         Measured position [m or rad]; only relative while not `homed`.
+    set_point : float
+        Where it was last told to be, counted like `position`; at rest they differ by what the axis'
+        controller leaves over.
     velocity : float
         Measured velocity [m/s or rad/s].
     powered : bool
@@ -59,6 +62,7 @@ class AxisSnapshot:
 
     time: float
     position: float
+    set_point: float
     velocity: float
     powered: bool
     homed: bool

@@ -199,6 +199,7 @@ class Cia402Axis(Axis):
         return AxisSnapshot(
             time=self.monitor.fresh_time,
             position=self._settings.position(machine.at.position - self._zero),
+            set_point=self._settings.position(machine.target - self._zero),
             velocity=self._velocity,
             powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,

@@ -118,9 +118,19 @@ class MotionRun:
         )
 
     def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
-        return CoordinatedMotion(
-            (at.insertion.position, at.rotation.position), self._end, self._duration
+        # A pushed axis has no set-point. An actuated one goes on from the last: from where it was
+        # measured, at rest or one cycle ago, the first set-point could be farther ahead than others.
+        start = (
+            at.insertion.position if self._pushed else at.insertion.set_point,
+            at.rotation.set_point,
         )
+        limits, retracts = self._limits, self.activity is Activity.RETRACTION
+        shortest = max(
+            abs(self._end[0] - start[0])
+            / (limits.retraction_speed if retracts else limits.max_speed),
+            0.0 if retracts else abs(self._end[1] - start[1]) / limits.max_rotation_rate,
+        )
+        return CoordinatedMotion(start, self._end, max(self._duration, shortest))
 
     def _off(self, at: PairSnapshot) -> str:
         insertion = abs(self._end[0] - at.insertion.position)

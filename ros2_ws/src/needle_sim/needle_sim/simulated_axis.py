@@ -67,6 +67,7 @@ class SimulatedAxis(Axis):
         return AxisSnapshot(
             time=now,
             position=self._position,
+            set_point=self._position,
             velocity=self._velocity,
             powered=self._powered,
             homed=self._homed,

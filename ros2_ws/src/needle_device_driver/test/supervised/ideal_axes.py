@@ -73,6 +73,7 @@ class FakeAxis(Axis):
         return AxisSnapshot(
             time=now if self.silent_since is None else self.silent_since,
             position=self.position,
+            set_point=self.position,
             velocity=0.0,
             powered=self.powered,
             homed=self.homed,

@@ -43,6 +43,7 @@ class ScriptedDrive:
         self.silent = False
         self.deaf_to_reset = False
         self.blocked = False
+        self.left_over = 0
         self.keeps_quick_stop = False
         self.home_after = 3
         self.homing_for = -1
@@ -102,7 +103,7 @@ class ScriptedDrive:
     def follow(self) -> None:
         """With power, also in a quick stop, the motor goes to the demand."""
         if self.state == "enabled" and self.mode == 8:
-            self.demand = self.target
+            self.demand = self.target - self.left_over
         elif self.state != "quick stop":
             self.demand = self.position
         if not self.blocked:

@@ -28,6 +28,25 @@ def test_look_ahead_is_one_cycle_at_every_moment(drive_bench: DriveBench) -> Non
     assert bench.outcomes == ["succeeded"]
 
 
+@pytest.mark.parametrize("left_over", [-90, 90])
+def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it(
+    make_drive_bench: Callable[..., DriveBench], left_over: int
+) -> None:
+    bench = make_drive_bench(retraction_speed=0.005)
+    bench.ready()
+    bench.insertion.left_over = left_over
+    bench.cycle(1, holding=True)
+    for _ in range(2):
+        # As fast as may be: what a motor's controller leaves over comes on top.
+        bench.step(0.002, 0.1, 0.4)
+        bench.cycle(30, holding=True)
+    assert bench.outcomes == ["succeeded", "succeeded"]
+    assert bench.supervisor.retract(bench.clock()).success
+    bench.cycle(60, holding=True)
+    assert not in_state(bench, State.FAULT), bench.status.reason
+    assert abs(bench.insertion.position) <= 100
+
+
 def test_look_ahead_refuses_a_set_point_that_is_further(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
