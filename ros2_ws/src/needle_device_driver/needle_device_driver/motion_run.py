@@ -118,8 +118,8 @@ class MotionRun:
         )
 
     def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
-        # A pushed axis has no set-point. An actuated one goes on from the last: from where it was
-        # measured, at rest or one cycle ago, the first set-point could be farther ahead than others.
+        # A pushed axis has no set-point. An actuated one goes on from the last: it rests beside it,
+        # and counted from there the first set-point could be too far ahead.
         start = (
             at.insertion.position if self._pushed else at.insertion.set_point,
             at.rotation.set_point,
