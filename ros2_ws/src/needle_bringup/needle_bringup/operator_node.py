@@ -6,7 +6,6 @@ import os
 import signal
 import sys
 import time
-from types import FrameType
 from typing import Any, TextIO
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -31,6 +30,7 @@ from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import RECORDER
 
@@ -211,15 +211,8 @@ def _progress_stream() -> TextIO:
 
 def main() -> int:
     """Run the operator; returns its exit code."""
-    signalled = False
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        nonlocal signalled
-        signalled = True
-
     # rclpy's own handlers would shut the context down before the release could go out.
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, on_signal)
+    end = EndRequest(signal.SIGHUP)
 
     def spin(node: Node) -> int:
         assert isinstance(node, OperatorNode)
@@ -227,7 +220,7 @@ def main() -> int:
         executor.add_node(node)
         try:
             while not node.ended:
-                if signalled:
+                if end.wanted:
                     node.interrupt()
                 executor.spin_once(timeout_sec=0.05)
             return node.finish(executor)

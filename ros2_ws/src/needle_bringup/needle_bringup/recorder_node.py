@@ -5,11 +5,9 @@ from __future__ import annotations
 import collections
 import importlib
 import json
-import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any, cast
 
 import yaml
@@ -35,6 +33,7 @@ from needle_bringup.recording import Recording
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 
@@ -341,21 +340,9 @@ def _read_calibration(path: str) -> str:
         raise UserError(f"calibration_file: cannot read {path}: {error}") from error
 
 
-class _StopRequest:
-    """Turns SIGINT and SIGTERM into a flag, so that one during start-up is not lost either."""
-
-    def __init__(self) -> None:
-        self.wanted = False
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, self._take)
-
-    def _take(self, _number: int, _frame: FrameType | None) -> None:
-        self.wanted = True
-
-
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
-    stop = _StopRequest()
+    stop = EndRequest()
     keep_freed_memory()
 
     def spin(node: Node) -> int:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import signal
 import sys
 import time
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
@@ -33,6 +31,7 @@ from needle_common.conversions import (
     values_of,
 )
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_sim.bench import SimulatedBench
@@ -419,22 +418,15 @@ class SimRigNode(Node):
 
 def main() -> int:
     """Run sim_rig; returns its exit code."""
-    ended = False
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        nonlocal ended
-        ended = True
-
     # rclpy's own handlers would shut the context down in the middle of a tick.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, on_signal)
+    end = EndRequest()
 
     def spin(node: Node) -> int:
         assert isinstance(node, SimRigNode)
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         try:
-            while not ended:
+            while not end.wanted:
                 executor.spin_once(timeout_sec=node.turns())
             node.close()
         finally:
