@@ -6,8 +6,7 @@ import dataclasses
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import numpy as np
-
+from needle_bringup.parameters import plain_value
 from needle_bringup.rerun import Output, stored
 from needle_common.conversions import to_nanoseconds, values_of
 from needle_common.errors import UserError
@@ -19,18 +18,6 @@ from needle_controller.steering_types import Action, Awaiting, PublishUpdate, Se
 _STEERING = (State.STEERING.value, State.WAITING_FOR_TIP.value)
 # A controller that is asked at the end of a motion may not have heard its last joints yet [ns].
 _HEARD_LATE = 100_000_000
-# rcl_interfaces/msg/ParameterValue: the member that holds a value of each type.
-_MEMBERS = {
-    1: "bool_value",
-    2: "integer_value",
-    3: "double_value",
-    4: "string_value",
-    5: "byte_array_value",
-    6: "bool_array_value",
-    7: "integer_array_value",
-    8: "double_array_value",
-    9: "string_array_value",
-}
 
 
 class ControllerStage:
@@ -157,11 +144,11 @@ class ControllerStage:
         if message.node != self._node:
             return ()
         known = {field.name for field in dataclasses.fields(self._parameters)}
-        changes = {
-            parameter.name: plain_value(parameter.value)
-            for parameter in message.changed_parameters
-            if parameter.name in known
-        }
+        changes: dict[str, Any] = {}
+        for parameter in message.changed_parameters:
+            if parameter.name in known:
+                value = plain_value(parameter.value)
+                changes[parameter.name] = tuple(value) if isinstance(value, list) else value
         try:
             values = dataclasses.replace(self._parameters, **changes)
         except UserError as error:
@@ -181,11 +168,3 @@ def _messages(action: PublishUpdate) -> dict[str, Any]:
         "needle/linearized_state": conversions.to_vector(estimate.linearized, stamp),
         "needle/control_input": conversions.to_control_input(update, stamp),
     }
-
-
-def plain_value(value: Any) -> Any:
-    """Return the value in a ParameterValue of rosbags, lists as tuples."""
-    content = getattr(value, _MEMBERS.get(value.type, "string_value"))
-    if isinstance(content, (bool, int, float, str)):
-        return content
-    return tuple(np.asarray(content).tolist())

@@ -30,14 +30,21 @@ _FIELDS = {
 
 
 def plain_value(value: ParameterValue) -> Any:
-    """Return a parameter's value as YAML can hold it; None where it is not set."""
+    """Return a parameter's value as YAML can hold it; None where it is not set.
+
+    Parameters
+    ----------
+    value : ParameterValue
+        rclpy's, or a bag's as rosbags has it.
+    """
     field = _FIELDS.get(value.type)
     if field is None:
         return None
     plain = getattr(value, field)
     if isinstance(plain, (bool, int, float, str)):
         return plain
-    return [int.from_bytes(x, "little") if isinstance(x, bytes) else x for x in plain]
+    items = plain if isinstance(plain, list) else plain.tolist()
+    return [int.from_bytes(x, "little") if isinstance(x, bytes) else x for x in items]
 
 
 class ParameterSnapshots:

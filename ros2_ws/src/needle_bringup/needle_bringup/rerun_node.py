@@ -15,7 +15,8 @@ from needle_bringup.bag_hearing import unheard_tips
 from needle_bringup.bag_reader import Run, read_run
 from needle_bringup.bag_writer import refuse_existing_bag
 from needle_bringup.comparison import compare
-from needle_bringup.controller_rerun_node import ControllerStage, plain_value
+from needle_bringup.controller_rerun_node import ControllerStage
+from needle_bringup.parameters import plain_value
 from needle_bringup.rerun import (
     TIP_TOPICS,
     has_images,
