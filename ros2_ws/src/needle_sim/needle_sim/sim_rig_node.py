@@ -5,24 +5,19 @@ from __future__ import annotations
 import math
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
-from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
-from sensor_msgs.msg import CameraInfo, Image
 
 from needle_common.base_node import DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import (
-    IMAGES,
     LATCHED,
     NANOSECONDS,
     RELIABLE,
@@ -35,16 +30,13 @@ from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
 from needle_sim.bench import SimulatedBench
-from needle_sim.conversions import to_camera_info, to_image, to_tip, to_tip_pose, to_truth
+from needle_sim.conversions import to_truth
 from needle_sim.driven_device_node import DrivenDevice
-from needle_sim.image_folder import ImageFolder, truth_of
 from needle_sim.lock_step import Action, LockStep
 from needle_sim.own_device_node import OwnDevice
 from needle_sim.pace import Pace
 from needle_sim.parameters import SimRigParameters
-from needle_sim.renderer import StereoRenderer
-from needle_sim.scenarios import SCENARIOS
-from needle_sim.stereo_rig import load_stereo_rig
+from needle_sim.simulated_sensors_node import SimulatedCameras, SimulatedTips
 
 HELP = """\
 sim_rig: stands in for the rig, so that every other node runs as on the real one.
@@ -70,7 +62,6 @@ _CLOCK_REPEAT = 0.1
 _MATCH_CHECK = 0.02
 _IDLE = 0.01
 _TURNS_PER_LOOK = 5
-_CENTRELINE_SPACING = 0.001
 
 
 class SimRigNode(Node):
@@ -94,14 +85,13 @@ class SimRigNode(Node):
             tip_noise=values.tip_noise,
             seed=values.seed,
         )
-        self._is_camera = values.level != "tip"
         self._lock_step: LockStep | None = None
         self._pace: Pace | None = None
         if values.real_time_factor > 0.0:
             self._pace = Pace(TICK, values.real_time_factor)
         else:
             self._lock_step = LockStep(
-                answered=self._is_camera, reexpose_after=values.reexpose_after
+                answered=values.level != "tip", reexpose_after=values.reexpose_after
             )
         self._time_ns = START_NS
         self._started = False
@@ -144,13 +134,11 @@ class SimRigNode(Node):
         self._controller_status = self.create_subscription(
             DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
         )
-        self._measurements: list[Publisher[Any]] = []
-        self._folder: ImageFolder | None = None
-        if self._is_camera:
-            self._create_cameras()
+        self._sensors: SimulatedTips | SimulatedCameras
+        if values.level == "tip":
+            self._sensors = SimulatedTips(self, self._bench, values)
         else:
-            self._tip = self._publisher(PointStamped, "needle/tip")
-            self._tip_pose = self._publisher(PoseWithCovarianceStamped, "needle/tip_pose")
+            self._sensors = SimulatedCameras(self, self._bench, values, self._on_answer)
         self._partners = AnsweringNodes(self)
 
     # ---- the loop -----------------------------------------------------------------------------
@@ -207,8 +195,7 @@ class SimRigNode(Node):
     def close(self) -> None:
         """Stop what is ours to stop, and say so."""
         self._device.close()
-        if self._folder is not None:
-            self._folder.close()
+        self._sensors.close()
 
     def _turn_in_real_time(self, pace: Pace, now: float) -> float:
         if pace.wait(now) > 0.0:
@@ -263,28 +250,7 @@ class SimRigNode(Node):
         number = self._exposures
         self._exposures += 1
         self._truth.publish(to_truth(self._bench.plant.T_rig_tip, stamp))
-        if self._is_camera:
-            pose = self._bench.plant.T_rig_tip
-            line = self._bench.plant.centreline(_CENTRELINE_SPACING)
-            images = self._renderer.render(pose, line, number)
-            if self._folder is not None:
-                there = SCENARIOS[self._settings.scenario].needle and len(line) > 1
-                self._folder.write(
-                    number,
-                    images,
-                    self._bench.insertion,
-                    truth_of(pose) if there else None,
-                    self._renderer.share_seen(pose, line, number),
-                )
-            for image, frame, camera, (image_raw, camera_info) in zip(
-                images, self._frames, self._cameras, self._views, strict=True
-            ):
-                camera_info.publish(to_camera_info(camera, frame, stamp))
-                image_raw.publish(to_image(image, frame, stamp))
-        else:
-            tip = self._bench.measure_tip(number)
-            self._tip_pose.publish(to_tip_pose(tip, self._settings.tip_noise, stamp))
-            self._tip.publish(to_tip(tip, stamp))
+        self._sensors.expose(number, stamp)
         if self._lock_step is not None:
             self._lock_step.exposed(self._time_ns, now)
         self._tell_health()
@@ -305,13 +271,11 @@ class SimRigNode(Node):
         self._diagnostics.set("simulation", Diagnostic(level, message, values))
 
     def _end_outside_phantom(self) -> None:
-        if not self._is_camera or self._ended:
-            return
-        height = float(self._bench.tip[0])
-        if abs(height) > self._surface_height:
+        height, surface = float(self._bench.tip[0]), self._sensors.surface_height
+        if abs(height) > surface and not self._ended:
             self._ended = (
                 f"the tip left the phantom: x = {height * 1e3:.2f} mm is beyond "
-                f"{math.copysign(self._surface_height, height) * 1e3:.2f} mm"
+                f"{math.copysign(surface, height) * 1e3:.2f} mm"
             )
             self._device.end_run(self._ended)
             self._tell_health()
@@ -335,13 +299,12 @@ class SimRigNode(Node):
         self.get_logger().info("all partners are there: time starts")
 
     def _missing_partners(self) -> list[str]:
-        publishers = self._device.publishers
-        subscriptions = [*self._device.subscriptions, self._controller_status]
-        if self._is_camera:
-            publishers += [image_raw for image_raw, _ in self._views]
-            subscriptions.append(self._answers)
-        else:
-            publishers.append(self._tip)
+        publishers = [*self._device.publishers, *self._sensors.heard]
+        subscriptions = [
+            *self._device.subscriptions,
+            self._controller_status,
+            *self._sensors.subscriptions,
+        ]
         missing = unheard(self, publishers)
         missing += [
             f"publisher of {subscription.topic_name}"
@@ -350,7 +313,7 @@ class SimRigNode(Node):
         ]
         missing += self._device.missing()
         if not missing and self._settings.wait_for_recorder:
-            publishers += [self._truth, *self._measurements]
+            publishers += [self._truth, *self._sensors.publishers]
             missing += unrecorded(self, publishers)
             missing += self._partners.unaware_sources(subscriptions)
         return missing
@@ -359,35 +322,6 @@ class SimRigNode(Node):
         if self._ended:
             return f"the run has ended: {self._ended}"
         return "" if self._started else f"waiting for {self._missing}"
-
-    def _publisher(self, message_type: type, topic: str, qos: Any = RELIABLE) -> Publisher[Any]:
-        publisher = self.create_publisher(message_type, topic, qos)
-        self._measurements.append(publisher)
-        return publisher
-
-    def _create_cameras(self) -> None:
-        file = self._settings.calibration_file or str(
-            Path(get_package_share_directory("needle_tracker")) / "config" / "calibration.yaml"
-        )
-        rig = load_stereo_rig(file)
-        self._surface_height = rig.surface_height
-        self._cameras = (rig.left, rig.right)
-        self._renderer = StereoRenderer(
-            rig, self._settings.seed, scenario=SCENARIOS[self._settings.scenario]
-        )
-        if self._settings.images:
-            self._folder = ImageFolder(Path(self._settings.images).expanduser(), Path(file))
-        self._frames = ("left_camera_optical", "right_camera_optical")
-        self._views = [
-            (
-                self._publisher(Image, f"stereo/{side}/image_raw", IMAGES),
-                self._publisher(CameraInfo, f"stereo/{side}/camera_info", IMAGES),
-            )
-            for side in ("left", "right")
-        ]
-        self._answers = self.create_subscription(
-            PoseWithCovarianceStamped, "needle/tip_pose", self._on_answer, RELIABLE
-        )
 
     # ---- callbacks ----------------------------------------------------------------------------
 
