@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from needle_common.errors import UserError
 from needle_tracker.calibration import SIDES
@@ -68,7 +70,15 @@ def views_in_folders(
     pairs = open_pairs(left, right)
     if pairs.unpaired:
         raise UserError(f"{len(pairs.unpaired)} images have no partner: {pairs.unpaired[0]}")
-    for pair in pairs:
+    for pair in tqdm(
+        pairs,
+        desc="finding the board",
+        total=len(pairs.names),
+        unit="pair",
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    ):
         images = {}
         for side, folder, image in (("left", left, pair.left), ("right", right, pair.right)):
             if image is None:

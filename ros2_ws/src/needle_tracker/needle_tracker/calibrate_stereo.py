@@ -14,6 +14,7 @@ from needle_common.errors import UserError
 from needle_common.options import CommandParser
 from needle_tracker.board_views import nothing_seen, views_in_folders
 from needle_tracker.calibration import SIDES
+from needle_tracker.calibration_doubts import doubts, misfits, square_error
 from needle_tracker.calibration_figures import residual_figure, rig_figure, save_figure
 from needle_tracker.calibration_file import save_calibration
 from needle_tracker.calibration_session import load_session
@@ -30,7 +31,8 @@ board is and where it lay:
   board: {columns: 12, rows: 9, square: 0.010, marker: 0.0075, dictionary: DICT_5X5_100}
   phantom: {surface_height: 0.0175, refractive_index: 1.33}      # kept where not determined
   places:                                                        # by file name, * and ? allowed
-    surface_*: {origin: [0.0185, -0.045, 0.0025]}
+    surface_near: {origin: [0.0185, -0.045, 0.0025]}
+    surface_far: {origin: [0.0185, -0.045, 0.0125]}
     under_wedge: {origin: [-0.0125, -0.045, 0.004], columns: [0.2079, 0, 0.9781],
                   under_surface: true, sigma: 2.0e-5}
 
@@ -39,12 +41,14 @@ All in metres, in the frame `rig` (x up, z along the insertion, origin at the ne
 first marker beside it. `columns` is the direction in which the columns count (the print's left to
 right; default [0, 0, 1], along the insertion), `rows` that of the rows (top to bottom; default
 [0, 1, 0]). So a board flat on the surface lies print up, its first corner nearest to the entry and
-at the smallest y, its x = surface height + thickness of the board. It defines `rig`.
+at the smallest y, its x = surface height + thickness of the board. It defines `rig`; laid there
+twice, a measured way apart, it tells whether the squares have the size that is said.
 
 An image whose name has no place is a board held freely in air: at least 6, better 20, tilted by 15
 to 45 deg in all directions. Boards under the surface, of known place and at different depths (a
 wedge), tell refractive index and surface height; `sigma` is how well the place is known.
 """
+_SCALE_TOLD = 0.1  # [%]
 _EPILOG = """\
 writes: FILE.yaml, FILE.rig.png (cameras, surface, boards), FILE.residuals.png
 
@@ -52,8 +56,9 @@ examples:
   ros2 run needle_tracker calibrate_stereo --board board.pdf
   ros2 run needle_tracker calibrate_stereo --left L --right R --session S.yaml --output rig.yaml
 
-exit codes: 0 done; 1 calibrated and written, but tips are not expected within --goal-mm; 2 bad
-input or a set of views that cannot determine the rig (nothing written); 130 interrupted
+exit codes: 0 done; 1 calibrated and written, but tips are not expected within --goal-mm, or places
+and squares contradict each other; 2 bad input or a set of views that cannot determine the rig
+(nothing written); 130 interrupted
 """
 
 
@@ -80,18 +85,28 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
     empty = [view.name for view in views if nothing_seen(view) and view.place is None]
+    if all(nothing_seen(view) for view in views):
+        raise UserError(
+            f"none of {len(views)} image pairs shows the session's board ({session.board}): is it "
+            "another one?"
+        )
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
     result = calibrate([view for view in views if view.name not in empty], sizes, session.phantom)
-    text = report(result, options.goal_mm)
+    problems = doubts(result)
+    text = "\n".join([report(result, options.goal_mm), *(f"NOT OK: {one}" for one in problems)])
     print(text)
     save_calibration(options.output, result.calibration, text.splitlines())
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
     save_figure(residual_figure(result), options.output.with_suffix(".residuals.png"))
     if options.json is not None:
-        write_json(options.json, figures(result, options.goal_mm))
+        write_json(
+            options.json,
+            figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None},
+        )
     print(f"written: {options.output}")
-    return EXIT_DONE if 1e3 * result.tip_error_p95 <= options.goal_mm else EXIT_MISSED
+    good = not problems and 1e3 * result.tip_error_p95 <= options.goal_mm
+    return EXIT_DONE if good else EXIT_MISSED
 
 
 def view_set(view: BoardView) -> str:
@@ -126,18 +141,7 @@ def report(result: RigCalibration, goal_mm: float) -> str:
         f"reprojection error, {side} camera, {name} boards: {error:.3f} px rms"
         for (side, name), error in reprojection_by_set(result).items()
     ]
-    worst = [
-        (result.reprojection_rms_px(side, i), side, view.name)
-        for i, view in enumerate(result.model.views)
-        for side in SIDES
-    ]
-    typical = float(np.median([error for error, _, _ in worst]))
-    lines += [
-        f"WARNING: {name}, {side} camera: {error:.2f} px rms, the others {typical:.2f}: "
-        "does its place hold, was the board flat?"
-        for error, side, name in worst
-        if error > 2.0 * typical + 0.05
-    ]
+    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
     for name, found in result.parameters.items():
         scale, unit = (1e3, " mm") if name == "surface_height" else (1.0, "")
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
@@ -150,6 +154,14 @@ def report(result: RigCalibration, goal_mm: float) -> str:
             )
         else:
             lines.append(f"{name}: not asked of these views, kept at the given {given:g}{unit}")
+    error, sigma = (100.0 * value for value in square_error(result))
+    if sigma < _SCALE_TOLD:
+        lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
+    else:
+        lines.append(
+            "size of the squares: not told by these views (a board laid on the surface twice, a "
+            "measured way apart, tells it): tips are wrong by as much as it is"
+        )
     error_mm = 1e3 * result.tip_error_p95
     verdict = "within" if error_mm <= goal_mm else "NOT within"
     lines.append(

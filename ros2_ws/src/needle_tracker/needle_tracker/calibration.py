@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from needle_common.errors import OutOfBoundsError, UserError
 
 SIDES = ("left", "right")
+LEAST_BASELINE = 1e-3  # between the cameras [m]
 _DISTORTION_MODEL = "plumb_bob"
 
 
@@ -98,8 +99,7 @@ def load_calibration(path: Path) -> StereoCalibration:
     try:
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:
-        first = str(error).splitlines()[0]
-        raise UserError(f"calibration {path} is not YAML: {first}") from error
+        raise UserError(f"calibration {path} is not YAML: {yaml_problem(error)}") from error
     try:
         return parse_calibration(content)
     except UserError as error:
@@ -135,9 +135,16 @@ def parse_calibration(content: Any) -> StereoCalibration:
                 f"{side} camera is at x = {camera.centre[0]:g} m, not above the surface at "
                 f"{surface_height:g} m"
             )
-    if np.linalg.norm(cameras[0].centre - cameras[1].centre) < 1e-3:
+    if np.linalg.norm(cameras[0].centre - cameras[1].centre) < LEAST_BASELINE:
         raise UserError("left and right camera are in the same place: no depth can be measured")
     return StereoCalibration(Phantom(surface_height, refractive_index), cameras[0], cameras[1])
+
+
+def yaml_problem(error: yaml.YAMLError) -> str:
+    """Return in one line what a file is no YAML for, and where."""
+    mark = getattr(error, "problem_mark", None)
+    problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+    return problem if mark is None else f"line {mark.line + 1}: {problem}"
 
 
 def _camera(content: Any, side: str) -> Camera:

@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 
 _COLOURS = {"left": "#1668b0", "right": "#d1701b"}
 _MM = 1e3
-_FRUSTUM = 0.25  # [m]
 
 
 def rig_figure(result: RigCalibration) -> Figure:
@@ -42,7 +41,11 @@ def rig_figure(result: RigCalibration) -> Figure:
         for side in SIDES:
             camera = calibration.left if side == "left" else calibration.right
             label = f"{side} camera" if named else None
-            _draw_camera(axes, camera, axis, _COLOURS[side], label)
+            axes.plot(
+                _MM * camera.centre[axis], _MM * camera.centre[0], "o",
+                color=_COLOURS[side], label=label,
+            )  # fmt: skip
+            _draw_frustum(axes, camera, height, axis, _COLOURS[side])
         axes.set_aspect("equal")
         axes.set_xlabel(axis_label)
         axes.set_ylabel("x (up) [mm]")
@@ -63,7 +66,7 @@ def residual_figure(result: RigCalibration) -> Figure:
     for number, side in enumerate(SIDES):
         camera = result.calibration.left if side == "left" else result.calibration.right
         pixels, errors = result.model.pixels[side], result.residuals(side)
-        axes = figure.add_axes((0.05 + 0.49 * number, 0.52, 0.44, 0.43))
+        axes = figure.add_axes((0.06 + 0.49 * number, 0.53, 0.43, 0.43))
         axes.quiver(
             pixels[:, 0], pixels[:, 1], errors[:, 0], errors[:, 1],
             angles="xy", scale_units="xy", scale=1.0 / enlarged,
@@ -71,8 +74,10 @@ def residual_figure(result: RigCalibration) -> Figure:
         )  # fmt: skip
         axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
         axes.set_title(
-            f"{side}: {result.reprojection_rms_px(side):.3f} px rms, drawn {enlarged:.0f} times"
+            f"{side}: {result.reprojection_rms_px(side):.3f} px rms (arrows {enlarged:.0f} times "
+            "as long)"
         )
+        axes.set(xlabel="u [px]", ylabel="v [px]" if number == 0 else "")
     axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
     places = np.arange(len(result.model.views))
     for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):
@@ -112,13 +117,16 @@ def _style(view: BoardView) -> dict[str, Any]:
     return {"color": "#b03060" if view.under_surface else "#1b1b1b", "linewidth": 2.0}
 
 
-def _draw_camera(axes: Any, camera: Camera, axis: int, colour: str, label: str | None) -> None:
+def _draw_frustum(axes: Any, camera: Camera, surface_height: float, axis: int, colour: str) -> None:
     centre = camera.centre
     corners = np.array(
         [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float
     )
-    ends = centre + _FRUSTUM * optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
-    axes.plot(_MM * centre[axis], _MM * centre[0], "o", color=colour, label=label)
+    rays = optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
+    above = centre[0] - surface_height
+    # Down to the surface; a camera that looks level has no such end.
+    lengths = np.minimum(above / np.maximum(-rays[:, 0], 1e-9), 2.0 * above)
+    ends = centre + lengths[:, None] * rays
     for end in ends:
         axes.plot(
             _MM * np.array([centre[axis], end[axis]]), _MM * np.array([centre[0], end[0]]),

@@ -13,7 +13,7 @@ import yaml
 from numpy.typing import NDArray
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_tracker.calibration import Phantom
+from needle_tracker.calibration import Phantom, yaml_problem
 from needle_tracker.charuco import CharucoBoard
 
 Array = NDArray[np.float64]
@@ -101,7 +101,7 @@ def load_session(path: Path) -> Session:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise UserError(f"cannot read session {path}: {reason}") from error
     except yaml.YAMLError as error:
-        raise UserError(f"session {path} is not YAML: {str(error).splitlines()[0]}") from error
+        raise UserError(f"session {path} is not YAML: {yaml_problem(error)}") from error
     try:
         return parse_session(content)
     except UserError as error:

@@ -71,6 +71,13 @@ class CharucoBoard:
                 f"{self.dictionary} has {markers}"
             )
 
+    def __str__(self) -> str:
+        """Return what it is, for a person."""
+        return (
+            f"{self.columns} x {self.rows} squares of {1e3 * self.square:g} mm, markers "
+            f"{1e3 * self.marker:g} mm, {self.dictionary}"
+        )
+
     @property
     def size(self) -> tuple[float, float]:
         """Length along x and y [m]."""
@@ -158,8 +165,7 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     figure.text(
         0.5,
         0.25 * _MARGIN / paper[1],
-        f"{board.columns} x {board.rows} squares of {1e3 * board.square:g} mm, markers "
-        f"{1e3 * board.marker:g} mm, {board.dictionary}; origin: top left corner of the pattern",
+        f"{board}; origin: top left corner of the pattern",
         ha="center",
         fontsize=6,
     )

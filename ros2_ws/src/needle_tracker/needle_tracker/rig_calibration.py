@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
-from needle_tracker.calibration import SIDES, Phantom, StereoCalibration
+from needle_tracker.calibration import LEAST_BASELINE, SIDES, Phantom, StereoCalibration
 from needle_tracker.calibration_start import check_views, first_calibration
 from needle_tracker.rig_fit import RigFit, board_parameters_free, fit
 from needle_tracker.rig_model import (
@@ -144,6 +144,8 @@ def calibrate(
         free[worst] = False
     _check_cameras(names, result, sizes)
     calibration = model.calibration(result.parameters)
+    if np.linalg.norm(calibration.left.centre - calibration.right.centre) < LEAST_BASELINE:
+        raise UserError("both cameras come out in one place: are left and right the same images?")
     determined = {
         name: Determined(
             value=float(result.parameters[i]),

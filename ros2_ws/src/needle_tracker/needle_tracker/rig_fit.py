@@ -102,6 +102,50 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     return RigFit(parameters, free.copy(), covariance, residuals, sigma if known else seen, cost)
 
 
+def outlier_weights(whitened: Array) -> Array:
+    """Return how much each residual counts, by its size in standard deviations (soft L1)."""
+    return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
+
+
+def place_rows(model: RigModel, free: Mask) -> Array:
+    """Return the rows that known places add to the whitened Jacobian, shape (6 * places, free)."""
+    rows, sigmas = _place_priors(model, free)
+    result = np.zeros((len(rows), int(np.count_nonzero(free))))
+    result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
+    return result
+
+
+def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
+    """Return how far boards came out from their places, where those have a standard deviation.
+
+    Parameters
+    ----------
+    model : RigModel
+        What was fitted.
+    result : RigFit
+        Its fit.
+
+    Returns
+    -------
+    list of (str, float, float)
+        Name of the view; distance of the board's middle from where it should be [m]; the largest
+        of its six parameters in standard deviations.
+    """
+    rows, sigmas = _place_priors(model, result.free)
+    numbers = (rows.reshape(-1, 6)[:, 0] - SHARED_PARAMETERS) // 6
+    poses = model.board_poses(result.parameters)
+    deviations = []
+    for number, pulls in zip(
+        numbers.tolist(), (result.parameters[rows] / sigmas).reshape(-1, 6), strict=True
+    ):
+        view = model.views[number]
+        assert view.place is not None
+        middle = np.append(view.left.points.mean(axis=0), 1.0)
+        away = (poses[number] - view.place.T_rig_board) @ middle
+        deviations.append((view.name, float(np.linalg.norm(away)), float(np.abs(pulls).max())))
+    return deviations
+
+
 def _minimise(
     model: RigModel, start: Array, free: Mask, sigma: float, priors: tuple[NDArray[np.intp], Array]
 ) -> tuple[Array, Array, float]:
@@ -124,7 +168,7 @@ def _minimise(
     cost, pixels = cost_of(parameters)
     normal = np.zeros((0, 0))
     for _ in range(_ITERATIONS):
-        weights = 1.0 / np.sqrt(1.0 + (pixels / _OUTLIER) ** 2)
+        weights = outlier_weights(pixels)
         slopes = np.nan_to_num(model.jacobian(parameters, free) / sigma)
         weighted = slopes * weights[:, None]
         normal, gradient = weighted.T @ slopes, weighted.T @ pixels

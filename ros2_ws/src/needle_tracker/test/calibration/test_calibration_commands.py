@@ -68,6 +68,7 @@ def test_from_images_to_a_calibration_that_its_check_accepts(
     assert values["reprojection_left_under_px"] < 0.1
     assert values["determined_refractive_index"] is True
     assert values["sigma_left_k3"] is None
+    assert values["problem"] is None
 
     words = arguments(recorded, "--calibration", str(output), "--json", str(figures))
     assert check_calibration(words) == 0
@@ -110,6 +111,11 @@ def blind(folder: Path) -> None:
     cv2.imwrite(str(folder / "right" / "free_3.png"), np.full((768, 1024), 90, np.uint8))
 
 
+def another_board(folder: Path) -> None:
+    path = folder / "session.yaml"
+    path.write_text(path.read_text().replace("columns: 12", "columns: 11"))
+
+
 def bad_session(folder: Path) -> None:
     (folder / "session.yaml").write_text("board: {}\n")
 
@@ -128,6 +134,7 @@ def no_image_of_a_place(folder: Path) -> None:
         (empty, "no images"),
         (missing, "does not exist"),
         (blind, "free_3: the right camera sees 0 corners"),
+        (another_board, "shows the session's board (11 x 9 squares of 10 mm"),
         (bad_session, "phantom is missing"),
         (no_image_of_a_place, "places.under_deep has no image"),
     ],
@@ -184,8 +191,12 @@ def test_a_place_given_wrong_is_pointed_at(session: Path, tmp_path: Path, capsys
     content = yaml.safe_load((session / "session.yaml").read_text())
     content["places"]["surface_b"]["origin"] = flat_pose([0.0185, -0.040, 0.0025])[:3, 3].tolist()
     (session / "session.yaml").write_text(yaml.safe_dump(content))
-    assert calibrate_stereo(arguments(session, "--output", str(tmp_path / "rig.yaml"))) in (0, 1)
-    assert "WARNING: surface_" in capsys.readouterr().out
+    figures = tmp_path / "figures.json"
+    words = arguments(session, "--output", str(tmp_path / "rig.yaml"), "--json", str(figures))
+    assert calibrate_stereo(words) == 1
+    text = capsys.readouterr().out
+    assert "NOT OK: surface_" in text
+    assert "does its place hold" in json.loads(figures.read_text())["problem"]
 
 
 def test_the_board_command_writes_a_board(tmp_path: Path, capsys: Out) -> None:
