@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -13,9 +12,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Bool, Header
@@ -29,9 +26,9 @@ from needle_common.conversions import (
     to_stamp,
 )
 from needle_common.own_context_node import own_context
-from needle_sim.sim_rig_node import SimRigNode
 
-LIMIT = 20.0
+from .bench import SimRigBench
+
 TICK_NS = 20_000_000
 WAY_PER_TICK = 4e-5
 
@@ -127,27 +124,18 @@ class Others(Node):
         self.warnings += [s.message for s in message.status if s.level != b"\0"]
 
 
-class Rig:
+class Rig(SimRigBench):
     def __init__(self, context: Context, **parameters: Any) -> None:
-        overrides = {"level": "drive", **parameters}
-        self.sim = SimRigNode(
-            context=context,
-            parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
-        )
+        super().__init__(context, level="drive", **parameters)
         self.others = Others(context)
-        self._executor = SingleThreadedExecutor(context=context)
-        self._executor.add_node(self.sim)
-        self._executor.add_node(self.others)
+        self.join(self.others)
 
-    def until(self, condition: Callable[[], bool], what: str) -> None:
-        deadline = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < deadline, f"timed out: {what}; {self.others.warnings}"
-            self._executor.spin_once(timeout_sec=min(self.sim.turns(), 0.01))
+    def heard(self) -> object:
+        return self.others.warnings
 
     def look_around(self) -> None:
         for _ in range(100):
-            self._executor.spin_once(timeout_sec=min(self.sim.turns(), 0.002))
+            self.look(0.002)
 
     def start(self) -> None:
         self.others.steer(0)
@@ -161,12 +149,6 @@ class Rig:
             self.others._controller, state="STEERING", awaiting="result", tip_after_ns="0"
         )
         self.look_around()
-
-    def close(self) -> None:
-        self.sim.close()
-        self._executor.shutdown()
-        self.sim.destroy_node()
-        self.others.destroy_node()
 
 
 @contextmanager

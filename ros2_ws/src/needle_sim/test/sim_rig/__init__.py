@@ -1,0 +1,1 @@
+"""The node sim_rig beside scripted partners."""
