@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_bringup.bag_images import TOPICS, plain_image
+from needle_bringup.bag_images import SIDES, TOPICS, plain_image
 from needle_bringup.rerun import Output, stored
 from needle_common.conversions import to_nanoseconds
 from needle_tracker import conversions
@@ -43,6 +43,7 @@ class TrackerStage:
         self._takers: dict[str, Callable[[Any, float], Iterable[Answer]]] = {
             "joint_states": self._take_joints,
             **{topic: self._taker_of(side) for topic, side in TOPICS.items()},
+            **{f"stereo/{side}/camera_info": self._info_taker_of(side) for side in SIDES},
         }
         if parameters.heading_from_estimate:
             self._takers["needle/estimate"] = self._take_estimate
@@ -65,6 +66,14 @@ class TrackerStage:
         def take(message: Any, now: float) -> Iterable[Answer]:
             frame = conversions.to_frame(plain_image(message), side, self._cameras[side])
             return self._answers.add_image(side, to_nanoseconds(message.header.stamp), frame, now)
+
+        return take
+
+    def _info_taker_of(self, side: str) -> Callable[[Any, float], Iterable[Answer]]:
+        def take(message: Any, _: float) -> Iterable[Answer]:
+            problem = conversions.other_resolution(message, side, self._cameras[side])
+            self._answers.add_contradiction(side, problem)
+            return ()
 
         return take
 

@@ -42,13 +42,23 @@ def to_frame(message: Image, side: str, camera: Camera) -> Frame:
     return Frame(rows[:, : message.width])
 
 
+def other_resolution(message: CameraInfo, side: str, camera: Camera) -> str:
+    """Return that a camera_info is of images of another size than the calibration's, else empty."""
+    size = (message.width, message.height)
+    # Some drivers send zeros where they know nothing.
+    if size in {(0, 0), (camera.width, camera.height)}:
+        return ""
+    return (
+        f"{side} camera_info is for {message.width}x{message.height}, the calibration for "
+        f"{camera.width}x{camera.height}"
+    )
+
+
 def camera_info_problem(message: CameraInfo, side: str, camera: Camera) -> str:
     """Return how a camera_info contradicts the calibration file; empty where it does not."""
-    if (message.width, message.height) != (camera.width, camera.height):
-        return (
-            f"{side} camera_info is for {message.width}x{message.height}, the calibration for "
-            f"{camera.width}x{camera.height}"
-        )
+    problem = other_resolution(message, side, camera)
+    if problem:
+        return problem
     difference = float(np.abs(np.reshape(message.k, (3, 3)) - camera.camera_matrix).max())
     # An uncalibrated camera driver sends zeros.
     if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:

@@ -114,6 +114,7 @@ class PairAnswers:
         self._settings = settings
         self._queue: deque[tuple[float, Pair[Frame]]] = deque()
         self._last_stamp: int | None = None
+        self._contradictions: dict[str, str] = {}
         self._roll: RollEstimate | None = None
         self._T_rig_plane = np.eye(3)
 
@@ -123,6 +124,10 @@ class PairAnswers:
         if pair is not None:
             self._queue.append((now, pair))
         return self.ready(now)
+
+    def add_contradiction(self, side: str, reason: str) -> None:
+        """Refuse all pairs while a side's camera is not the calibrated one; empty: it is."""
+        self._contradictions[side] = reason
 
     def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
         """Take an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
@@ -169,7 +174,8 @@ class PairAnswers:
         last = self._last_stamp
         if last is None or pair.stamp > last:
             self._last_stamp = pair.stamp
-            return pair.left.problem or pair.right.problem
+            problems = (pair.left.problem, pair.right.problem, *self._contradictions.values())
+            return next(filter(None, problems), "")
         back = last - pair.stamp
         if back >= _NEW_RECORDING:
             self.tracker.reset()

@@ -33,6 +33,7 @@ from needle_tracker.calibration import SIDES, load_calibration
 from needle_tracker.conversions import (
     camera_info_problem,
     insertion_of,
+    other_resolution,
     roll_sigma_of,
     rotation_of,
     to_frame,
@@ -130,8 +131,9 @@ class StereoTrackerNode(Node):
             )
 
     def _on_camera_info(self, side: str, message: CameraInfo) -> None:
-        problem = camera_info_problem(message, side, self._cameras[side])
-        self._health.camera_info[side] = problem
+        camera = self._cameras[side]
+        self._health.camera_info[side] = camera_info_problem(message, side, camera)
+        self._answers.add_contradiction(side, other_resolution(message, side, camera))
 
     def _on_joints(self, message: JointState) -> None:
         insertion = insertion_of(message)

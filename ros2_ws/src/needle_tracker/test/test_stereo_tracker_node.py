@@ -7,6 +7,7 @@ import math
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -99,12 +100,19 @@ class Bench:
         message.header.stamp = to_stamp(stamp)
         self._joints.publish(message)
 
-    def image(self, side: str, stamp: int, pixels: np.ndarray, encoding: str = "mono8") -> None:
+    def image(
+        self,
+        side: str,
+        stamp: int,
+        pixels: np.ndarray,
+        encoding: str = "mono8",
+        cut_off: int = 0,
+    ) -> None:
         height, width = pixels.shape
         message = Image(height=height, width=width, step=width, encoding=encoding)
         message.header.stamp = to_stamp(stamp)
         data = array.array("B")
-        data.frombytes(pixels.tobytes())
+        data.frombytes(pixels.tobytes()[: pixels.size - cut_off])
         message.data = data
         self._images[side].publish(message)
 
@@ -256,6 +264,7 @@ def test_one_camera_alone_is_said(bench: Bench, images: Images) -> None:
     ("spoil", "encoding", "reason"),
     [
         (lambda image: image, "rgb8", "right image is 'rgb8', wants 'mono8'"),
+        (lambda image: image, "mono16", "right image is 'mono16', wants 'mono8'"),
         (lambda image: image[:480, :640], "mono8", "right image is 640x480, the calibration is"),
     ],
 )
@@ -278,6 +287,16 @@ def test_bad_images_are_answered_without_a_tip_and_named(
     assert found(bench.pair(20, images))
 
 
+def test_an_image_without_all_its_bytes_is_no_tip(bench: Bench, images: Images) -> None:
+    bench.joints(10)
+    bench.image("left", 10, images[0], cut_off=1)
+    bench.image("right", 10, images[1])
+    assert not found(bench.answer())
+    wanted = "pair refused: left image has 786431 bytes in rows of 1024"
+    bench.until(lambda: bench.health["images"][1].startswith(wanted))
+    assert not bench.tips
+
+
 def test_a_black_frame_is_no_tip(bench: Bench, images: Images) -> None:
     assert not found(bench.pair(10, (images[0], np.zeros_like(images[1]))))
     bench.until(lambda: "right image is black" in bench.health["track"][1])
@@ -297,16 +316,54 @@ def test_time_running_backwards_is_no_tip(bench: Bench, images: Images) -> None:
     assert len(bench.tips) <= 3
 
 
-def test_a_calibration_for_another_resolution_is_said(bench: Bench) -> None:
+def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
+    bench: Bench, images: Images
+) -> None:
     bench.camera_info(640, 480)
     bench.until(lambda: bench.health["images"][0] == 2)
-    assert "camera_info is for 640x480" in bench.health["images"][1]
+    reason = "left camera_info is for 640x480, the calibration for 1024x768"
+    assert bench.health["images"][1] == reason
+    assert not found(bench.pair(10, images))
+    bench.until(lambda: bench.health["images"][1] == f"pair refused: {reason}")
+    assert bench.health["images"][2][f"refused: {reason}"] == "1"
+    assert not bench.tips
+    # A driver that knows nothing contradicts nothing.
+    bench.camera_info(0, 0)
+    bench.until(lambda: not bench.node._health.camera_info["left"])
+    assert found(bench.pair(20, images))
+
+
+def test_a_calibration_for_another_resolution_gives_no_tip(
+    context: Context, images: Images, calibration_path: Path, tmp_path: Path
+) -> None:
+    text = calibration_path.read_text()
+    other = tmp_path / "other.yaml"
+    other.write_text(text.replace("image_width: 1024", "image_width: 1280"))
+    bench = Bench(context, calibration_file=str(other))
+    try:
+        assert not found(bench.pair(10, images))
+        wanted = "left image is 1024x768, the calibration is for 1280x768"
+        bench.until(lambda: bench.health["images"][2].get(f"refused: {wanted}") == "1")
+        assert bench.health["images"][:2] == (2, f"pair refused: {wanted}")
+        assert not bench.tips
+    finally:
+        bench.close()
+
+
+def test_the_same_images_from_both_cameras_are_no_tip(bench: Bench, images: Images) -> None:
+    """One camera wired to both topics: its two rays never meet in the phantom."""
+    assert not found(bench.pair(10, (images[0], images[0])))
+    assert not found(bench.pair(20, (images[1], images[0])))
+    bench.until(lambda: bench.health["track"][0] == 1)
+    assert not bench.tips
 
 
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
         ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
+        ("calibration_file", __file__, "is not YAML"),
+        ("calibration_file", "/dev/null", r"phantom\.surface_height is missing"),
         ("pair_tolerance", -1.0, "pair_tolerance"),
         ("needle_polarity", "grey", "needle_polarity"),
         ("pair_tolerence", 0.0, "did you mean 'pair_tolerance'"),
