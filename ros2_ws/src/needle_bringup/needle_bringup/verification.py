@@ -104,6 +104,12 @@ class Run:
         return ["", *self.output.strip().splitlines()][-1]
 
 
+def _heed_signals() -> None:
+    """Undo what a shell's background or nohup ignores, and all below would."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 class StartedRun:
     """A run of `scripts/simulate` under way.
 
@@ -128,8 +134,7 @@ class StartedRun:
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 start_new_session=True,
-                # A shell ignores it for what it runs in the background, and so would all below.
-                preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
+                preexec_fn=_heed_signals,  # noqa: PLW1509
             )
 
     @property
