@@ -69,7 +69,7 @@ def views_in_folders(
     sizes: Sizes = {}
     pairs = open_pairs(left, right)
     if pairs.unpaired:
-        raise UserError(f"{len(pairs.unpaired)} images have no partner: {pairs.unpaired[0]}")
+        raise UserError(f"images without a partner ({len(pairs.unpaired)}): {pairs.unpaired[0]}")
     for pair in tqdm(
         pairs,
         desc="finding the board",

@@ -35,6 +35,8 @@ CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
 CAUSES = (*CAMERAS, *PHANTOM)
 LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
 LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
+EXPLAINED_PX = 1.0  # a larger misfit, and the causes found explain nothing
+NOTHING_SHOWN = 1.0  # an unseen error of tips from which on a target shows nothing at all [m]
 TURN_LIMIT = np.deg2rad(0.01)  # a camera turned by more was touched, whatever it does to tips
 
 
@@ -68,7 +70,8 @@ class CheckResult:
     deviations : list of Deviation
         What was found, the most telling first.
     tip_error : float
-        What all of it together does to tips in the phantom, 95 % [m].
+        What all of it together does to tips in the phantom, 95 % [m]; NaN where the causes do not
+        explain what is seen.
     unseen_tip_error : float
         What errors this target could not show, 95 % [m].
     corner_sigma_px : float
@@ -125,15 +128,23 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     model = RigModel(calibration, views, boards)
     everything = _fit(model, list(CAUSES), None)
     sigma = everything.corner_sigma_px
+    misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
+    covariance = everything.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
+    unseen = tip_error_p95(calibration, covariance)
+    asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
+    reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
+    if not misfit <= EXPLAINED_PX:
+        problem = (
+            f"corners miss by {misfit:.1f} px whatever turned camera, index or surface is assumed: "
+            "another target or place than the session says, left and right exchanged, or other "
+            "cameras"
+        )
+        return CheckResult([], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, sigma)
     best = _fit(model, found, sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
     shift = _p95(calibration, model.calibration(best.parameters))
-    covariance = everything.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
-    unseen = tip_error_p95(calibration, covariance)
-    asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
     problems = []
-    misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
     if misfit > LARGEST_MISFIT_PX:
         problems.append(
             f"corners miss by {misfit:.2f} px in a way that no turned camera, index or surface "
@@ -148,10 +159,10 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     ]
     if unseen > limit:
         problems.append(
-            f"this target cannot show errors of tips below {1e3 * min(unseen, 1.0):.2f} mm: lay it "
-            "at known places on and under the surface, tilted"
+            "this target cannot show errors of tips"
+            + (f" below {1e3 * unseen:.2f} mm" if unseen < NOTHING_SHOWN else "")
+            + ": lay it at known places on and under the surface, tilted"
         )
-    reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
     return CheckResult(deviations, shift, unseen, sigma, reprojection, problems)
 
 

@@ -47,6 +47,9 @@ def check_calibration(options: CheckOptions, words: list[str]) -> int:
                     f"{side} images are {sizes[side][0]}x{sizes[side][1]}, the calibration is for "
                     f"{camera.width}x{camera.height}"
                 )
+        free = [view.name for view in views if view.place is None]
+        if free:
+            print(f"held freely in air, for the session has no such place: {', '.join(free)}")
     else:
         views = [_live_view(options, calibration, session, words)]
     result = check(calibration, views, options.limit)

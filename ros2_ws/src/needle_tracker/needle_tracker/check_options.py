@@ -10,7 +10,13 @@ from pathlib import Path
 from needle_common.cli import JsonValue
 from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.options import CommandParser
-from needle_tracker.calibration_check import CAMERAS, CAUSES, CheckResult, Deviation
+from needle_tracker.calibration_check import (
+    CAMERAS,
+    CAUSES,
+    NOTHING_SHOWN,
+    CheckResult,
+    Deviation,
+)
 
 _DESCRIPTION = """\
 Check a stereo calibration with a ChArUco board of known place: a camera turned by 0.02 deg, an
@@ -21,8 +27,9 @@ The session file is that of calibrate_stereo (see there): board and places. For 
 board flat on the surface and, tilted, at a known place under it, and give each place the `sigma`
 that it is really known to. A place given wrong looks like both cameras turned.
 
-Recorded images: --left and --right, folders paired by name. Live: --live NAME takes pairs from
-stereo/{left,right}/image_raw; the board stands still at the session's place NAME.
+Recorded images: --left and --right, folders paired by name; an image whose name is no place of the
+session is taken for a board held freely in air, which says little. Live: --live NAME takes pairs
+from stereo/{left,right}/image_raw; the board stands still at the session's place NAME.
 """
 _EPILOG = """\
 examples:
@@ -93,14 +100,21 @@ def report(result: CheckResult) -> str:
         f"{math.sqrt(2.0) * result.corner_sigma_px:.3f})"
     ]
     lines += [f"found: {_words(deviation)}" for deviation in result.deviations]
-    if not result.deviations:
+    explained = math.isfinite(result.tip_error)
+    if explained and not result.deviations:
         lines.append("found: nothing that differs from the calibration")
     if {d.cause for d in result.deviations} >= set(CAMERAS):
         lines.append("both cameras turned: or the target is not where the session says")
-    lines.append(
-        f"tips in the phantom, 95 %: off by {1e3 * result.tip_error:.3f} mm; errors below "
-        f"{1e3 * min(result.unseen_tip_error, 1.0):.3f} mm cannot be seen with this target"
-    )
+    if explained:
+        unseen = result.unseen_tip_error
+        lines.append(
+            f"tips in the phantom, 95 %: off by {1e3 * result.tip_error:.3f} mm; with this target "
+            + (
+                f"errors below {1e3 * unseen:.3f} mm cannot be seen"
+                if unseen < NOTHING_SHOWN
+                else "other errors cannot be seen, however large"
+            )
+        )
     lines += [f"NOT OK: {problem}" for problem in result.problems]
     if result.ok:
         lines.append("OK")
@@ -109,7 +123,7 @@ def report(result: CheckResult) -> str:
 
 def figures(result: CheckResult) -> dict[str, JsonValue]:
     """Return a check's figures, flat, for --json; null for a cause that was not found."""
-    unseen = result.unseen_tip_error if result.unseen_tip_error < 1.0 else math.nan
+    unseen = result.unseen_tip_error if result.unseen_tip_error < NOTHING_SHOWN else math.nan
     values: dict[str, JsonValue] = {
         "ok": result.ok,
         "tip_error_p95_mm": 1e3 * result.tip_error,

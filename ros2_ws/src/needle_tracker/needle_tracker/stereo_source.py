@@ -220,7 +220,7 @@ class RecordedPairs:
         self._pairs: PairSequence = open_pairs(Path(settings.left), Path(settings.right))
         if self._pairs.unpaired:
             raise UserError(
-                f"{len(self._pairs.unpaired)} images have no partner: {self._pairs.unpaired[0]}"
+                f"images without a partner ({len(self._pairs.unpaired)}): {self._pairs.unpaired[0]}"
             )
         self.dropped = 0
         self._any = False

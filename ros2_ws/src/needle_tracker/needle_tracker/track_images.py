@@ -94,6 +94,11 @@ def _run(words: Sequence[str]) -> int:
         print(f"  no tip {count:6d} x  {reason}")
     _warn("without a partner", pairs.unpaired)
     _warn("cannot be used", tracked.unreadable)
+    if pairs.cut_off:
+        print(
+            f"warning: {pairs.cut_off} pairs that the videos promise cannot be read",
+            file=sys.stderr,
+        )
     if insertions is not None and tracked.without_insertion:
         print(f"warning: {tracked.without_insertion} pairs have no insertion", file=sys.stderr)
     if json is not None:
@@ -173,7 +178,7 @@ def pair_problem(pair: NamedPair, calibration: StereoCalibration) -> str:
     cameras = (calibration.left, calibration.right)
     for side, image, camera in zip(SIDES, (pair.left, pair.right), cameras, strict=True):
         if image is None:
-            return f"{side} image is unreadable"
+            return f"{side} image is unreadable or not of 8 bit"
         if image.shape != (camera.height, camera.width):
             return (
                 f"{side} image is {image.shape[1]}x{image.shape[0]}, the calibration is for "
@@ -217,7 +222,8 @@ def _warn(what: str, names: Sequence[str]) -> None:
         return
     shown = ", ".join(names[:_NAMED])
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    print(f"warning: {len(names)} images {what}: {shown}{more}", file=sys.stderr)
+    count = f"{len(names)} image" + ("s" if len(names) > 1 else "")
+    print(f"warning: {count} {what}: {shown}{more}", file=sys.stderr)
 
 
 def _parser() -> CommandParser:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,13 @@ def test_a_target_that_cannot_show_it_is_never_ok(calibration_path: Path, rig: T
         result = check(calibration, views, LIMIT)
         assert not result.ok
         assert "cannot show" in result.problems[-1]
+
+
+def test_left_and_right_exchanged_is_no_turned_camera(calibration_path: Path, rig: TrueRig) -> None:
+    views = [dataclasses.replace(v, left=v.right, right=v.left) for v in target(rig)]
+    result = check(load_calibration(calibration_path), views, LIMIT)
+    assert result.deviations == []
+    assert "left and right exchanged" in result.problems[0]
 
 
 def test_another_lens_setting_is_no_turned_camera(calibration_path: Path, rig: TrueRig) -> None:

@@ -128,7 +128,7 @@ def no_image_of_a_place(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
-        (drop("free_2", "left"), "no partner: right free_2.png"),
+        (drop("free_2", "left"), "without a partner (1): right free_2.png"),
         (smaller, "free_3.png is 640x480"),
         (broken, "cannot read"),
         (empty, "no images"),
