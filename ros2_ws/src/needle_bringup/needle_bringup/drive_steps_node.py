@@ -126,7 +126,7 @@ class _RandomSteps:
         hand.now_ns = lambda: self.time.time_ns
         self._at = (0.0, 0.0)
         self._worst = (0.0, 0.0)
-        self._failed = 0
+        self._failures: list[str] = []
         self._retractions = 0
 
     def prepare(self) -> None:
@@ -171,16 +171,18 @@ class _RandomSteps:
             hand.look(0.002)
             if hand.status.get("needs_time") == "true":
                 self.time.tick()
-        self._failed += hand.results[stamp] != "succeeded"
+        if hand.results[stamp] != "succeeded":
+            self._failures.append(hand.results[stamp])
         off = self._off()
         self._worst = (max(self._worst[0], abs(off[0])), max(self._worst[1], abs(off[1])))
 
-    def figures(self) -> dict[str, float]:
+    def figures(self) -> dict[str, Any]:
         """Return what came of it; distances in counts."""
         hand, off = self._hand, self._off()
         return {
             "retractions": self._retractions,
-            "not_succeeded": self._failed,
+            "not_succeeded": len(self._failures),
+            "not_succeeded_for": sorted(set(self._failures)),
             "results": len(hand.results),
             "final_off_insertion_counts": off[0],
             "final_off_rotation_counts": off[1],

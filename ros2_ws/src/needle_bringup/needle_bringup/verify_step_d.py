@@ -83,7 +83,8 @@ def many_steps(_: Workbench, count: int = STEPS) -> Iterator[Finding]:
         "steps_messages",
         f"{count:,} random steps: results, joint_states and positions of each cycle",
         "every one, all steps succeeded",
-        f"{seen['results']} results, {seen['not_succeeded']} not succeeded; {lost} of "
+        f"{seen['results']} results, {seen['not_succeeded']} not succeeded"
+        f"{''.join(f' ({text})' for text in seen['not_succeeded_for'])}; {lost} of "
         f"{seen['ticks']} cycles without joints or positions",
         seen["results"] == count and seen["not_succeeded"] == 0 and lost == 0,
     )
