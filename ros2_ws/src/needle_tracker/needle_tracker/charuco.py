@@ -8,7 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
 from needle_common.errors import OutOfBoundsError, UserError
@@ -90,10 +92,30 @@ class CharucoBoard:
         flat = np.stack([u.ravel(), v.ravel(), np.zeros(u.size)], axis=-1)
         return np.asarray(self.square * flat)
 
-    def image(self, square_px: int) -> NDArray[np.uint8]:
-        """Return the pattern without a margin, `square_px` pixels a square."""
-        shape = (self.columns * square_px, self.rows * square_px)
-        return np.asarray(self._opencv().generateImage(shape), dtype=np.uint8)
+    def black_squares(self) -> Array:
+        """Return what is printed black: squares and modules of markers.
+
+        Returns
+        -------
+        ndarray, shape (n, 3)
+            x and y of the corner nearest to the origin, and the side, in the board's frame [m].
+        """
+        rows, columns = np.nonzero(np.add.outer(range(self.rows), range(self.columns)) % 2 == 0)
+        sides = np.full(len(rows), self.square)
+        parts = [np.column_stack([self.square * columns, self.square * rows, sides])]
+        board = self._opencv()
+        dictionary = board.getDictionary()
+        modules = dictionary.markerSize + 2
+        side = self.marker / modules
+        for number, outline in zip(
+            np.asarray(board.getIds()).ravel().tolist(), board.getObjPoints(), strict=True
+        ):
+            origin = np.asarray(outline, dtype=np.float64).reshape(-1, 3)[0, :2]
+            bits = cv2.aruco.generateImageMarker(dictionary, number, modules)
+            rows, columns = np.nonzero(np.asarray(bits) == 0)
+            places = origin + side * np.column_stack([columns, rows])
+            parts.append(np.column_stack([places, np.full(len(rows), side)]))
+        return np.concatenate(parts)
 
     def find(self, image: NDArray[np.uint8]) -> tuple[NDArray[np.intp], Array]:
         """Find the board's inner corners in an image.
@@ -159,9 +181,11 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     axes = figure.add_axes(
         (_MARGIN / paper[0], _MARGIN / paper[1], length / paper[0], height / paper[1])
     )
-    axes.imshow(board.image(80), cmap="gray", vmin=0, vmax=255, interpolation="nearest")
-    axes.set_aspect("auto")
+    axes.set(xlim=(0.0, length), ylim=(height, 0.0))
     axes.axis("off")
+    # Drawn, not an image: that would be fitted to whole dots, and all of the board be larger.
+    black = [Rectangle((x, y), side, side) for x, y, side in board.black_squares()]
+    axes.add_collection(PatchCollection(black, facecolor="black", linewidth=0.0, snap=False))
     figure.text(
         0.5,
         0.25 * _MARGIN / paper[1],

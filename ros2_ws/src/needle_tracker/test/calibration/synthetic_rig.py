@@ -23,6 +23,15 @@ BOARD = CharucoBoard()
 SIZE = (1024, 768)
 
 
+def board_image(square_px: int) -> NDArray[np.uint8]:
+    """The pattern as OpenCV draws it, without a margin."""
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, BOARD.dictionary))
+    shape = (BOARD.columns, BOARD.rows)
+    board = cv2.aruco.CharucoBoard(shape, BOARD.square, BOARD.marker, dictionary)
+    image = board.generateImage((shape[0] * square_px, shape[1] * square_px))
+    return np.asarray(image, dtype=np.uint8)
+
+
 @dataclasses.dataclass
 class TrueRig:
     """What a calibration file says, read without the code under test."""
@@ -116,7 +125,7 @@ class TrueRig:
         shape = (SIZE[1] * super_px, SIZE[0] * super_px)
         square_px = 40 * super_px
         pattern = cv2.copyMakeBorder(
-            BOARD.image(square_px), square_px, square_px, square_px, square_px,
+            board_image(square_px), square_px, square_px, square_px, square_px,
             cv2.BORDER_CONSTANT, value=255,
         )  # fmt: skip
         # The board's plane, as a fine mesh; between its knots the map is smooth.
