@@ -93,8 +93,11 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
     result = calibrate([view for view in views if view.name not in empty], sizes, session.phantom)
-    problems = doubts(result)
-    text = "\n".join([report(result, options.goal_mm), *(f"NOT OK: {one}" for one in problems)])
+    size = square_error(result)
+    problems = doubts(result, size)
+    text = "\n".join(
+        [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    )
     print(text)
     save_calibration(options.output, result.calibration, text.splitlines())
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
@@ -129,7 +132,7 @@ def reprojection_by_set(result: RigCalibration) -> dict[tuple[str, str], float]:
     return errors
 
 
-def report(result: RigCalibration, goal_mm: float) -> str:
+def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> str:
     """Return a calibration as a person reads it."""
     sets = [view_set(view) for view in result.model.views]
     counts = ", ".join(f"{sets.count(name)} {name}" for name in ("free", "surface", "under"))
@@ -154,7 +157,7 @@ def report(result: RigCalibration, goal_mm: float) -> str:
             )
         else:
             lines.append(f"{name}: not asked of these views, kept at the given {given:g}{unit}")
-    error, sigma = (100.0 * value for value in square_error(result))
+    error, sigma = (100.0 * value for value in size)
     if sigma < _SCALE_TOLD:
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
     else:

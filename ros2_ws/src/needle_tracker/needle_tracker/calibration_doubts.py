@@ -28,16 +28,18 @@ _LEAST_SHARE = 1e-9  # of what the size does to corners: rounding, where all of 
 _TRANSLATION = np.arange(3, 6)  # of a board's six parameters
 
 
-def doubts(result: RigCalibration) -> list[str]:
+def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
     """Return in words what of the session cannot be right; empty where all goes together.
 
     Parameters
     ----------
     result : RigCalibration
         The calibration.
+    size : (float, float)
+        Its `square_error`.
     """
     found = [text for view, text in misfits(result) if view.place is not None]
-    error, sigma = square_error(result)
+    error, sigma = size
     if abs(error) > max(LARGEST_SCALE_ERROR, LARGEST_PULL * sigma):
         found.append(
             f"the squares come out {100 * abs(error):.2f} +- {100 * sigma:.2f} % "

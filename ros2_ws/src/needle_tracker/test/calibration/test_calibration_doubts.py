@@ -37,8 +37,8 @@ def said_larger(view: BoardView, share: float) -> BoardView:
 
 def test_nothing_is_wrong_with_a_good_session(views: list[BoardView]) -> None:
     result = calibrated(views)
-    assert doubts(result) == []
     error, sigma = square_error(result)
+    assert doubts(result, (error, sigma)) == []
     assert abs(error) < 4.0 * sigma < 0.002
 
 
@@ -47,14 +47,15 @@ def test_wrong_squares_are_found_by_their_size(views: list[BoardView]) -> None:
     result = calibrated([said_larger(view, 0.003) for view in views])
     error, sigma = square_error(result)
     assert error == pytest.approx(-0.003, abs=4.0 * sigma)
-    assert "smaller than the session says" in doubts(result)[0]
+    assert "smaller than the session says" in doubts(result, (error, sigma))[0]
 
 
 def test_one_place_does_not_tell_the_size_of_the_squares(views: list[BoardView]) -> None:
     kept = [view for view in views if view.place is None or view.name == "surface_a"]
     result = calibrated([said_larger(view, 0.01) for view in kept])
-    assert not square_error(result)[1] < 0.1
-    assert doubts(result) == []
+    size = square_error(result)
+    assert not size[1] < 0.1
+    assert doubts(result, size) == []
 
 
 def test_a_wrong_place_under_the_surface_is_found(views: list[BoardView]) -> None:
@@ -66,7 +67,8 @@ def test_a_wrong_place_under_the_surface_is_found(views: list[BoardView]) -> Non
     place = dataclasses.replace(deep.place, T_rig_board=pose)
     moved = dataclasses.replace(deep, place=place)
     wrong = [moved if view is deep else view for view in views]
-    found = doubts(calibrated(wrong))
+    result = calibrated(wrong)
+    found = doubts(result, square_error(result))
     assert any(one.startswith("under_deep comes out 0.") for one in found)
 
 
