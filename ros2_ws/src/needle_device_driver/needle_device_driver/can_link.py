@@ -12,19 +12,19 @@ from typing import Any
 
 import can
 import canopen
-from canopen.objectdictionary import ObjectDictionary
-from canopen.sdo.client import SdoClient
 
 from needle_common.errors import UserError
+from needle_device_driver.objects import HEARTBEAT, MASTER_NODE_ID, NMT_OPERATIONAL
+from needle_device_driver.sdo_client import PatientSdoClient
 from needle_device_driver.slcan_bus import SlcanBus
 
 LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 _RECEIVE_WAIT = 0.05
 _JOIN_WAIT = 1.0
 _CONNECT_WAIT = 1.0
-
-# Entries are addressed by number: canopen needs to know none by name.
-_NO_DICTIONARY: Any = ObjectDictionary()  # type: ignore[no-untyped-call]
+# An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
+_SILENCE = 0.4
+_HEARTBEAT_PERIOD = 0.02
 
 Callback = Callable[[bytes, float], None]
 
@@ -172,7 +172,8 @@ class CanLink:
         self._network: canopen.Network | None = None
         self._thread: threading.Thread | None = None
         self._callbacks: dict[int, list[Callback]] = {}
-        self._sdo: dict[int, SdoClient] = {}
+        self._sdo: dict[int, PatientSdoClient] = {}
+        self._heard_at = 0.0
 
     @property
     def is_open(self) -> bool:
@@ -183,11 +184,19 @@ class CanLink:
     def errors(self) -> int:
         """How many error frames, lines that are no frame and refused frames there were."""
         bus = self._bus
-        own = bus.malformed + bus.refused if isinstance(bus, SlcanBus) else 0
-        return self.error_frames + own
+        own = bus.malformed if isinstance(bus, SlcanBus) else 0
+        return self.error_frames + own + self.refused
+
+    @property
+    def refused(self) -> int:
+        """How many commands and frames the adapter did not take; slcan only."""
+        return self._bus.refused if isinstance(self._bus, SlcanBus) else 0
 
     def open(self) -> None:
         """Open the adapter and begin to receive; a lost one is opened anew.
+
+        A serial adapter that is silent is told bitrate and "open" again: many start when their port
+        is opened, and hear nothing meanwhile.
 
         Raises
         ------
@@ -195,6 +204,7 @@ class CanLink:
             If that is not possible.
         """
         if self.is_open:
+            self._greet_again()
             return
         self.close()
         bus = self._open_bus(self.settings)
@@ -203,6 +213,7 @@ class CanLink:
         self._sdo = {}
         self._bus = bus
         self.lost = ""
+        self._heard_at = self.clock()
         self.openings += 1
         self._thread = threading.Thread(
             target=self._receive, args=(bus, self._network), name="can-receive", daemon=True
@@ -244,7 +255,17 @@ class CanLink:
             raise LinkError(self.lost) from error
         self.frames_sent += 1
 
-    def sdo(self, node_id: int) -> SdoClient:
+    def beat(self) -> None:
+        """Tell the drives' watchdogs that the control loop runs; only the loop itself may.
+
+        Raises
+        ------
+        LinkError
+            If the link is closed or lost.
+        """
+        self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
+
+    def sdo(self, node_id: int) -> PatientSdoClient:
         """Return the SDO client of a node, on the present opening of the adapter.
 
         Raises
@@ -255,12 +276,22 @@ class CanLink:
         if self._network is None or not self.is_open:
             raise LinkError(self.lost or f"{self.settings} is not open")
         if node_id not in self._sdo:
-            node = self._network.add_node(node_id, _NO_DICTIONARY)
-            client = node.sdo
-            client.RESPONSE_TIMEOUT = 0.1
-            client.MAX_RETRIES = 3
+            client = PatientSdoClient(node_id, self.beat, _HEARTBEAT_PERIOD)
+            client.network = self._network
+            self._network.subscribe(client.tx_cobid, client.on_response)
             self._sdo[node_id] = client
         return self._sdo[node_id]
+
+    def _greet_again(self) -> None:
+        bus = self._bus
+        if not isinstance(bus, SlcanBus) or self.clock() - self._heard_at < _SILENCE:
+            return
+        self._heard_at = self.clock()
+        try:
+            bus.greet()
+        except can.CanError as error:
+            self._lose(error)
+            raise LinkError(self.lost) from error
 
     def _lose(self, error: Exception) -> None:
         with self.arrival:
@@ -286,7 +317,7 @@ class CanLink:
             return
         if message.is_remote_frame or message.is_extended_id:
             return
-        now = self.clock()
+        now = self._heard_at = self.clock()
         self.frames_received += 1
         data = bytearray(message.data)
         for callback in self._callbacks.get(message.arbitration_id, ()):

@@ -45,8 +45,10 @@ class Goal(enum.Enum):
     STOPPED = "stopped"
 
 
-# Controlword in homing mode: begin. Statusword: bits whose meaning depends on the mode.
+# Controlword in homing mode: begin. Statusword: whether the drive listens to the bus; bits whose
+# meaning depends on the mode.
 START_HOMING = 1 << 4
+REMOTE = 1 << 9
 TARGET_REACHED = 1 << 10
 HOMING_ATTAINED = 1 << 12
 FOLLOWING_ERROR = 1 << 13

@@ -17,21 +17,20 @@ from needle_device_driver.drive_fault import Fault, drive_fault
 from needle_device_driver.drive_machine import LONGEST_REST, DriveMachine
 from needle_device_driver.drive_monitor import DriveMonitor
 from needle_device_driver.drive_settings import HERE, DriveSettings
-from needle_device_driver.drive_setup import (
+from needle_device_driver.drive_setup import set_up, write_homing, write_limits
+from needle_device_driver.drive_upkeep import (
     arm_watchdog,
     await_operational,
+    await_start,
     disarm_watchdog,
     reset_fault,
-    set_up,
-    write_homing,
-    write_limits,
 )
 from needle_device_driver.homing_run import HomingRun, HomingStep
-from needle_device_driver.object_access import DriveError, ObjectAccess, send_heartbeat
+from needle_device_driver.object_access import DriveError, ObjectAccess
 from needle_device_driver.rules import Rule
 
 # In cycles without an answer: a drive that is switched off at the end is given up.
-_SILENT = 5
+_SILENT = 15
 
 
 class Cia402Axis(Axis):
@@ -82,20 +81,24 @@ class Cia402Axis(Axis):
         self._configured = False
         self._opening = 0
         self._homed = False
+        self._limits_due = False
         self._origin = 0
         self._zero = 0
         self._velocity = 0.0
 
     def probe(self) -> None:
-        """Ask the drive whether it is there.
+        """Ask the drive whether it is there, from whatever state its node was left in.
 
         Raises
         ------
         AxisError
             If it does not answer.
         """
+        node = self._settings.node_id
         try:
-            ObjectAccess(self._link, self._settings.node_id).read(od.DEVICE_TYPE)
+            # A stopped node answers to nothing else.
+            self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
+            ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
 
@@ -116,6 +119,8 @@ class Cia402Axis(Axis):
             return
         if on:
             self._refuse_fault()
+            if self._limits_due:
+                raise AxisError(f"{self.name} axis has no software limits yet")
         else:
             self._homing = None
             self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -128,7 +133,7 @@ class Cia402Axis(Axis):
             self._zero = self._machine.at.position
             self._count_from_home()
             return
-        self._homed = False
+        self._homed = self._limits_due = False
         try:
             write_limits(self._access, self._settings, homed=False)
             write_homing(self._access, self._settings, speed)
@@ -187,7 +192,7 @@ class Cia402Axis(Axis):
             if not survived or self._opening != self._link.openings:
                 self._set_up(survived=survived)
             self.monitor.emergency = None
-            reset_fault(self._access, self._link.clock)
+            reset_fault(self._link, self._settings)
             self._refresh()
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
@@ -213,13 +218,20 @@ class Cia402Axis(Axis):
         )
 
     def close(self) -> None:
-        """Stop, switch off and release the drive's watchdog; the link is its owner's to close."""
+        """Stop, switch off and release the drive's watchdog; the link is its owner's to close.
+
+        Raises
+        ------
+        AxisError
+            If the drive does not say that it is off: its watchdog stays, and will switch it off.
+        """
         if not self._configured:
             return
         self._homing = None
         try:
             self._machine.want(Goal.OFF)
-            self._switch_off_now()
+            if not self._switch_off_now():
+                raise DriveError("does not say that it is off; its watchdog will switch it off")
             disarm_watchdog(self._link, self._settings)
         except (LinkError, DriveError) as error:
             raise self._error(error) from error
@@ -264,7 +276,11 @@ class Cia402Axis(Axis):
         if self._homing is not None:
             self._homing.update(at)
             if self._homing.step is HomingStep.DONE:
-                self._end_homing()
+                # The drive's own limits count from home: now that it has one, and once it is off.
+                self._limits_due = True
+                self._count_from_home()
+        elif self._limits_due and self._machine.state not in POWERED:
+            self._write_limits()
 
     def _send_order(self) -> None:
         command, mode = self._machine.next_order()
@@ -276,7 +292,7 @@ class Cia402Axis(Axis):
             od.COMMAND.function_code + self._settings.node_id, od.COMMAND.pack(word, mode)
         )
 
-    def _end_homing(self) -> None:
+    def _write_limits(self) -> None:
         try:
             write_limits(self._access, self._settings, homed=True)
         except LinkError:
@@ -285,7 +301,7 @@ class Cia402Axis(Axis):
         except DriveError as error:
             self._machine.trouble = str(error)
             return
-        self._count_from_home()
+        self._limits_due = False
 
     def _count_from_home(self) -> None:
         self._homing = None
@@ -335,8 +351,8 @@ class Cia402Axis(Axis):
             self._origin += 1
         self.monitor.begin_set_up()
         self.lacking = set_up(self._link, self._settings, period=self._period, homed=self._homed)
-        if not await_operational(self._link, self.monitor, self._period):
-            raise DriveError(f"node {self._settings.node_id} did not become operational")
+        self._limits_due = False
+        await_start(self._link, self.monitor, self._settings, self._period)
         arm_watchdog(self._link, self._settings, self._watchdog)
         self.monitor.end_set_up()
         self._opening = self._link.openings
@@ -357,13 +373,13 @@ class Cia402Axis(Axis):
             # A fault from before has sent its message to nobody.
             self.monitor.emergency = access.read(od.ERROR_CODE) or None
 
-    def _switch_off_now(self) -> None:
-        """Run cycles of its own until the drive is off: nobody else will."""
+    def _switch_off_now(self) -> bool:
+        """Run cycles of its own until the drive is off: nobody else will. Return whether it is."""
         if not self.actuated:
-            return
+            return True
         silent = 0
         for _ in range(LONGEST_REST + _SILENT):
-            send_heartbeat(self._link)
+            self._link.beat()
             self._send_order()
             self.monitor.expect_answer()
             self._link.send(od.SYNC)
@@ -373,5 +389,8 @@ class Cia402Axis(Axis):
                 self._link.arrival.wait_for(lambda: bool(self._link.lost), self._period / 2.0)
             self.update()
             silent = 0 if answered else silent + 1
-            if self._machine.state not in POWERED or silent > _SILENT:
-                return
+            if silent > _SILENT:
+                return False
+            if answered and self._machine.state not in POWERED:
+                return True
+        return False

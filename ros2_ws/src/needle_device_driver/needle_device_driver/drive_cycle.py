@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from needle_device_driver.axis import AxisError
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
-from needle_device_driver.object_access import send_heartbeat
 from needle_device_driver.objects import SYNC
 
 
@@ -52,7 +51,7 @@ class DriveCycle:
         if self._link.is_open:
             # The link remembers its loss, and the axes report it.
             try:
-                send_heartbeat(self._link)
+                self._link.beat()
             except LinkError:
                 return
 
@@ -79,7 +78,7 @@ class DriveCycle:
         if not self._link.is_open:
             return
         try:
-            send_heartbeat(self._link)
+            self._link.beat()
             for axis in self._axes:
                 axis.transmit()
             for axis in self._axes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from needle_device_driver.cia402 import (
     FAULTS,
     POWERED,
+    REMOTE,
     DriveCommand,
     DriveState,
     Goal,
@@ -155,6 +156,7 @@ class DriveMachine:
             self._complain(
                 f"is not {self._goal.value} after {_LONGEST_SWITCHING * self._period:g} s: "
                 f"{state.name}, mode {self.at.mode}"
+                + ("" if self.at.statusword & REMOTE else ", not under the bus's control (bit 9)")
             )
 
     def _next_command(self) -> DriveCommand:

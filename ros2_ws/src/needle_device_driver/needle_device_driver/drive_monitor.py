@@ -66,6 +66,7 @@ class DriveMonitor:
         self._heartbeats = 0
         self._nmt_state = NMT_BOOT_UP
         self._watching = False
+        self._outdated = False
         self.rebooted = False
         self.emergency: int | None = None
         self.malformed = 0
@@ -94,6 +95,12 @@ class DriveMonitor:
         with self._lock:
             return self._watching and self._nmt_state != NMT_OPERATIONAL
 
+    @property
+    def heard(self) -> bool:
+        """Whether a heartbeat came since the last set-up began."""
+        with self._lock:
+            return self._heartbeats > 0
+
     def answered(self) -> bool:
         """Return whether all process data arrived since the last SYNC."""
         with self._lock:
@@ -109,6 +116,7 @@ class DriveMonitor:
         """Forget what was; the node is set up from the start."""
         with self._lock:
             self._watching = False
+            self._heartbeats = 0
             self.rebooted = False
 
     def end_set_up(self) -> None:
@@ -118,12 +126,17 @@ class DriveMonitor:
             self.emergency = None
 
     def take(self, statusword: int, mode: int, inputs: int, position: int) -> None:
-        """Take what was read on request as if it had been sent."""
+        """Take what was read on request as if it had been sent.
+
+        The next answer to a SYNC is older in some drives, which answer with what they sampled at
+        the SYNC before: it counts as an answer, not for what it says.
+        """
         with self._lock:
             self._statusword, self._mode, self._inputs = statusword, mode, inputs
             self._position = position
             self._answers = {STATUS.function_code, POSITION.function_code}
             self._number += 1
+            self._outdated = True
             self._fresh_time = self._link.clock()
 
     def await_operational(self, timeout: float) -> bool:
@@ -144,7 +157,8 @@ class DriveMonitor:
     def _answer(self, function_code: int, time: float) -> None:
         self._answers.add(function_code)
         if not self._awaited():
-            self._number += 1
+            self._number += not self._outdated
+            self._outdated = False
             self._fresh_time = time
         self._lock.notify_all()
 

@@ -2,38 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import enum
 
 from needle_device_driver import objects as od
 from needle_device_driver.can_link import CanLink
 from needle_device_driver.cia402 import (
-    FAULTS,
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
     SUPPORTS_HOMING,
     DriveCommand,
     drive_state,
 )
-from needle_device_driver.drive_monitor import DriveMonitor
-from needle_device_driver.drive_settings import DriveSettings
-from needle_device_driver.emergency import describe_error
-from needle_device_driver.object_access import DriveError, ObjectAccess, send_heartbeat
-from needle_device_driver.objects import Pdo
+from needle_device_driver.drive_settings import HERE, DriveSettings
+from needle_device_driver.object_access import DriveError, DriveRefusalError, ObjectAccess
+from needle_device_driver.pdo_setup import map_pdo, silence_unused
 
 # Milliseconds between a drive's heartbeats: well inside the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
 # In seconds.
-_HEARTBEAT_WAIT = 0.3
-_FAULT_RESET_WAIT = 1.0
+_SWITCH_OFF_WAIT = 1.0
+
+_LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
+_KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
+_NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
 
 
-# A rule depends on these: what the drive made of them is read back.
-_CHECKED = (od.ABORT_CONNECTION_OPTION, od.FAULT_REACTION_OPTION, od.FOLLOWING_WINDOW)
-# Entries that CiA 402 leaves to the maker and that no rule hangs on alone.
-_LEFT_OUT = (
-    "has no {}: check on the rig what it does there (docs/hardware.md)",
-    "has no digital inputs to map: a retraction ends at 0 only, not at the switch",
-)
+class _Need(enum.Enum):
+    """How much hangs on an entry that a drive need not have; one that it has is set."""
+
+    WISH = enum.auto()  # A drive that refuses keeps its own.
+    TAKEN = enum.auto()
+    # A rule depends on these: what the drive made of them is read back.
+    AT_MOST = enum.auto()
+    EXACT = enum.auto()
 
 
 def set_up(
@@ -74,96 +75,51 @@ def set_up(
     access.write(od.CONSUMER_HEARTBEAT, 0)
     lacking: list[str] = []
     if settings.actuated:
-        lacking += _set_up_motion(access, settings, period)
+        lacking += _set_up_motion(link, access, settings, period)
         write_limits(access, settings, homed=homed)
-        _map(access, node, od.COMMAND)
-        _map(access, node, od.SET_POINT)
-    if access.has(od.DIGITAL_INPUTS):
-        _map(access, node, od.STATUS)
-    else:
-        lacking.append(_LEFT_OUT[1])
-        _map(access, node, od.STATUS_WITHOUT_INPUTS)
-    _map(access, node, od.POSITION)
-    access.write_optional(od.CYCLE_PERIOD, round(period * 1e6))
+        map_pdo(access, node, od.COMMAND)
+        map_pdo(access, node, od.SET_POINT)
+    lacking += _map_status(access, node)
+    map_pdo(access, node, od.POSITION)
+    silence_unused(access)
+    access.offer(od.CYCLE_PERIOD, round(period * 1e6))
     access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
     link.send(od.NMT, bytes([od.NMT_START, node]))
     return tuple(lacking)
 
 
-def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> None:
-    """Let the drive stop without the computer's heartbeat for `watchdog` [s]; raises as `set_up`.
-
-    It is the last step of a set-up: from here on the loop must send its heartbeat.
-    """
-    if settings.actuated:
-        ObjectAccess(link, settings.node_id).write_checked(
-            od.CONSUMER_HEARTBEAT, od.MASTER_NODE_ID << 16 | round(watchdog * 1e3)
-        )
-
-
-def await_operational(link: CanLink, monitor: DriveMonitor, period: float) -> bool:
-    """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
-    until = link.clock() + _HEARTBEAT_WAIT
-    while link.clock() < until:
-        send_heartbeat(link)
-        if monitor.await_operational(period):
-            return True
-    return False
-
-
-def reset_fault(access: ObjectAccess, clock: Callable[[], float]) -> None:
-    """Acknowledge a drive's fault and wait until it is gone; moves nothing.
-
-    Parameters
-    ----------
-    access : ObjectAccess
-        The drive.
-    clock : callable
-        Steady time [s].
-
-    Raises
-    ------
-    DriveError
-        If the drive does not answer, or stays in its fault.
-    LinkError
-        If the link is lost.
-    """
-    if drive_state(access.read(od.STATUSWORD)) not in FAULTS:
-        return
-    # The rising edge counts.
-    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-    access.write(od.CONTROLWORD, DriveCommand.FAULT_RESET)
-    until = clock() + _FAULT_RESET_WAIT
-    while drive_state(access.read(od.STATUSWORD)) in FAULTS:
-        if clock() > until:
-            code = describe_error(access.read(od.ERROR_CODE))
-            raise DriveError(f"the drive does not leave its fault: {code}")
-    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-
-
-def disarm_watchdog(link: CanLink, settings: DriveSettings) -> None:
-    """Let the drive go without the computer, which takes its leave; raises as `set_up`."""
-    if settings.actuated:
-        ObjectAccess(link, settings.node_id).write(od.CONSUMER_HEARTBEAT, 0)
-
-
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> None:
     """Set the drive's software limits: none while un-homed, for they count from home."""
-    lower, upper = settings.limits_counts if homed else (od.NO_LOWER_LIMIT, od.NO_UPPER_LIMIT)
-    access.write_checked(od.LOWER_LIMIT, lower)
-    access.write_checked(od.UPPER_LIMIT, upper)
+    if homed:
+        _write_limits(access, *settings.limits_counts)
+        return
+    refusals = []
+    for lower, upper in od.NO_LIMITS:
+        try:
+            _write_limits(access, lower, upper)
+        except DriveRefusalError as error:
+            refusals.append(error)
+        else:
+            return
+    raise refusals[0]
 
 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> None:
-    """Set method and speeds of a homing; `speed` in unit/s."""
-    access.write(od.HOMING_METHOD, settings.homing_method)
+    """Set the speeds of a homing; `speed` in unit/s."""
     access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed))
     # Slow on the edge that counts.
     access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0))
     access.write(od.HOMING_ACCELERATION, settings.magnitude(settings.acceleration))
 
 
-def _set_up_motion(access: ObjectAccess, settings: DriveSettings, period: float) -> list[str]:
+def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
+    access.write_checked(od.LOWER_LIMIT, lower, variable=True)
+    access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+
+
+def _set_up_motion(
+    link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
+) -> list[str]:
     modes = access.read(od.SUPPORTED_MODES)
     for bit, name in (
         (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
@@ -171,49 +127,86 @@ def _set_up_motion(access: ObjectAccess, settings: DriveSettings, period: float)
     ):
         if not modes & bit:
             raise DriveError(f"node {settings.node_id} has no {name} mode (0x6502 = 0x{modes:08X})")
-    if drive_state(access.read(od.STATUSWORD)) in POWERED:
-        access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    _switch_off(link, access, settings)
     # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
     access.write_checked(od.QUICK_STOP_OPTION, 6)
     # The node keeps its state: whether it exchanges process data tells a reboot.
-    access.write_optional(od.ERROR_BEHAVIOUR, 1)
+    access.offer(od.ERROR_BEHAVIOUR, 1)
+    _write_homing_method(access, settings.homing_method)
     magnitude = settings.magnitude
     wanted = [
         # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
-        (od.SHUTDOWN_OPTION, 1),
-        (od.DISABLE_OPTION, 1),
-        (od.FAULT_REACTION_OPTION, 2),
-        (od.ABORT_CONNECTION_OPTION, 1),
-        (od.FOLLOWING_WINDOW, magnitude(settings.following_error)),
-        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3)),
-        (od.HOME_OFFSET, 0),
-        (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed)),
-        (od.PROFILE_VELOCITY, magnitude(settings.speed)),
-        (od.PROFILE_ACCELERATION, magnitude(settings.acceleration)),
-        (od.PROFILE_DECELERATION, magnitude(settings.acceleration)),
-        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration)),
-        (od.INTERPOLATION_PERIOD, round(period * 1e3)),
-        (od.INTERPOLATION_EXPONENT, -3),
+        (od.SHUTDOWN_OPTION, 1, _Need.WISH),
+        (od.DISABLE_OPTION, 1, _Need.WISH),
+        (od.FAULT_REACTION_OPTION, 2, _Need.EXACT),
+        (od.ABORT_CONNECTION_OPTION, 1, _Need.EXACT),
+        (od.FOLLOWING_WINDOW, magnitude(settings.following_error), _Need.AT_MOST),
+        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3), _Need.WISH),
+        (od.HOME_OFFSET, 0, _Need.TAKEN),
+        (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
+        (od.PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
+        (od.PROFILE_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.PROFILE_DECELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration), _Need.TAKEN),
+        (od.INTERPOLATION_PERIOD, round(period * 1e3), _Need.TAKEN),
+        (od.INTERPOLATION_EXPONENT, -3, _Need.TAKEN),
     ]
     if settings.max_torque > 0.0:
-        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3)))
-    return [
-        _LEFT_OUT[0].format(entry)
-        for entry, value in wanted
-        if not access.write_optional(entry, value, checked=entry in _CHECKED)
-    ]
+        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.TAKEN))
+    lacking = (_set(access, entry, value, need) for entry, value, need in wanted)
+    return [text for text in lacking if text]
 
 
-def _map(access: ObjectAccess, node: int, pdo: Pdo) -> None:
-    """Set a PDO up in the order that CiA 301 wants: off, type, mapping, on."""
-    cob_id = od.Entry(pdo.communication, 1, od.U32, "COB-ID")
-    transmission = od.Entry(pdo.communication, 2, od.U8, "transmission type")
-    count = od.Entry(pdo.mapping, 0, od.U8, "number of mapped entries")
-    address = pdo.function_code + node
-    access.write(cob_id, od.PDO_OFF | address)
-    access.write(transmission, pdo.transmission)
-    access.write(count, 0)
-    for number, entry in enumerate(pdo.entries, start=1):
-        access.write(od.Entry(pdo.mapping, number, od.U32, "mapped entry"), entry.mapping)
-    access.write(count, len(pdo.entries))
-    access.write(cob_id, address)
+def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
+    """Write an entry as far as it is needed; return what the drive lacks."""
+    try:
+        if need is _Need.EXACT:
+            access.write_checked(entry, value)
+        elif need is _Need.AT_MOST:
+            # More than half: rounded, not clipped.
+            access.write_checked(entry, value, at_least=value // 2 + 1)
+        else:
+            access.write(entry, value)
+    except DriveRefusalError as error:
+        if error.lacking:
+            return _LEFT_OUT.format(entry)
+        if need is not _Need.WISH:
+            raise
+        return _KEPT.format(entry, value)
+    return ""
+
+
+def _switch_off(link: CanLink, access: ObjectAccess, settings: DriveSettings) -> None:
+    """Switch off what another program left on: a powered drive takes no settings."""
+    if drive_state(access.read(od.STATUSWORD)) not in POWERED:
+        return
+    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    until = link.clock() + _SWITCH_OFF_WAIT
+    while drive_state(access.read(od.STATUSWORD)) in POWERED:
+        if link.clock() > until:
+            raise DriveError(f"node {settings.node_id} does not switch off")
+
+
+def _write_homing_method(access: ObjectAccess, method: int) -> None:
+    try:
+        access.write(od.HOMING_METHOD, method)
+    except DriveRefusalError:
+        if method not in HERE:
+            raise
+        # Two numbers for "where it stands": 35 is the older edition's.
+        for other in HERE:
+            if other != method:
+                access.write(od.HOMING_METHOD, other)
+
+
+def _map_status(access: ObjectAccess, node: int) -> list[str]:
+    if access.has(od.DIGITAL_INPUTS):
+        try:
+            map_pdo(access, node, od.STATUS)
+        except DriveRefusalError:
+            # Either they cannot be mapped, or the next attempt tells what else it is.
+            pass
+        else:
+            return []
+    map_pdo(access, node, od.STATUS_WITHOUT_INPUTS)
+    return [_NO_INPUTS]

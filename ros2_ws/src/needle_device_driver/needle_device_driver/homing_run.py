@@ -49,6 +49,7 @@ class HomingRun:
     def update(self, at: Feedback) -> None:
         """Take what the drive says now."""
         attained = bool(at.statusword & HOMING_ATTAINED)
+        ended = attained and bool(at.statusword & TARGET_REACHED)
         if self.step is HomingStep.PREPARING:
             if drive_state(at.statusword) is DriveState.OPERATION_ENABLED and (
                 at.mode == Mode.HOMING
@@ -63,11 +64,12 @@ class HomingRun:
         if at.statusword & HOMING_ERROR:
             self.step = HomingStep.FAILED
             return
-        self._stale = self._stale and attained
+        # Some drives keep the first bit for good; the second goes with each homing's begin.
+        self._stale = self._stale and ended
         if self._stale:
             near = abs(at.position) <= self._tolerance_counts
             done = self._here and near and self._cycles >= _INSTANT
         else:
-            done = attained and bool(at.statusword & TARGET_REACHED)
+            done = ended
         if done:
             self.step = HomingStep.DONE

@@ -2,28 +2,47 @@
 
 from __future__ import annotations
 
+import contextlib
+
 import canopen
 
 from needle_device_driver.can_link import CanLink
-from needle_device_driver.objects import HEARTBEAT, MASTER_NODE_ID, NMT_OPERATIONAL, Entry
+from needle_device_driver.objects import Entry
 
 _NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
+_OTHER_LENGTH = (0x0607_0010, 0x0607_0012, 0x0607_0013)
 
 
 class DriveError(Exception):
     """A drive does not answer, or refuses; the text says what and why."""
 
 
-def send_heartbeat(link: CanLink) -> None:
-    """Tell the drives' watchdogs that the control loop runs; only the loop itself may."""
-    link.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
+class DriveRefusalError(DriveError):
+    """A drive refuses to have an entry read or written.
+
+    Parameters
+    ----------
+    text : str
+        What and why.
+    code : int
+        SDO abort code.
+    """
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+    @property
+    def lacking(self) -> bool:
+        """Whether the drive does not have the entry at all."""
+        return self.code in _NO_SUCH_OBJECT
 
 
 class ObjectAccess:
     """Reads and writes entries of one node; each transfer waits for its answer.
 
-    Before each transfer the computer's heartbeat goes out, so that the watchdog of the other
-    drive does not trip while one is set up.
+    Before each transfer, and while it waits, the computer's heartbeat goes out, so that the
+    watchdog of the other drive does not trip while one is set up.
 
     Parameters
     ----------
@@ -42,68 +61,110 @@ class ObjectAccess:
 
         Raises
         ------
+        DriveRefusalError
+            If the drive does not have it.
         DriveError
-            If the drive does not answer or does not have it.
+            If the drive does not answer.
         LinkError
             If the link is lost.
         """
-        send_heartbeat(self._link)
         try:
-            return entry.unpack(self._link.sdo(self._node_id).upload(entry.index, entry.subindex))
+            data = self._upload(entry)
+            narrower = entry.resized(len(data)) if len(data) < entry.size else None
+            return (narrower or entry).unpack(data)
         except (canopen.SdoAbortedError, canopen.SdoCommunicationError, ValueError) as error:
             raise self._error("read", entry, error) from error
 
-    def write(self, entry: Entry, value: int) -> None:
-        """Write an entry; raises as `read`."""
-        send_heartbeat(self._link)
-        data = entry.pack(value)
+    def write(self, entry: Entry, value: int, *, variable: bool = False) -> None:
+        """Write an entry; raises as `read`.
+
+        A drive in which it is wider or narrower than the standard has it gets it as wide as it has
+        it. A drive that refuses to be given what it has already has not refused, unless the entry
+        is `variable`: it will be given other values later.
+        """
         try:
-            self._link.sdo(self._node_id).download(entry.index, entry.subindex, data)
-        except (canopen.SdoAbortedError, canopen.SdoCommunicationError) as error:
+            self._download(entry, entry.pack(value))
+        except canopen.SdoAbortedError as error:
+            if error.code in _OTHER_LENGTH and self._write_resized(entry, value):
+                return
+            if variable or not self._holds(entry, value):
+                raise self._error(f"write {value} to", entry, error) from error
+        except canopen.SdoCommunicationError as error:
             raise self._error(f"write {value} to", entry, error) from error
 
-    def write_checked(self, entry: Entry, value: int) -> None:
+    def write_checked(
+        self, entry: Entry, value: int, *, at_least: int | None = None, variable: bool = False
+    ) -> None:
         """Write an entry that a safety rule depends on, and read it back; raises as `read`.
+
+        Parameters
+        ----------
+        entry : Entry
+            Where.
+        value : int
+            What it shall be.
+        at_least : int, optional
+            A drive that rounds down may have anything from here to `value`.
+        variable : bool
+            As `write` has it.
 
         Raises
         ------
         DriveError
             Also if the drive has something else then.
         """
-        self.write(entry, value)
+        self.write(entry, value, variable=variable)
         got = self.read(entry)
-        if got != value:
+        if not (value if at_least is None else at_least) <= got <= value:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
-    def write_optional(self, entry: Entry, value: int, *, checked: bool = False) -> bool:
-        """Write an entry that not every drive has; return whether this one does.
-
-        Raises as `write`, or `write_checked` where `checked`: many drives round a ramp.
-        """
-        try:
-            (self.write_checked if checked else self.write)(entry, value)
-        except DriveError as error:
-            if _is_lacking(error):
-                return False
-            raise
-        return True
+    def offer(self, entry: Entry, value: int) -> None:
+        """Write an entry that is good to have; a drive that refuses goes without."""
+        with contextlib.suppress(DriveRefusalError):
+            self.write(entry, value)
 
     def has(self, entry: Entry) -> bool:
         """Return whether the drive has an entry; raises as `read`."""
         try:
             self.read(entry)
-        except DriveError as error:
-            if _is_lacking(error):
+        except DriveRefusalError as error:
+            if error.lacking:
                 return False
             raise
         return True
 
+    def _upload(self, entry: Entry) -> bytes:
+        self._link.beat()
+        return self._link.sdo(self._node_id).upload(entry.index, entry.subindex)
+
+    def _download(self, entry: Entry, data: bytes) -> None:
+        self._link.beat()
+        self._link.sdo(self._node_id).download(entry.index, entry.subindex, data)
+
+    def _write_resized(self, entry: Entry, value: int) -> bool:
+        try:
+            resized = entry.resized(len(self._upload(entry)))
+            if resized is None:
+                return False
+            self._download(resized, resized.pack(value))
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError):
+            return False
+        return True
+
+    def _holds(self, entry: Entry, value: int) -> bool:
+        try:
+            return self.read(entry) == value
+        except DriveError:
+            return False
+
     def _error(self, what: str, entry: Entry, error: Exception) -> DriveError:
-        if isinstance(error, canopen.SdoCommunicationError):
-            return DriveError(f"node {self._node_id} does not answer ({what} {entry})")
-        return DriveError(f"node {self._node_id} refuses to {what} {entry}: {error}")
-
-
-def _is_lacking(error: DriveError) -> bool:
-    cause = error.__cause__
-    return isinstance(cause, canopen.SdoAbortedError) and cause.code in _NO_SUCH_OBJECT
+        if isinstance(error, canopen.SdoAbortedError):
+            return DriveRefusalError(
+                f"node {self._node_id} refuses to {what} {entry}: {error}", error.code
+            )
+        if isinstance(error, ValueError):
+            return DriveError(f"node {self._node_id} sends {error}")
+        why = (
+            "; the adapter refuses what it is told: bitrate, wiring?" if self._link.refused else ""
+        )
+        return DriveError(f"node {self._node_id} does not answer ({what} {entry}){why}")

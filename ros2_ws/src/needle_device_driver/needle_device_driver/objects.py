@@ -32,9 +32,14 @@ class Entry:
         return f"0x{self.index:04X}:{self.subindex} {self.name}"
 
     @property
+    def size(self) -> int:
+        """How many bytes it has."""
+        return struct.calcsize(self.format)
+
+    @property
     def mapping(self) -> int:
         """The entry as a PDO's mapping parameter names it."""
-        return self.index << 16 | self.subindex << 8 | 8 * struct.calcsize(self.format)
+        return self.index << 16 | self.subindex << 8 | 8 * self.size
 
     def pack(self, value: int) -> bytes:
         """Return a value as bytes.
@@ -47,7 +52,7 @@ class Entry:
         try:
             return struct.pack(self.format, value)
         except struct.error:
-            bits = 8 * struct.calcsize(self.format)
+            bits = 8 * self.size
             signed = self.format[-1].islower()
             lower = -(2 ** (bits - 1)) if signed else 0
             upper = 2 ** (bits - signed) - 1
@@ -61,11 +66,18 @@ class Entry:
         ValueError
             If they are shorter.
         """
-        size = struct.calcsize(self.format)
-        if len(data) < size:
-            raise ValueError(f"{self}: {len(data)} bytes, wanted {size}")
-        value: int = struct.unpack(self.format, data[:size])[0]
+        if len(data) < self.size:
+            raise ValueError(f"{self}: {len(data)} bytes, wanted {self.size}")
+        value: int = struct.unpack(self.format, data[: self.size])[0]
         return value
+
+    def resized(self, size: int) -> Entry | None:
+        """Return the same entry `size` bytes wide; None where no number is."""
+        wider = {1: "<b", 2: "<h", 4: "<i"}.get(size)
+        if wider is None:
+            return None
+        signed = self.format[-1].islower()
+        return dataclasses.replace(self, format=wider if signed else wider.upper())
 
 
 U8, U16, U32, I8, I16, I32 = "<B", "<H", "<I", "<b", "<h", "<i"
@@ -113,7 +125,8 @@ NEGATIVE_LIMIT_SWITCH = 1 << 0
 POSITIVE_LIMIT_SWITCH = 1 << 1
 HOME_SWITCH = 1 << 2
 
-NO_LOWER_LIMIT, NO_UPPER_LIMIT = -(2**31), 2**31 - 1
+# Software limits that are none; some drives count in less than the whole range.
+NO_LIMITS = ((-(2**31), 2**31 - 1), (-(2**31) + 1, 2**31 - 1), (-(2**30), 2**30 - 1))
 
 # Addresses of the predefined connection set: function code plus node id.
 NMT = 0x000
@@ -129,9 +142,10 @@ MASTER_NODE_ID = 127
 NMT_START, NMT_PRE_OPERATIONAL = 0x01, 0x80
 NMT_BOOT_UP, NMT_OPERATIONAL = 0x00, 0x05
 
-# Transmission types: at once; at the next SYNC.
-ASYNCHRONOUS, SYNCHRONOUS = 255, 1
-PDO_OFF = 1 << 31
+# Transmission types: at once (by the device's profile, or by its maker's word); at the next SYNC.
+ASYNCHRONOUS, ASYNCHRONOUS_BY_MAKER, SYNCHRONOUS = 255, 254, 1
+# Bits of a PDO's COB-ID: it does not exist; it cannot be asked for by a remote frame.
+PDO_OFF, PDO_NO_REMOTE = 1 << 31, 1 << 30
 
 
 @dataclasses.dataclass(frozen=True)

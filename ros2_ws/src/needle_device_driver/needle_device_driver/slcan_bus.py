@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import time
 
 import serial
-from can import CanOperationError, Message
+from can import CanInitializationError, CanOperationError, Message
 from can.interfaces.slcan import slcanBus
 
 _ENDS = (0x0D, 0x07)
+_LINE_FEED = 0x0A
 _LONGEST_LINE = 64
 
 
 class SlcanBus(slcanBus):
-    """python-can's slcan with three changes.
+    """python-can's slcan with five changes.
 
     The serial port is read in whatever pieces it has; byte by byte, as python-can does, a loaded
     machine falls up to 0.8 s behind. A write neither waits for the last bit to leave the port nor
     long for room, so that an adapter that takes nothing cannot hang the control loop.
-    A line that is no frame is counted, not raised.
+    A line that is no frame is counted, not raised. Adapters that end their lines with CR and LF are
+    understood: to python-can, the LF hides the frame behind it. The port is this program's alone.
 
     Parameters
     ----------
@@ -42,7 +45,32 @@ class SlcanBus(slcanBus):
         self.refused = 0
         self._lines: list[str] = []
         self._channel_open = False
+        self._bitrate = bitrate
         super().__init__(channel, tty_baudrate=tty_baudrate, bitrate=bitrate, sleep_after_open=0)
+
+    def greet(self) -> None:
+        """Tell the adapter the bitrate and to open its channel, whatever it was told before."""
+        self.set_bitrate(self._bitrate)
+
+    def set_bitrate(self, bitrate: int, data_bitrate: int | None = None) -> None:
+        """Set the bitrate and open the channel; an unfinished line of a predecessor ends first.
+
+        Raises
+        ------
+        CanInitializationError
+            If another program has the port: frames of two would tear each other apart.
+        """
+        if not self._lock_port():
+            raise CanInitializationError("another program uses it")
+        self._write("")
+        super().set_bitrate(bitrate, data_bitrate)
+
+    def _lock_port(self) -> bool:
+        try:
+            self.serialPortOrig.exclusive = True
+        except serial.SerialException as error:
+            return error.errno not in (errno.EAGAIN, errno.EACCES)
+        return True
 
     def open(self) -> None:
         """Open the channel, once: adapters refuse the second order that python-can gives."""
@@ -87,6 +115,8 @@ class SlcanBus(slcanBus):
         except (serial.SerialException, OSError, TypeError, ValueError) as error:
             raise CanOperationError(str(error)) from error
         for byte in piece:
+            if byte == _LINE_FEED:
+                continue
             self._buffer.append(byte)
             if byte in _ENDS:
                 self._lines.append(self._buffer.decode("ascii", errors="replace"))

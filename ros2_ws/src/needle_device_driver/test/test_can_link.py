@@ -15,6 +15,8 @@ import pytest
 
 from needle_common.errors import UserError
 from needle_device_driver.can_link import CanLink, LinkError, LinkSettings, open_bus
+from needle_device_driver.object_access import DriveError, ObjectAccess
+from needle_device_driver.objects import DEVICE_TYPE
 
 
 class Adapter:
@@ -90,7 +92,8 @@ def received(link: CanLink, cob_id: int) -> list[bytes]:
 def test_slcan_opens_with_the_bitrate_and_sends_frames(adapter: Adapter, make_link: Make) -> None:
     link = make_link(LinkSettings("slcan", adapter.path, bitrate=1_000_000))
     link.open()
-    assert adapter.read(b"O\r") == b"C\rS8\r\rO\r"
+    # First the end of a line that a killed predecessor may have left.
+    assert adapter.read(b"O\r") == b"\rC\rS8\r\rO\r"
     link.send(0x201, b"\x0f\x00\x08")
     link.send(0x80)
     assert adapter.read(b"t0800\r") == b"t20130F0008\rt0800\r"
@@ -111,6 +114,61 @@ def test_slcan_takes_what_comes_in_any_pieces_and_counts_what_is_no_frame(
     assert frames == [b"\x37\x02", b"\xab\xcd", b""]
     assert link.errors >= 4
     assert not link.lost
+
+
+def test_slcan_lines_may_end_with_a_line_feed_too(adapter: Adapter, make_link: Make) -> None:
+    link = make_link(LinkSettings("slcan", adapter.path))
+    frames = received(link, 0x181)
+    link.open()
+    adapter.say(b"\r\n\r\nt18123702\r\nz\r\n\nt1811aB12F4\r\n")
+    wait_for(link, lambda: len(frames) >= 2)
+    assert frames == [b"\x37\x02", b"\xab"]
+    assert link.errors == 0
+
+
+def test_slcan_that_is_silent_is_told_to_open_again(adapter: Adapter) -> None:
+    # It starts when its port is opened, and hears nothing meanwhile.
+    now = [0.0]
+    link = CanLink(LinkSettings("slcan", adapter.path, bitrate=125_000), lambda: now[0])
+    link.open()
+    hello = b"\rC\rS4\r\rO\r"
+    assert adapter.read(b"O\r") == hello
+    link.open()
+    now[0] = 0.5
+    link.open()
+    assert adapter.read(b"O\r") == hello
+    frames = received(link, 0x181)
+    now[0] = 1.0
+    adapter.say(b"t1810\r")
+    wait_for(link, lambda: len(frames) == 1)
+    link.open()
+    link.send(0x80)
+    # Not once it was heard.
+    assert adapter.read(b"t0800\r") == b"t0800\r"
+    assert link.openings == 1
+    link.close()
+
+
+def test_slcan_port_is_one_programs_alone(adapter: Adapter, make_link: Make) -> None:
+    link = make_link(LinkSettings("slcan", adapter.path))
+    link.open()
+    with pytest.raises(LinkError, match=r"cannot open.*another program uses it"):
+        make_link(LinkSettings("slcan", adapter.path)).open()
+    link.close()
+    make_link(LinkSettings("slcan", adapter.path)).open()
+
+
+def test_slcan_that_refuses_is_named_where_nobody_answers(
+    adapter: Adapter, make_link: Make
+) -> None:
+    link = make_link(LinkSettings("slcan", adapter.path))
+    frames = received(link, 0x181)
+    link.open()
+    adapter.say(b"\r\r\x07\x07t1810\r")
+    wait_for(link, lambda: len(frames) == 1)
+    assert link.refused == 2
+    with pytest.raises(DriveError, match=r"does not answer.*the adapter refuses"):
+        ObjectAccess(link, 1).read(DEVICE_TYPE)
 
 
 def test_slcan_a_flood_of_frames_is_taken_whole(adapter: Adapter, make_link: Make) -> None:

@@ -132,3 +132,14 @@ def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveM
     machine.begin_anew(said(DISABLED))
     assert machine.trouble == ""
     assert machine.goal is Goal.OFF
+
+
+@pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])
+def test_a_drive_that_does_not_listen_to_the_bus_is_told(
+    machine: DriveMachine, statusword: int, told: bool
+) -> None:
+    machine.want(Goal.ON)
+    for _ in range(102):
+        machine.update(said(statusword))
+    assert "is not on after 2 s: SWITCH_ON_DISABLED, mode 8" in machine.trouble
+    assert ("not under the bus's control (bit 9)" in machine.trouble) is told

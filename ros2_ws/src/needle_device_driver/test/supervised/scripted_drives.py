@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import queue
+from collections.abc import Callable
 
 import can
 
@@ -29,7 +30,20 @@ class ScriptedDrive:
             (0x6502, 0): (0x000000A1).to_bytes(4, "little"),
             (0x603F, 0): b"\x00\x00",
         }
+        for number in range(4):
+            # As they come: two are on, the first told at each change; remote frames are not had.
+            off = 0x80000000 * (number > 1)
+            for index, cob_id in ((0x1400, 0x200), (0x1800, 0x40000180)):
+                value = off + cob_id + 0x100 * number + node
+                self.objects[index + number, 1] = value.to_bytes(4, "little")
         self.lacking: set[int] = set()
+        # Of a write: the abort code, or 0; what the drive makes of it.
+        self.refuses: Callable[[int, int, bytes], int] = lambda index, sub, value: 0
+        self.stores: Callable[[int, bytes], bytes] = lambda index, value: value
+        self.ignores_sdo_orders = False
+        # Answers to a SYNC with what it sampled at the one before.
+        self.tells_late = False
+        self.told: list[tuple[int, bytes]] = []
         self.state = "disabled"
         self.mode = 0
         self.inputs = 0
@@ -70,7 +84,8 @@ class ScriptedDrive:
 
     def take(self, cob_id: int, data: bytes) -> None:
         if cob_id == 0x600 + self.node:
-            self.sdo(data)
+            if self.nmt != 0x04:
+                self.sdo(data)
         elif cob_id == 0 and data[1] == self.node:
             self.nmt = {0x01: 0x05, 0x80: 0x7F}[data[0]]
         elif cob_id == 0x77F:
@@ -88,8 +103,13 @@ class ScriptedDrive:
     def sync(self) -> None:
         status = self.statusword.to_bytes(2, "little") + bytes([self.mode])
         status += self.inputs.to_bytes(4, "little")
-        self.say(0x180, status[: self.status_size])
-        self.say(0x280, self.position.to_bytes(4, "little", signed=True))
+        now = [
+            (0x180, status[: self.status_size]),
+            (0x280, self.position.to_bytes(4, "little", signed=True)),
+        ]
+        for function, data in self.told if self.tells_late else now:
+            self.say(function, data)
+        self.told = now
         self.target = self.next_target
         if self.homing_for >= 0:
             self.homing_for += 1
@@ -140,9 +160,14 @@ class ScriptedDrive:
         head = data[1:4]
         if data[0] == 0x80:
             return
+        size = 4 - (data[0] >> 2 & 3)
+        written = data[0] != 0x40
+        code = self.refuses(index, sub, data[4 : 4 + size]) if written else 0
         if index in self.lacking:
-            self.say(0x580, b"\x80" + head + bytes.fromhex("00000206"))
-        elif data[0] == 0x40:
+            code = 0x0602_0000
+        if code:
+            self.say(0x580, b"\x80" + head + code.to_bytes(4, "little"))
+        elif not written:
             live = {
                 (0x6041, 0): self.statusword.to_bytes(2, "little"),
                 (0x6061, 0): bytes([self.mode]),
@@ -156,11 +181,9 @@ class ScriptedDrive:
             first = 0x43 | (4 - len(value)) << 2
             self.say(0x580, bytes([first]) + head + value.ljust(4, b"\x00"))
         else:
-            size = 4 - (data[0] >> 2 & 3)
-            value = data[4 : 4 + size]
-            self.objects[index, sub] = value
-            if index == 0x6040:
-                self.command(int.from_bytes(value, "little"))
+            self.objects[index, sub] = self.stores(index, data[4 : 4 + size])
+            if index == 0x6040 and not (self.ignores_sdo_orders and self.nmt == 0x05):
+                self.command(int.from_bytes(data[4:6], "little"))
             self.say(0x580, b"\x60" + head + bytes(4))
 
 
