@@ -30,10 +30,11 @@ _NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at 
 class _Need(enum.Enum):
     """How much hangs on an entry that a drive need not have; one that it has is set."""
 
-    WISH = enum.auto()  # A drive that refuses keeps its own.
-    TAKEN = enum.auto()
-    # A rule depends on these: what the drive made of them is read back.
-    AT_MOST = enum.auto()
+    # A drive that refuses keeps its own.
+    WISH = enum.auto()
+    # A rule depends on these: what the drive made of them is read back. Rounded is not clipped.
+    ROUNDED = enum.auto()
+    ROUNDED_DOWN = enum.auto()
     EXACT = enum.auto()
 
 
@@ -109,7 +110,6 @@ def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) ->
     access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed))
     # Slow on the edge that counts.
     access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0))
-    access.write(od.HOMING_ACCELERATION, settings.magnitude(settings.acceleration))
 
 
 def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
@@ -140,19 +140,20 @@ def _set_up_motion(
         (od.DISABLE_OPTION, 1, _Need.WISH),
         (od.FAULT_REACTION_OPTION, 2, _Need.EXACT),
         (od.ABORT_CONNECTION_OPTION, 1, _Need.EXACT),
-        (od.FOLLOWING_WINDOW, magnitude(settings.following_error), _Need.AT_MOST),
+        (od.FOLLOWING_WINDOW, magnitude(settings.following_error), _Need.ROUNDED_DOWN),
         (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3), _Need.WISH),
-        (od.HOME_OFFSET, 0, _Need.TAKEN),
+        (od.HOME_OFFSET, 0, _Need.EXACT),
         (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
         (od.PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
         (od.PROFILE_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
         (od.PROFILE_DECELERATION, magnitude(settings.acceleration), _Need.WISH),
-        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration), _Need.TAKEN),
-        (od.INTERPOLATION_PERIOD, round(period * 1e3), _Need.TAKEN),
-        (od.INTERPOLATION_EXPONENT, -3, _Need.TAKEN),
+        (od.HOMING_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration), _Need.ROUNDED),
+        (od.INTERPOLATION_PERIOD, round(period * 1e3), _Need.EXACT),
+        (od.INTERPOLATION_EXPONENT, -3, _Need.EXACT),
     ]
     if settings.max_torque > 0.0:
-        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.TAKEN))
+        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.ROUNDED))
     lacking = (_set(access, entry, value, need) for entry, value, need in wanted)
     return [text for text in lacking if text]
 
@@ -162,8 +163,9 @@ def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
     try:
         if need is _Need.EXACT:
             access.write_checked(entry, value)
-        elif need is _Need.AT_MOST:
-            # More than half: rounded, not clipped.
+        elif need is _Need.ROUNDED:
+            access.write_checked(entry, value, at_least=value // 2 + 1, at_most=2 * value)
+        elif need is _Need.ROUNDED_DOWN:
             access.write_checked(entry, value, at_least=value // 2 + 1)
         else:
             access.write(entry, value)

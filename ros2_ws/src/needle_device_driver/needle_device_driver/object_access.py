@@ -93,7 +93,13 @@ class ObjectAccess:
             raise self._error(f"write {value} to", entry, error) from error
 
     def write_checked(
-        self, entry: Entry, value: int, *, at_least: int | None = None, variable: bool = False
+        self,
+        entry: Entry,
+        value: int,
+        *,
+        at_least: int | None = None,
+        at_most: int | None = None,
+        variable: bool = False,
     ) -> None:
         """Write an entry that a safety rule depends on, and read it back; raises as `read`.
 
@@ -103,8 +109,8 @@ class ObjectAccess:
             Where.
         value : int
             What it shall be.
-        at_least : int, optional
-            A drive that rounds down may have anything from here to `value`.
+        at_least, at_most : int, optional
+            What a drive that rounds may make of it; otherwise nothing else.
         variable : bool
             As `write` has it.
 
@@ -115,7 +121,9 @@ class ObjectAccess:
         """
         self.write(entry, value, variable=variable)
         got = self.read(entry)
-        if not (value if at_least is None else at_least) <= got <= value:
+        lower = value if at_least is None else at_least
+        upper = value if at_most is None else at_most
+        if not lower <= got <= upper:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
     def offer(self, entry: Entry, value: int) -> None:

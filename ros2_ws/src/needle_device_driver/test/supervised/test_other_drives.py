@@ -40,11 +40,12 @@ def sdo_count(bench: DriveBench, request: str) -> int:
 
 
 def test_a_setting_that_a_drive_keeps_for_itself_is_told(drive_bench: DriveBench) -> None:
-    drive_bench.insertion.refuses = refuse(RANGE, 0x605B, 0x607F, 0x1029, 0x1006)
+    drive_bench.insertion.refuses = refuse(RANGE, 0x605B, 0x607F, 0x609A, 0x1029, 0x1006)
     steps(drive_bench)
     assert [text.partition(":")[0] for text in drive_bench.drives.lacking] == [
         "insertion drive keeps its own 0x605B",
         "insertion drive keeps its own 0x607F",
+        "insertion drive keeps its own 0x609A",
     ]
 
 
@@ -91,18 +92,37 @@ def test_an_object_of_another_width_is_written_as_wide_as_it_is(drive_bench: Dri
     assert drive.objects[0x60C2, 1] == b"\x14\x00"
 
 
-@pytest.mark.parametrize(("window", "taken"), [(9984, True), (10_001, False), (4000, False)])
-def test_a_following_window_may_be_rounded_down_but_neither_up_nor_clipped(
-    drive_bench: DriveBench, window: int, taken: bool
+@pytest.mark.parametrize(
+    ("index", "wanted", "has", "taken"),
+    [
+        # Following error: rounded down, never up.
+        (0x6065, 10_000, 9984, True),
+        (0x6065, 10_000, 10_001, False),
+        (0x6065, 10_000, 4000, False),
+        # Quick stop ramp: rounded, but not clipped.
+        (0x6085, 10_000_000, 9_999_488, True),
+        (0x6085, 10_000_000, 10_000_384, True),
+        (0x6085, 10_000_000, 65_535, False),
+        # A home that is elsewhere; set-points that are run through faster than they come.
+        (0x607C, 0, 5, False),
+        (0x60C2, 20, 10, False),
+        # No rule hangs on these.
+        (0x6083, 1_000_000, 65_535, True),
+        (0x609A, 1_000_000, 65_535, True),
+    ],
+)
+def test_what_a_drive_makes_of_a_setting_is_read_back_where_a_rule_needs_it(
+    drive_bench: DriveBench, index: int, wanted: int, has: int, taken: bool
 ) -> None:
-    drive_bench.insertion.stores = lambda index, value: (
-        window.to_bytes(4, "little") if index == 0x6065 else value
+    drive_bench.insertion.stores = lambda at, value: (
+        has.to_bytes(len(value), "little")
+        if at == index and value == wanted.to_bytes(len(value), "little")
+        else value
     )
     reply = drive_bench.supervisor.configure(drive_bench.clock())
     assert reply.success is taken
-    assert taken or f"took 10000 for 0x6065:0 following error window and has {window}" in (
-        reply.message
-    )
+    assert taken or f"took {wanted} for 0x{index:04X}" in reply.message
+    assert taken or reply.message.endswith(f"and has {has}")
 
 
 def test_no_limits_are_as_wide_as_the_drive_counts(drive_bench: DriveBench) -> None:
