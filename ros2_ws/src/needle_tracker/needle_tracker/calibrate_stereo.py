@@ -162,8 +162,8 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
     else:
         lines.append(
-            "size of the squares: not told by these views (a board laid on the surface twice, 10 mm "
-            "or more apart, tells it); tips are wrong by as much as it is"
+            "size of the squares: not told by these views (a board laid on the surface twice, "
+            "10 mm or more apart, tells it); tips are wrong by as much as it is"
         )
     error_mm = 1e3 * result.tip_error_p95
     verdict = "within" if error_mm <= goal_mm else "NOT within"
