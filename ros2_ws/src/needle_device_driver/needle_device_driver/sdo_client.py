@@ -67,15 +67,14 @@ class PatientSdoClient(SdoClient):
         for _ in range(round(_RESPONSE_WAIT / self._period)):
             try:
                 while True:
-                    response = self.responses.get(timeout=self._period)
+                    # Eight bytes; not every drive sends those that it does not need.
+                    response = bytes(self.responses.get(timeout=self._period)).ljust(8, b"\0")
                     if _answers(response, request):
-                        return bytes(response)
+                        return response
             except queue.Empty:
                 self._beat()
         return None
 
 
 def _answers(response: bytes, request: bytes) -> bool:
-    if len(response) != len(request):
-        return False
     return request[0] & 0xE0 not in _INITIATE or response[1:4] == request[1:4]

@@ -76,6 +76,12 @@ def test_a_refusal_has_its_code() -> None:
     assert caught.value.code == 0x0602_0000
 
 
+def test_an_answer_may_leave_out_the_bytes_that_it_does_not_need() -> None:
+    wire = Wire([bytes.fromhex("4b416000") + b"\x37\x02"], [bytes.fromhex("60406000")])
+    assert wire.client.upload(0x6041, 0) == b"\x37\x02"
+    wire.client.download(0x6040, 0, b"\x06\x00")
+
+
 def test_a_number_in_segments_is_put_together() -> None:
     wire = Wire([bytes.fromhex("4102650004000000")], [bytes.fromhex("07a1000000000000")])
     assert wire.client.upload(0x6502, 0) == b"\xa1\x00\x00\x00"
