@@ -60,9 +60,10 @@ class NodeParameters(Generic[P]):
                     node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])])
             except InvalidParameterTypeException as error:
                 given = node._parameter_overrides[name].value
+                whole = isinstance(default, float) and type(given) is int
                 raise UserError(
                     f"{node.get_fully_qualified_name()}: {name} = {given!r} is not of type "
-                    f"{type(default).__name__}" + (" (write 1.0, not 1)" if given == 1 else "")
+                    f"{type(default).__name__}" + (f" (write {given}.0)" if whole else "")
                 ) from error
             except InvalidParameterValueException as error:
                 given = node._parameter_overrides[name].value
