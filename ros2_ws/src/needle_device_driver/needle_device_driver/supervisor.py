@@ -134,6 +134,8 @@ class MotionSupervisor:
             return Reply(False, f"the device is {self._core.state.value}, not UNCONFIGURED")
         error = self._core.order(lambda axis: axis.configure())
         if error:
+            # The other axis may be set up, and would wait for a computer that says no more.
+            self._core.order(lambda axis: axis.close())
             return Reply(False, error)
         self._core.configured = True
         self._core.go(Trigger.CONFIGURE, "configured")

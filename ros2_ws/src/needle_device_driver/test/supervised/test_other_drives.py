@@ -317,6 +317,20 @@ def test_a_homing_method_that_a_drive_lacks_is_known_before_anything_moves(
     assert "refuses to write 17 to 0x6098:0 homing method" in reply.message
 
 
+def test_a_drive_that_is_refused_leaves_the_other_one_without_watchdog(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.insertion.refuses = refuse(RANGE, 0x6098)
+    assert not bench.supervisor.configure(bench.clock()).success
+    assert bench.rotation.nmt == 0x05
+    assert bench.written(2, 0x1016, 1) == bytes(4)
+    # And may be configured once the first is mended.
+    bench.insertion.refuses = refuse(RANGE)
+    assert bench.supervisor.reset(bench.clock()).success
+    steps(bench)
+
+
 def test_where_it_stands_has_two_numbers(drive_bench: DriveBench) -> None:
     drive_bench.rotation.refuses = lambda index, sub, value: (
         RANGE if index == 0x6098 and value != b"\x23" else 0
