@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-import socket
 import threading
 from collections.abc import Callable
 from typing import Any
@@ -17,11 +16,11 @@ from needle_common.errors import UserError
 from needle_device_driver.objects import HEARTBEAT, MASTER_NODE_ID, NMT_OPERATIONAL
 from needle_device_driver.sdo_client import PatientSdoClient
 from needle_device_driver.slcan_bus import SlcanBus
+from needle_device_driver.socketcand_bus import SocketcandBus
 
 LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 _RECEIVE_WAIT = 0.05
 _JOIN_WAIT = 1.0
-_CONNECT_WAIT = 1.0
 # An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
 _SILENCE = 0.4
 _HEARTBEAT_PERIOD = 0.02
@@ -53,7 +52,7 @@ class LinkSettings:
     port : int
         socketcand only.
     write_timeout : float
-        How long a frame may wait for room [s]; slcan only.
+        How long a frame may wait for room [s]; slcan and socketcand only.
     """
 
     kind: str
@@ -104,14 +103,11 @@ def open_bus(settings: LinkSettings) -> can.BusABC:
                 write_timeout=settings.write_timeout,
             )
         if settings.kind == "socketcand":
-            # python-can would try for ten seconds without a pause.
-            socket.create_connection((settings.host, settings.port), _CONNECT_WAIT).close()
-            return can.Bus(
-                interface="socketcand",
-                channel=settings.channel,
+            return SocketcandBus(
+                settings.channel,
                 host=settings.host,
                 port=settings.port,
-                tcp_tune=True,
+                write_timeout=settings.write_timeout,
             )
         return can.Bus(interface=settings.kind, channel=settings.channel)
     except (can.CanError, OSError, ValueError) as error:
@@ -123,7 +119,7 @@ def _plainly(error: Exception) -> str:
     for cause in (error, error.__cause__, error.__context__):
         if isinstance(cause, OSError) and cause.errno is not None:
             return os.strerror(cause.errno)
-    return str(error)
+    return str(error).partition("\n")[0]
 
 
 class _Network(canopen.Network):
@@ -184,7 +180,7 @@ class CanLink:
     def errors(self) -> int:
         """How many error frames, lines that are no frame and refused frames there were."""
         bus = self._bus
-        own = bus.malformed if isinstance(bus, SlcanBus) else 0
+        own = bus.malformed if isinstance(bus, SlcanBus | SocketcandBus) else 0
         return self.error_frames + own + self.refused
 
     @property

@@ -14,6 +14,7 @@ import can
 import pytest
 
 from needle_common.errors import UserError
+from needle_device_driver import socketcand_bus
 from needle_device_driver.can_link import CanLink, LinkError, LinkSettings, open_bus
 from needle_device_driver.object_access import DriveError, ObjectAccess
 from needle_device_driver.objects import DEVICE_TYPE
@@ -270,9 +271,10 @@ def test_virtual_carries_frames_both_ways_and_not_those_of_others(make_link: Mak
 
 
 class Daemon:
-    """A socketcand, as far as python-can's client asks for one."""
+    """A socketcand for one client; what follows its last `ok` comes with it."""
 
-    def __init__(self) -> None:
+    def __init__(self, *says: bytes) -> None:
+        self.says = says or (b"< hi >", b"< ok >", b"< ok >")
         self.server = socket.create_server(("localhost", 0))
         self.port = self.server.getsockname()[1]
         self.got = b""
@@ -281,14 +283,11 @@ class Daemon:
         self.thread.start()
 
     def _serve(self) -> None:
-        # The first connection only asks whether somebody is there.
-        self.server.accept()[0].close()
-        connection, _ = self.server.accept()
-        connection.sendall(b"< hi >")
-        for _ in range(2):
-            connection.recv(100)
-            connection.sendall(b"< ok >")
-        self.connection = connection
+        self.connection, _ = self.server.accept()
+        for number, words in enumerate(self.says):
+            if number:
+                self.got += self.connection.recv(100)
+            self.connection.sendall(words)
 
     def close(self) -> None:
         if self.connection is not None:
@@ -307,13 +306,61 @@ def test_socketcand_carries_frames_and_its_end_is_a_lost_link(make_link: Make) -
     assert daemon.connection.recv(100) == b"< send 201 3 f 0 8 >"
     daemon.connection.sendall(b"< frame 181 12.5 3702 >")
     wait_for(link, lambda: frames == [b"\x37\x02"])
+    assert daemon.got == b"< open can0 >< rawmode >"
     daemon.close()
-    until = time.monotonic() + 5.0
+    # Noticed without a word sent. A closed connection is readable for ever: nobody reads on.
+    wait_for(link, lambda: bool(link.lost))
+    assert link.lost.endswith("the server hung up")
     with pytest.raises(LinkError, match="lost"):
-        while time.monotonic() < until:
-            link.send(0x80)
-    # A closed connection is readable for ever: nobody may go on reading it.
+        link.send(0x80)
     thread = link._thread
     assert thread is not None
     thread.join(5.0)
     assert not thread.is_alive()
+
+
+def test_socketcand_frames_may_come_with_the_answer_in_any_pieces(make_link: Make) -> None:
+    daemon = Daemon(b"< hi >", b"< ok >", b"< ok >< frame 181 1.5 3702 >< frame 18")
+    link = make_link(LinkSettings("socketcand", "can0", host="localhost", port=daemon.port))
+    frames = received(link, 0x181)
+    link.open()
+    daemon.thread.join(5.0)
+    assert daemon.connection is not None
+    daemon.connection.sendall(b"1 1.6  >\xff\xfe>< frame x y z >" + b"?" * 300)
+    daemon.connection.sendall(b">< error 004 1.7 >< frame 181 1.8 ab >")
+    wait_for(link, lambda: len(frames) == 3)
+    assert frames == [b"\x37\x02", b"", b"\xab"]
+    assert link.errors == 4
+    assert not link.lost
+    daemon.close()
+
+
+@pytest.mark.parametrize(
+    ("says", "why"),
+    [
+        ([b""], "got nothing"),
+        ([b"SSH-2.0-OpenSSH_9.2\r\n"], "got nothing"),
+        ([b"< hello >"], "got '< hello >'"),
+        ([b"< hi >", b"< error could not open bus >"], "got '< error could not open bus >'"),
+    ],
+)
+def test_socketcand_that_is_none_is_refused_and_hangs_nobody(
+    make_link: Make, monkeypatch: pytest.MonkeyPatch, says: list[bytes], why: str
+) -> None:
+    monkeypatch.setattr(socketcand_bus, "_ANSWER_WAIT", 0.2)
+    daemon = Daemon(*says)
+    link = make_link(LinkSettings("socketcand", "can0", host="localhost", port=daemon.port))
+    with pytest.raises(LinkError, match="cannot open socketcand") as caught:
+        link.open()
+    assert why in str(caught.value)
+    daemon.close()
+
+
+def test_socketcand_that_takes_nothing_is_lost_and_hangs_nobody(make_link: Make) -> None:
+    daemon = Daemon()
+    link = make_link(LinkSettings("socketcand", "can0", host="localhost", port=daemon.port))
+    link.open()
+    with pytest.raises(LinkError, match="takes nothing"):
+        for _ in range(1_000_000):
+            link.send(0x201, bytes(8))
+    daemon.close()
