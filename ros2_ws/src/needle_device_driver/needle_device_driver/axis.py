@@ -36,7 +36,7 @@ class AxisSnapshot:
         Measured position [m or rad]; only relative while not `homed`.
     set_point : float
         Where it was last told to be, counted like `position`; at rest they differ by what the axis'
-        controller leaves over.
+        controller leaves over. Of an axis that a hand moves: `position`.
     velocity : float
         Measured velocity [m/s or rad/s].
     powered : bool

@@ -201,10 +201,14 @@ class Cia402Axis(Axis):
         """Return the newest reply."""
         machine = self._machine
         fault = self._fault
+        position, told = (
+            self._settings.position(counts - self._zero)
+            for counts in (machine.at.position, machine.target)
+        )
         return AxisSnapshot(
             time=self.monitor.fresh_time,
-            position=self._settings.position(machine.at.position - self._zero),
-            set_point=self._settings.position(machine.target - self._zero),
+            position=position,
+            set_point=told if self.actuated else position,
             velocity=self._velocity,
             powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,

@@ -60,7 +60,7 @@ class CommandContext:
     Attributes
     ----------
     insertion, rotation : float
-        Where the joints are [m], [rad].
+        Where the joints were last told to be, and a motion begins [m], [rad].
     homed : bool
         Whether both axes are homed.
     last_stamp_ns : int or None

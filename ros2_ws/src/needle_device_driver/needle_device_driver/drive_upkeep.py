@@ -99,6 +99,7 @@ def reset_fault(link: CanLink, settings: DriveSettings) -> None:
     until = link.clock() + _FAULT_RESET_WAIT
     while drive_state(access.read(od.STATUSWORD)) in FAULTS:
         if link.clock() > until:
-            code = describe_error(access.read(od.ERROR_CODE))
-            raise DriveError(f"the drive does not leave its fault: {code}")
+            has_code = access.has(od.ERROR_CODE)
+            why = f": {describe_error(access.read(od.ERROR_CODE))}" if has_code else ""
+            raise DriveError(f"the drive does not leave its fault{why}")
     order(DriveCommand.DISABLE_VOLTAGE)

@@ -118,12 +118,9 @@ class MotionRun:
         )
 
     def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
-        # A pushed axis has no set-point. An actuated one goes on from the last: it rests beside it,
-        # and counted from there the first set-point could be too far ahead.
-        start = (
-            at.insertion.position if self._pushed else at.insertion.set_point,
-            at.rotation.set_point,
-        )
+        # From the last set-point: a motor rests beside it, and counted from there the first
+        # set-point could be too far ahead.
+        start = at.insertion.set_point, at.rotation.set_point
         limits, retracts = self._limits, self.activity is Activity.RETRACTION
         shortest = max(
             abs(self._end[0] - start[0])

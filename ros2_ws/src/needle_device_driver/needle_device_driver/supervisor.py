@@ -207,8 +207,8 @@ class MotionSupervisor:
             self._refuse(command, at)
             return
         context = CommandContext(
-            insertion=at.insertion.position,
-            rotation=at.rotation.position,
+            insertion=at.insertion.set_point,
+            rotation=at.rotation.set_point,
             homed=at.homed,
             last_stamp_ns=self._last_stamp_ns,
             tip_age=self._ages.age(command.stamp_ns, now),

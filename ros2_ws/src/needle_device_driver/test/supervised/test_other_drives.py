@@ -291,6 +291,25 @@ def test_a_fault_is_acknowledged_in_the_process_data(drive_bench: DriveBench) ->
     recovers(bench)
 
 
+def test_a_fault_that_stays_in_a_drive_without_error_code_is_told_all_the_same(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.configured()
+    drive = bench.insertion
+    drive.state, drive.deaf_to_reset, drive.lacking = "fault", True, {0x603F}
+    bench.cycle(1)
+    sdo = drive.sdo
+
+    def late(data: bytes) -> None:
+        bench.skipped += 0.05
+        sdo(data)
+
+    drive.sdo = late  # type: ignore[method-assign]
+    reply = bench.supervisor.reset(bench.clock())
+    assert reply.message == "insertion axis: the drive does not leave its fault"
+
+
 def test_a_drive_that_does_not_say_that_it_is_off_keeps_its_watchdog(
     drive_bench: DriveBench,
 ) -> None:

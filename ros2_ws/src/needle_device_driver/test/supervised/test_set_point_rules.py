@@ -11,6 +11,7 @@ from needle_device_driver.states import State
 
 from .checks import failed, in_state, recovers
 from .drive_bench import DriveBench
+from .ideal_axes import Bench
 
 INSERTION, ROTATION = 1, 2
 
@@ -36,9 +37,10 @@ def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it
     bench.ready()
     bench.insertion.left_over = left_over
     bench.cycle(1, holding=True)
-    for _ in range(2):
-        # As fast as may be: what a motor's controller leaves over comes on top.
-        bench.step(0.002, 0.1, 0.4)
+    for number in (1, 2):
+        # As far and as fast as may be, from where the last step was to end.
+        target = Bench.step_command(0.002 * number, 0.1 * number, bench.ros_ns, 0.4)
+        bench.supervisor.submit(target, bench.clock())
         bench.cycle(30, holding=True)
     assert bench.outcomes == ["succeeded", "succeeded"]
     assert bench.supervisor.retract(bench.clock()).success
