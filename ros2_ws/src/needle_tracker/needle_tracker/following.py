@@ -22,7 +22,8 @@ from needle_tracker.track import Anchor
 
 Array = NDArray[np.float64]
 
-PLAIN_PX, PLAIN_ALONG_PX = 0.12, 0.6  # standard deviations of an end beyond doubt [px]
+PLAIN_PX, PLAIN_ALONG_PX = 0.12, 1.0  # standard deviations of an end beyond doubt [px]
+SOUND_PX, SOUND_ALONG_PX = 0.3, 2.0  # of an end that is seen well
 _SIDEWAYS = 0.9e-3  # the strip reaches so far beside the prediction [m] ...
 _ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma) [m]
 _SPREAD = 0.1  # both grow with the way ahead
@@ -169,10 +170,19 @@ def weighed(
         # Two plain views that contradict the prediction: it may be what is wrong.
         if strange[i] and (not tips[1 - i].clear or is_plain(tips[i])):
             return None
-    tips = (_softened(tips[0], left), _softened(tips[1], right))
+    first, second = (
+        tip if is_sound(tip) and not odd else _softened(tip, misfit)
+        for tip, misfit, odd in zip(tips, misfits, strange, strict=True)
+    )
+    tips = (first, second)
     if any(strange):
         return Sights(tips, True)
     return Sights(_one_end(tips, misfits), False)
+
+
+def is_sound(tip: ImageTip) -> bool:
+    """Return whether a view shows the needle's end well."""
+    return tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= SOUND_ALONG_PX
 
 
 def is_plain(tip: ImageTip) -> bool:

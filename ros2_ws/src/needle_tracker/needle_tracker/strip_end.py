@@ -6,7 +6,7 @@ and its extreme point lies half of that beyond the middle of the fall.
 """
 
 # Compiled functions take plain numbers, one by one.
-# ruff: noqa: PLR0912
+# ruff: noqa: PLR0912, PLR0915
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ Array = NDArray[np.float64]
 
 _NEEDLE_MASS = 0.62  # what a shadow on the floor does not have
 _FAINT_DOUBT = 0.4
-_KNEE, _FEIGNED = 0.5, 8.0  # [px^2], of the end's standard deviation
-_MOST_DOUBT = 0.5
 _CLEAR_OF = 0.6
+_TAIL = 0.2  # of the mass: there the tail ends
 _LONGEST_FALL = 12  # [px]
+_GAP = 2  # rows between what is darker and what is brighter than beside it
 # Three rows together blur an end more than the shaft's edges [px^2]; where the blur is wide, what
 # is left of that is that edges close to each other look sharper than they are.
 _ROWS_SQUARE = 1.75
 _END_OVER_EDGE = 1.42
 _SHIFT = 1.1  # of the extreme point, over the taper's share of the fall
-_DOUBT = 0.4
+_DOUBT, _TAIL_DOUBT = 0.4, 0.5
+# A flat end's tail over its fall, and what noise adds to it [px].
+_FLAT_TAIL, _FEIGNED_TAIL = 0.68, 0.4
+_UNKNOWN_EDGE = 1.6  # [px]
 _KNEE, _FEIGNED = 0.5, 8.0  # [px^2], of the end's standard deviation
-_MOST_DOUBT = 0.5
-_CLEAR_OF = 0.6
 _EDGE_ROWS = 24
 _WHOLE = 0.93
 # From the profile of a box under a Gaussian: quarter width of an edge over the full width at half.
@@ -44,7 +45,7 @@ _BLUNT_FROM, _BLUNT, _BLUNTEST = 0.275, 3.2, 0.4
 @compiled
 def find_end(
     mass: Array, behind: int, prior: float, prior_sigma: float
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float, float]:
     """Return where the mass falls to half its level for good.
 
     Every row votes for "needle" or "beyond its end" by how far its mass is from half the level;
@@ -68,9 +69,11 @@ def find_end(
         even beyond the end counts for little.
     fall : float
         Length over which the mass falls from three quarters to one quarter [px]; 0: not known.
+    tail : float
+        How far beyond the end some of the mass goes on [px]; 0: not known.
     """
     rows = len(mass)
-    nothing = (np.nan, 0.0, 0.0, 0.0)
+    nothing = (np.nan, 0.0, 0.0, 0.0, 0.0)
     smooth = np.empty(rows)
     for i in range(rows):
         first, last = max(i - 1, 0), min(i + 1, rows - 1)
@@ -108,7 +111,7 @@ def find_end(
         return nothing
     along = i - behind + (smooth[i] - half) / (smooth[i] - smooth[i + 1])
     quarter = 0.5 * (level - half)
-    inner = outer = 0.0
+    inner = outer = seen_to = 0.0
     for k in range(i, max(i - _LONGEST_FALL, 0), -1):
         if smooth[k] >= half + quarter > smooth[k + 1]:
             inner = k + (smooth[k] - half - quarter) / (smooth[k] - smooth[k + 1])
@@ -117,6 +120,22 @@ def find_end(
         if smooth[k] >= half - quarter > smooth[k + 1]:
             outer = k + (smooth[k] - half + quarter) / (smooth[k] - smooth[k + 1])
             break
+    # What is left of the needle there, a bevel's face, is not what is beyond it.
+    part = np.sort(mass[min(best + 14, rows - 4) : min(best + 23, rows)])
+    rest = part[len(part) // 2]
+    if abs(rest) > abs(beyond):
+        rest = beyond
+    little = _TAIL * (level - rest)
+    gap = 0
+    for k in range(i, min(i + _LONGEST_FALL, rows - 1)):
+        # A face that mirrors a light is brighter than what is beside it.
+        there, beside = abs(smooth[k] - rest), abs(smooth[k + 1] - rest)
+        if there >= little > beside:
+            seen_to = k + (there - little) / (there - beside)
+        gap = 0 if there >= little else gap + 1
+        if gap > _GAP:
+            break
+    tail = max(seen_to - behind - along, 0.0) if seen_to > 0.0 else 0.0
     fall = outer - inner if inner > 0.0 and outer > 0.0 else 0.0
     # Clear of the fall.
     aside = round(_CLEAR_OF * fall)
@@ -127,7 +146,7 @@ def find_end(
         after += mass[min(i + 3 + aside + k, rows - 1)] / level / size
     if abs(beyond) < _NEEDLE_MASS:
         after = max(abs(after - beyond / level), _FAINT_DOUBT * abs(beyond) / level)
-    return along, before, after, fall
+    return along, before, after, fall, tail
 
 
 @compiled
@@ -184,22 +203,32 @@ def edge_fall(darkness: Array, behind: int, end: float, line: float, slope: floa
 
 
 @compiled
-def taper_beyond(fall: float, edge: float, sigma: float) -> tuple[float, float]:
+def taper_beyond(fall: float, tail: float, edge: float, sigma: float) -> tuple[float, float]:
     """Return how far the extreme point lies beyond half the mass, and how uncertain that is [px].
 
     Parameters
     ----------
-    fall, edge : float
-        From `find_end` and `edge_fall`.
+    fall, tail : float
+        From `find_end`.
+    edge : float
+        From `edge_fall`.
     sigma : float
         Standard deviation of an end, from the image's noise [px].
     """
-    if fall <= 0.0 or edge <= 0.0:
-        return 0.0, 0.0
-    flat = max(edge * edge + _ROWS_SQUARE, (_END_OVER_EDGE * edge) ** 2)
-    square = max(fall * fall - flat, 0.0)
-    taper = math.sqrt(square)
+    if fall <= 0.0:
+        return 0.0, _TAIL_DOUBT * tail
+    known = edge if edge > 0.0 else _UNKNOWN_EDGE
+    flat = max(known * known + _ROWS_SQUARE, (_END_OVER_EDGE * known) ** 2)
+    taper = math.sqrt(max(fall * fall - flat, 0.0))
     # What the noise can feign is no taper.
     knee = math.hypot(_KNEE, _FEIGNED * fall * sigma)
-    share = square * square / (square * square + knee * knee)
-    return _SHIFT * taper * share, min(_DOUBT * taper * share, _MOST_DOUBT)
+    share = taper**4 / (taper**4 + knee * knee)
+    beyond, doubt = _SHIFT * taper * share, _DOUBT * taper * share
+    if edge <= 0.0:
+        # A taper, or more blur than was thought.
+        beyond, doubt = 0.5 * beyond, 0.5 * taper * share
+    # A bevel's face may be nearly as dark as the needle or nearly as bright as what is beside it:
+    # the tail then tells of another end than the fall does.
+    reach = tail - _FLAT_TAIL * math.sqrt(flat)
+    apart = max(abs(reach - beyond) - _FEIGNED_TAIL - 2.0 * sigma, 0.0)
+    return beyond, math.hypot(doubt, _TAIL_DOUBT * apart)

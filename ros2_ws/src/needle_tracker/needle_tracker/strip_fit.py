@@ -36,6 +36,10 @@ _AGREE_PX = 0.7  # what agrees with a line [px]
 _VOTE_STEP_PX = 0.3
 _SHIFTS, _TILTS = 9, 8
 _ROWS_ALIKE = 3.0
+# The needle's edges by what is a little darker than the light beside it and what is nearly as dark
+# as the needle [its contrast]; how far their middles may be apart [px], and what more is worth.
+_FOOT, _TOP = (0.15, 0.4), (0.5, 0.8)
+_EVEN_PX, _LOPSIDED, _MOST_LOPSIDED_PX = 0.05, 0.8, 0.25
 
 
 @compiled
@@ -84,18 +88,27 @@ def middle_line(
     last = min(math.floor(end - 2.0) + behind, len(mass) - 1)
     centre = np.empty(max(last - first + 1, 0))
     place = np.empty(len(centre))
+    lean = np.empty(len(centre))
     rows = 0
     for i in range(first, last + 1):
         if not 0.25 < mass[i] < 1.5:
             continue
-        total = moment = 0.0
+        total = moment = foot = foot_moment = top = top_moment = 0.0
         for j in range(reach - near, reach + near + 1):
-            weight = min(max(darkness[i, j] - 0.3 * contrast, 0.0), 0.4 * contrast)
+            dark, across = darkness[i, j] / contrast, (j - reach) * STEP_PX
+            weight = min(max(dark - 0.3, 0.0), 0.4)
             total += weight
-            moment += weight * (j - reach) * STEP_PX
-        if total < 0.3 * contrast:
+            moment += weight * across
+            weight = min(max(dark - _FOOT[0], 0.0), _FOOT[1] - _FOOT[0])
+            foot += weight
+            foot_moment += weight * across
+            weight = min(max(dark - _TOP[0], 0.0), _TOP[1] - _TOP[0])
+            top += weight
+            top_moment += weight * across
+        if total < 0.3:
             continue
         centre[rows] = moment / total
+        lean[rows] = top_moment / top - foot_moment / foot if top > 0.0 < foot else 0.0
         place[rows] = i - behind - end
         rows += 1
     if rows < LEAST_ROWS:
@@ -107,7 +120,7 @@ def middle_line(
     chosen_offset, chosen_slope = vote_line(place[:rows], centre[:rows], length)
     for k in range(rows):
         keep[k] = abs(centre[k] - chosen_offset - chosen_slope * place[k]) < _AGREE_PX
-    offset = slope = 0.0
+    offset = slope = lopsided = 0.0
     inverse: Array = np.zeros((3, 3))
     spread = 0.0
     count = 0
@@ -131,12 +144,13 @@ def middle_line(
         normal[2, 2] += 0.02
         inverse[:] = np.linalg.inv(normal)
         solution = inverse @ right
-        total = 0.0
+        total = lopsided = 0.0
         for k in range(rows):
             x = place[k] / length
             residual[k] = abs(centre[k] - solution[0] - solution[1] * x - solution[2] * x * x)
             if keep[k]:
                 total += residual[k] * residual[k]
+                lopsided += lean[k] / count
         spread = math.sqrt(total / max(count - 3, 1))
         scale = max(1.4826 * np.sort(residual)[rows // 2], 0.03)
         for k in range(rows):
@@ -147,6 +161,11 @@ def middle_line(
     spread *= math.sqrt(_ROWS_ALIKE) * (rows / count) ** 2
     sigma_offset = spread * math.sqrt(inverse[0, 0])
     sigma_slope = spread * math.sqrt(inverse[1, 1]) / length
+    # A needle is as dark on its one side as on the other; with a shadow, a glint or a bubble along
+    # it where its middle is depends on what one takes for its edge.
+    doubt = min(_LOPSIDED * max(abs(lopsided) - _EVEN_PX, 0.0), _MOST_LOPSIDED_PX)
+    sigma_offset = math.hypot(sigma_offset, doubt)
+    sigma_slope = math.hypot(sigma_slope, doubt / length)
     return offset, slope, sigma_offset, sigma_slope, count
 
 
@@ -239,10 +258,10 @@ def fit_strip(
         if level <= 0.0:
             return -2
         mass = row_masses(darkness, width, level)
-        along, before, after, fall = find_end(mass, behind, prior, prior_sigma)
+        along, before, after, fall, tail = find_end(mass, behind, prior, prior_sigma)
         if prior_sigma > 0.0 and not abs(along - prior) <= 3.0 * prior_sigma:
             # No end where it must be: hidden. The line is good for something all the same.
-            along, before, after, fall = prior, 0.0, 1.0, 0.0
+            along, before, after, fall, tail = prior, 0.0, 1.0, 0.0, 0.0
         if not math.isfinite(along):
             return -1
         line, slope, sigma_line, sigma_slope, count = middle_line(
@@ -252,7 +271,7 @@ def fit_strip(
             return -3
         sigma_end = 2.3 * noise * math.sqrt(width + 4.0) / level
         edge = edge_fall(darkness, behind, along, line, slope)
-        beyond, doubt = taper_beyond(fall, edge, sigma_end)
+        beyond, doubt = taper_beyond(fall, tail, edge, sigma_end)
         stop, shift, b = along + beyond, line + slope * beyond, slope
         if abs(along) < 3.0 and abs(line) < 0.5 and abs(slope) < 0.02:
             break

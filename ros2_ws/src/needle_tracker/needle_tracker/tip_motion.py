@@ -20,6 +20,8 @@ _DRIFT = 0.02e-3  # what moves from pair to pair at rest [m]
 _LEAN_SIGMA = 0.12  # between the visible end and the heading (pre-bend) [rad]
 # What spoils a view spoils the next one's too: the gain is not all believed.
 _ALIKE = 1.0
+_NO_SURPRISE = 6.0  # squared, over its covariance
+_APART = 0.25  # variance of what lies between two places, over their squared distance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,12 +78,19 @@ class TipMotion:
 
     def updated(self, tip: SpatialTip) -> TipMotion:
         """Return the state with a measured tip taken in."""
-        gain = self.covariance[:, :3] @ np.linalg.inv(self.covariance[:3, :3] + tip.covariance)
-        change = gain @ (tip.position - self.position)
+        off = tip.position - self.position
+        both = self.covariance[:3, :3] + tip.covariance
+        gain = self.covariance[:, :3] @ np.linalg.inv(both)
+        change = gain @ off
         covariance = self.covariance - gain @ self.covariance[:3, :]
         # K (1 - K): most where prediction and measurement count alike.
         gain = gain[:3]
         covariance[:3, :3] += _ALIKE * (np.eye(3) - gain) @ gain @ covariance[:3, :3]
+        # A surprise says that one of the two is wrong, not which.
+        surprise = float(off @ np.linalg.solve(both, off))
+        if surprise > _NO_SURPRISE:
+            share = _APART * (1.0 - _NO_SURPRISE / surprise)
+            covariance[:3, :3] += share * np.outer(off, off)
         return TipMotion(
             self.position + change[:3],
             self.heading + change[3:],

@@ -12,19 +12,25 @@ import enum
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.gates import GateSettings, refusal
+from needle_tracker.gates import UNCERTAIN, GateSettings, refusal
 from needle_tracker.tip_motion import TipMotion
 from needle_tracker.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
 TOO_FAR = "too far from the last tip"
+SURPRISING = "too far from the prediction"
 _HEADING_TOLERANCE = 0.12  # [rad]
 _HIDDEN_PER_LOST = 4
 _CERTAIN = 0.5e-3  # [m]
+# A needle that both views showed so often lies where it was seen; that is not soon forgotten.
+_ESTABLISHED, _PATIENCE = 10, 5
+_PITCH = 0.5e-3  # of the places that the tip has passed [m]
+# The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
+_BESIDE = 2.0e-3
 _CONFIRM_KNOWN = 2
-_RIVALS_TRACKING = 2
-_NO_SURPRISE = 9.0
+_NO_SURPRISE = 9.0  # squared, over its covariance
+_NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
@@ -80,8 +86,11 @@ class Track:
         self._misses = 0
         self._hidden = 0
         self._rival: Anchor | None = None
-        self._rivals = 0
+        self._next_rival: Anchor | None = None
+        self._rivals = self._next_rivals = 0
         self._agreeing = 0
+        self._sights = 0
+        self._passed: list[tuple[float, Array]] = []
 
     def enter(self) -> None:
         """Note that the needle is in the entry zone, where it cannot be seen."""
@@ -120,14 +129,17 @@ class Track:
         following = predicted is not None and predicted.known and self.state is TrackState.TRACKING
         merged = predicted.motion.merged(tip) if predicted is not None and following else tip
         reason = refusal(merged, insertion, self._settings)
-        if reason is not None or predicted is None:
+        if reason == UNCERTAIN and refusal(tip, insertion, self._settings) is None:
+            # Only the two together are: they contradict each other.
+            merged, reason = tip, SURPRISING
+        if predicted is None or reason not in (None, SURPRISING):
             return reason
         miss = float(np.linalg.norm(merged.position - predicted.motion.position))
         if miss > self.tolerance(predicted):
             return TOO_FAR
         if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
-            return "too far from the prediction"
-        return None
+            return SURPRISING
+        return reason
 
     def accept(
         self,
@@ -136,6 +148,7 @@ class Track:
         *,
         anew: bool = False,
         certain: bool = True,
+        seen: bool = True,
     ) -> SpatialTip | None:
         """Take a tip that passed `judge`.
 
@@ -149,6 +162,8 @@ class Track:
             Whether what was known before was wrong.
         certain : bool
             Whether one such tip is enough to begin with, if the insertion is known.
+        seen : bool
+            Whether both views show the end.
 
         Returns
         -------
@@ -165,19 +180,64 @@ class Track:
                 wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
             confirmed = self._agreeing >= wanted
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
-        self._misses = self._hidden = self._rivals = 0
-        self._rival = None
+        self._misses = self._hidden = self._rivals = self._next_rivals = 0
+        self._rival = self._next_rival = None
+        if anew and (predicted is None or not self._is_on_way(tip, predicted)):
+            self._sights, self._passed = 0, []
+        self._sights += seen
         motion = TipMotion.start(tip)
         if predicted is not None and predicted.known and not anew:
             motion = predicted.motion.updated(tip)
             tip = predicted.motion.merged(tip)
         self.anchor = Anchor(motion, insertion)
+        if insertion is not None:
+            self._passed = [p for p in self._passed if p[0] < insertion - _PITCH]
+            self._passed.append((insertion, motion.position))
         return tip if self.state is TrackState.TRACKING else None
+
+    def _is_on_way(self, tip: SpatialTip, predicted: Anchor) -> bool:
+        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
+        return miss <= max(self.tolerance(predicted), _BESIDE)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was a believed tip."""
+        return self.state in (TrackState.TRACKING, TrackState.LOST)
+
+    @property
+    def is_established(self) -> bool:
+        """Whether the needle was seen well so often that it cannot be elsewhere."""
+        return self.anchor is not None and self._sights >= _ESTABLISHED
 
     @property
     def is_unbroken(self) -> bool:
         """Whether the pair before had a believed tip."""
         return self._misses == 0 and self._hidden == 0
+
+    def way(self, insertion: float | None) -> tuple[Array, Array] | None:
+        """Return where the needle passes, as far as its tip was seen on its way.
+
+        Parameters
+        ----------
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+
+        Returns
+        -------
+        points : ndarray, shape (n, 3)
+            Outwards, the predicted tip last, in `rig` [m].
+        half_widths : ndarray, shape (n,)
+            How far beside them the needle may be [m].
+        """
+        predicted = self.predict(insertion)
+        if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
+            return None
+        assert insertion is not None
+        passed = [position for length, position in self._passed if length < insertion - _PITCH]
+        points = np.array([*passed, predicted.motion.position])
+        half_widths = np.full(len(points), _BESIDE)
+        half_widths[-1] = max(self.tolerance(predicted), _BESIDE)
+        return points, half_widths
 
     def is_certain(self, insertion: float | None) -> bool:
         """Return whether the tip's place is known so well that half a sight of it is enough."""
@@ -187,11 +247,22 @@ class Track:
         variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
         return variance < _CERTAIN**2
 
-    def fits(self, tip: SpatialTip, insertion: float | None) -> bool:
+    def fits(self, tip: SpatialTip, insertion: float | None, *, on_way: bool) -> bool:
         """Return whether a tip is where it must be, by a prediction that is certain."""
         predicted = self.predict(insertion)
-        certain = predicted is not None and self.is_certain(insertion)
-        return certain and predicted is not None and predicted.motion.surprise(tip) < _NO_SURPRISE
+        certain = predicted is not None and (on_way or self.is_certain(insertion))
+        if predicted is None or not certain:
+            return False
+        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
+        return miss < _NEAR and predicted.motion.surprise(tip) < _NO_SURPRISE
+
+    def is_excluded(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Return whether a needle that was seen so well before cannot have got to a tip."""
+        predicted = self.predict(insertion)
+        if predicted is None or not self.is_established:
+            return False
+        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
+        return miss > _FAR and predicted.motion.surprise(tip) > _NO_SURPRISE
 
     def contest(self, tip: SpatialTip, insertion: float | None, wanted: int) -> bool:
         """Note a tip that the track does not bear out; return whether it has won.
@@ -203,7 +274,7 @@ class Track:
         insertion : float or None
             Length of needle in the phantom at the exposure [m].
         wanted : int
-            How many in a row win where the track is lost; more are wanted where it is not.
+            How many in a row win.
 
         Returns
         -------
@@ -217,27 +288,38 @@ class Track:
             motion = rival.motion.advanced(ahead, self._settings.reach.curvature)
             miss = float(np.linalg.norm(tip.position - motion.position))
             agrees = miss <= self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
-        self._rivals = self._rivals + 1 if agrees else 1
-        self._rival = Anchor(TipMotion.start(tip), insertion)
-        if self.state is TrackState.TRACKING:
-            wanted += _RIVALS_TRACKING
-        return self._rivals >= wanted
+        # Of what one pair shows several may agree with the pair before: that is one sight of it.
+        count = self._rivals + 1 if agrees else 1
+        if count > self._next_rivals:
+            self._next_rival = Anchor(TipMotion.start(tip), insertion)
+            self._next_rivals = count
+        return count >= wanted
+
+    def _pass_rival_on(self) -> None:
+        """Keep this pair's rival for the next: rivals win in a row, or not at all."""
+        self._rival, self._rivals = self._next_rival, self._next_rivals
+        self._next_rival, self._next_rivals = None, 0
 
     def miss(self) -> None:
         """Note a pair without a believed tip."""
         settings = self._settings
+        self._pass_rival_on()
         self._misses += 1
         if self.state is TrackState.TRACKING:
             if self._misses >= settings.lost_after:
                 self.state = TrackState.LOST
         elif self.state is not TrackState.LOST:
+            rival = self._rival, self._rivals
             self.reset()
-        if self.state is TrackState.LOST and self._misses >= settings.forget_after:
+            self._rival, self._rivals = rival
+        patience = _PATIENCE if self.is_established else 1
+        if self.state is TrackState.LOST and self._misses >= patience * settings.forget_after:
             self.reset()
 
     def hide(self) -> None:
         """Note a pair that shows the shaft where it should be, but its end in neither view."""
         self._hidden += 1
+        self._pass_rival_on()
         if self._hidden > _HIDDEN_PER_LOST * self._settings.lost_after:
             self.miss()
 

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from needle_tracker.calibration import SIDES, StereoCalibration
+from needle_tracker.corridor import within_corridor
 from needle_tracker.detection import (
     DetectionSettings,
     Image,
@@ -22,27 +23,41 @@ from needle_tracker.detection import (
     find_paths,
     without_shadows,
 )
-from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, Follower, weighed
+from needle_tracker.evidence import (
+    CLEAR_ALONG_PX,
+    CLEAR_PX,
+    NEAR_ALONG_PX,
+    NEAR_PX,
+    UsualContrast,
+    is_sound,
+    sights_against,
+    sights_for,
+)
+from needle_tracker.following import (
+    PLAIN_ALONG_PX,
+    PLAIN_PX,
+    SOUND_ALONG_PX,
+    SOUND_PX,
+    Follower,
+    weighed,
+)
 from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
 from needle_tracker.tip_fit import Expected, ImageTip, fit_tip, hidden
 from needle_tracker.tip_motion import TipMotion
-from needle_tracker.track import TOO_FAR, Track, TrackState
+from needle_tracker.track import SURPRISING, TOO_FAR, Track, TrackState
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip, triangulate
 
 UNCLEAR = "not clear enough to begin with"
 HIDDEN = "the end is hidden in both images"
-_SOUND_PX, _SOUND_ALONG_PX = 0.3, 1.0  # what both ends must keep to begin a track [px]
-_CONTRAST_RATIO = 2.2
-# What is enough to begin with a needle that is so short [m], near where the entry has it.
-_YOUNG, _YOUNG_PX, _YOUNG_ALONG_PX, _YOUNG_SURPRISE = 15e-3, 0.6, 3.0, 9.0
-# So many in a row that agree win against the track, or without one that is good.
-_SOUND_RIVALS, _UNSOUND_RIVALS = 2, 3
+# A needle so short [m] is near where the entry has it, to so much of its covariance.
+_YOUNG, _YOUNG_SURPRISE = 15e-3, 9.0
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
+_ALONE_WAY = 5e-3  # and for so much insertion after both showed the needle well [m]
 # With no end in sight, lines so good tell where the needle is, for so much more insertion [px, m].
 _HIDDEN_LINE_PX, _HIDDEN_WAY = 1.0, 5e-3
 _FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
@@ -80,27 +95,6 @@ class Measurement:
     regions: tuple[Expected | None, Expected | None] = (None, None)
 
 
-def is_sound(
-    found: tuple[ImageTip | None, ImageTip | None], across_px: float, along_px: float
-) -> bool:
-    """Return whether both views show the same needle's end well.
-
-    Parameters
-    ----------
-    found : pair of (ImageTip or None)
-        What the left and the right image show.
-    across_px, along_px : float
-        Largest standard deviations of the end [px].
-    """
-    left, right = found
-    if left is None or right is None or not (left.clear and right.clear):
-        return False
-    contrasts = sorted((left.contrast, right.contrast))
-    return contrasts[1] <= _CONTRAST_RATIO * contrasts[0] and all(
-        tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
-    )
-
-
 class StereoTracker:
     """Tracks the tip through a sequence of stereo pairs.
 
@@ -131,6 +125,8 @@ class StereoTracker:
         self._last: tuple[ImageTip, ImageTip] | None = None
         self._contradicted = 0
         self._clear_at: float | None = None
+        self._sound_at: float | None = None
+        self._usual = UsualContrast()
 
     def warm_up(self) -> None:
         """Compile, or load, all that is compiled: the first pair must not wait for it.
@@ -157,6 +153,8 @@ class StereoTracker:
         self._last = None
         self._contradicted = 0
         self._clear_at = None
+        self._sound_at = None
+        self._usual.forget()
 
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair.
@@ -188,6 +186,7 @@ class StereoTracker:
                 return self.skip(f"{side} image is black")
         if insertion is not None and insertion < self.settings.entry_zone:
             self._last = None
+            self._usual.forget()
             self.track.enter()
             tip = tip_at_entry(
                 insertion,
@@ -205,22 +204,34 @@ class StereoTracker:
                 self.track.miss()
             if self.track.anchor is None:
                 self._last = None
+                self._usual.forget()
             return dataclasses.replace(measured, state=self.track.state)
-        anew = measured.contested is not None
-        beyond_doubt = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
-        believed = self.track.accept(measured.tip, insertion, anew=anew, certain=beyond_doubt)
-        left_tip, right_tip = measured.image_tips
-        if left_tip is not None and right_tip is not None:
-            self._last = (left_tip, right_tip) if anew else self._steadied(left_tip, right_tip)
-            if left_tip.clear or right_tip.clear:
-                self._clear_at = insertion
-        reason = "not confirmed yet" if believed is None else ""
-        return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
+        return self._taken(measured, measured.tip, insertion)
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
         self.track.miss()
         return Measurement(None, self.track.state, reason)
+
+    def _taken(
+        self, measured: Measurement, tip: SpatialTip, insertion: float | None
+    ) -> Measurement:
+        """Take a tip into the track; return it as believed."""
+        anew = measured.contested is not None
+        beyond_doubt = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
+        sound = is_sound(measured.image_tips, SOUND_PX, SOUND_ALONG_PX)
+        seen = is_sound(measured.image_tips, CLEAR_PX, CLEAR_ALONG_PX)
+        believed = self.track.accept(tip, insertion, anew=anew, certain=beyond_doubt, seen=seen)
+        left_tip, right_tip = measured.image_tips
+        if left_tip is not None and right_tip is not None:
+            self._last = (left_tip, right_tip) if anew else self._steadied(left_tip, right_tip)
+            if left_tip.clear or right_tip.clear:
+                self._clear_at = insertion
+            if sound:
+                self._sound_at = insertion
+                self._usual.see((left_tip, right_tip))
+        reason = "not confirmed yet" if believed is None else ""
+        return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
 
     def _steadied(self, left: ImageTip, right: ImageTip) -> tuple[ImageTip, ImageTip]:
         """Return how the needle was seen last: what crosses it must not be taken for it.
@@ -262,7 +273,13 @@ class StereoTracker:
             contradicted = sights is not None and sights.contradicted
             self._contradicted = self._contradicted + 1 if contradicted else 0
             # One view alone bridges what passes; it does not take up a track that has gaps.
-            alone = contradicted and not self.track.is_unbroken
+            # And it does so for a while only after both showed the needle well.
+            far = (
+                self._sound_at is None
+                or insertion is None
+                or abs(insertion - self._sound_at) > _ALONE_WAY
+            )
+            alone = contradicted and (far or not self.track.is_unbroken)
             if sights is None or alone or self._contradicted > _CONTRADICTED:
                 return None
             found = sights.tips
@@ -270,7 +287,8 @@ class StereoTracker:
             measured = Measurement(None, self.track.state, HIDDEN, found)
         else:
             measured = self._judged(found, insertion)
-            if measured.tip is None and measured.reason != UNCERTAIN:
+            sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
+            if measured.tip is None and (sound or measured.reason != UNCERTAIN):
                 return None
         return dataclasses.replace(measured, regions=regions)
 
@@ -282,11 +300,31 @@ class StereoTracker:
         return lines and abs(insertion - self._clear_at) <= _HIDDEN_WAY
 
     def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
-        """Look everywhere that can be reached (with this insertion, where known)."""
+        """Look along the way that the needle has gone, then everywhere that can be reached."""
+        way = self.track.way(insertion)
+        if way is not None:
+            left, right = (
+                within_corridor(grid, view, *way)
+                for grid, view in zip(self.grids, self.views, strict=True)
+            )
+            measured = self._search(images, insertion, (left, right), on_way=True)
+            if measured.tip is not None or self.track.is_established:
+                return measured
+        return self._search(images, insertion, self.grids)
+
+    def _search(
+        self,
+        images: tuple[Image, Image],
+        insertion: float | None,
+        grids: tuple[SearchGrid, SearchGrid],
+        *,
+        on_way: bool = False,
+    ) -> Measurement:
+        """Look for the needle in the grids (as long as this insertion, where known)."""
         state = self.track.state
         paths: list[list[Path]] = []
         for i, side in enumerate(SIDES):
-            paths.append(self._paths(images[i], i, insertion))
+            paths.append(self._paths(images[i], i, grids[i], insertion))
             if not paths[i]:
                 return Measurement(None, state, f"no needle in the {side} image")
         paths = _of_one_polarity(paths)
@@ -310,7 +348,7 @@ class StereoTracker:
             if left is None or right is None or not (left.clear or right.clear):
                 continue
             chosen = (left_path, right_path)
-            measured = self._considered(chosen, (left, right), insertion)
+            measured = self._considered(chosen, (left, right), insertion, on_way=on_way)
             if measured.tip is not None:
                 return measured
             first = first or measured
@@ -322,26 +360,20 @@ class StereoTracker:
         return Measurement(None, state, "views do not meet")
 
     def _considered(
-        self, paths: tuple[Path, Path], found: tuple[ImageTip, ImageTip], insertion: float | None
+        self,
+        paths: tuple[Path, Path],
+        found: tuple[ImageTip, ImageTip],
+        insertion: float | None,
+        *,
+        on_way: bool,
     ) -> Measurement:
         """Judge a pair that was found without a prediction; its whole shaft counts too."""
         measured = self._judged(found, insertion)
         if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
             measured = self._one_sided(found, insertion) or measured
-        sound = is_sound(measured.image_tips, _SOUND_PX, _SOUND_ALONG_PX)
-        fits = measured.tip is not None and self.track.fits(measured.tip, insertion)
-        wanted = 0
-        if measured.reason == TOO_FAR and sound:
-            wanted = _SOUND_RIVALS
-        elif measured.tip is not None and not fits and not sound:
-            begun = self.track.state in (TrackState.TRACKING, TrackState.LOST)
-            if begun or not self._is_young(measured, insertion):
-                if self.track.anchor is None:
-                    return dataclasses.replace(measured, tip=None, reason=UNCLEAR)
-                wanted = _UNSOUND_RIVALS
-        elif measured.tip is not None and not fits and self.track.state is TrackState.LOST:
-            certain = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
-            wanted = 0 if certain else _SOUND_RIVALS
+        wanted = self._sights_wanted(measured, found, insertion, on_way=on_way)
+        if wanted is None:
+            return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
         tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured
@@ -354,6 +386,29 @@ class StereoTracker:
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
         return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
 
+    def _sights_wanted(
+        self,
+        measured: Measurement,
+        found: tuple[ImageTip, ImageTip],
+        insertion: float | None,
+        *,
+        on_way: bool,
+    ) -> int | None:
+        """Return how many such tips in a row must agree, 0 where one will do, None for never."""
+        track, tip = self.track, measured.tip or measured.contested
+        if tip is not None and track.is_excluded(tip, insertion):
+            return None
+        alike = self._usual.is_like(found)
+        if measured.tip is None:
+            refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
+            return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
+        if track.fits(measured.tip, insertion, on_way=False):
+            return 0
+        near = on_way and track.fits(measured.tip, insertion, on_way=True)
+        if self._is_young(measured, insertion) and not track.has_begun:
+            return 0
+        return sights_for(track.state, measured.image_tips, alike=alike, near=near)
+
     def _is_young(self, measured: Measurement, insertion: float | None) -> bool:
         """Return whether a short needle is seen about where the entry has it.
 
@@ -362,15 +417,15 @@ class StereoTracker:
         """
         if insertion is None or insertion > _YOUNG or measured.tip is None:
             return False
-        if not is_sound(measured.image_tips, _YOUNG_PX, _YOUNG_ALONG_PX):
+        if not is_sound(measured.image_tips, NEAR_PX, NEAR_ALONG_PX):
             return False
         reach = self.settings.gates.reach
         entry = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
         return TipMotion.start(entry).surprise(measured.tip) < _YOUNG_SURPRISE
 
-    def _paths(self, image: Image, i: int, insertion: float | None) -> list[Path]:
+    def _paths(self, image: Image, i: int, grid: SearchGrid, insertion: float | None) -> list[Path]:
         """Return what may be the needle in an image, as long as the insertion says."""
-        look, grid = self._detection[i], self.grids[i]
+        look = self._detection[i]
         following = self._last is not None and self.track.state is TrackState.TRACKING
         if self._last is not None and following and look.bright is None:
             look = dataclasses.replace(look, bright=self._last[i].bright)

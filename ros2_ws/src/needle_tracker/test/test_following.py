@@ -111,6 +111,79 @@ def test_the_end_of_a_bevel_is_its_point(length: float) -> None:
     assert abs(tip.point[0] - (point - 0.5)) < 4.0 * tip.sigma_along
 
 
+def drawn_end(
+    length: float, face: float, shade: float, blur: float, seed: int
+) -> tuple[np.ndarray, float]:
+    """Draw a needle 8 times too large, 4.6 px wide, its point at u = 140.
+
+    Parameters
+    ----------
+    length, face : float
+        Of the bevel [px], and how dark its face is beside the shaft, which is 1.
+    shade : float
+        Darkness of a band that lies along the needle's one side.
+    blur, seed
+        In pixels; of the noise.
+
+    Returns
+    -------
+    image : ndarray of uint8
+    end : float
+        Column of the point [px].
+    """
+    fine, point, half = 8, 140.0, 2.3
+
+    def filled(corners: list[list[float]]) -> np.ndarray:
+        drawn = np.zeros((100 * fine, 200 * fine), np.float32)
+        ends = [np.round(np.array(corners) * fine * 16).astype(np.int32)]
+        cv2.fillPoly(drawn, ends, 1.0, shift=4)
+        return np.asarray(drawn)
+
+    shaft = [[30, 50 - half], [point, 50 - half], [point - length, 50 + half], [30, 50 + half]]
+    dark = filled(shaft)
+    begin = point - length
+    dark -= (1.0 - face) * dark * filled([[begin, 40], [160, 40], [160, 60], [begin, 60]])
+    beside = filled([[30, 50 + half], [point, 50 + half], [point, 56], [30, 56]])
+    dark = np.where(beside > 0.0, np.maximum(dark, shade), dark)
+    cover = cv2.GaussianBlur(
+        cv2.resize(dark, (200, 100), interpolation=cv2.INTER_AREA), (0, 0), blur
+    )
+    rng = np.random.default_rng(seed)
+    image = np.clip(np.round(170 - 110 * cover + rng.normal(0, 2, cover.shape)), 0, 255)
+    return image.astype(np.uint8), point - 0.5
+
+
+@pytest.mark.parametrize("face", [-0.8, 0.5, 0.7, 1.0])
+@pytest.mark.parametrize("blur", [0.5, 1.0])
+def test_where_a_bevel_ends_is_as_uncertain_as_its_face_makes_it(face: float, blur: float) -> None:
+    for length in (5.0, 8.0):
+        image, end = drawn_end(length, face, 0.0, blur, 1)
+        expected = Expected(np.array([138.0, 49.5]), np.array([1.0, 0.0]), 90.0, 6, 0.0)
+        tip = fit_expected(image, expected, False, DetectionSettings())
+        assert tip is not None
+        assert abs(tip.point[0] - end) < 4.0 * tip.sigma_along
+    # A flat end is what it was.
+    image, end = drawn_end(0.0, 1.0, 0.0, blur, 1)
+    flat = fit_expected(image, expected, False, DetectionSettings())
+    assert flat is not None
+    assert flat.sigma_along < 0.2
+    assert abs(flat.point[0] - end) < 3.0 * flat.sigma_along
+
+
+@pytest.mark.parametrize("shade", [0.3, 0.45])
+def test_a_shade_along_one_side_makes_the_line_less_certain(shade: float) -> None:
+    expected = Expected(np.array([138.0, 49.5]), np.array([1.0, 0.0]), 90.0, 6, 0.0)
+    image, _ = drawn_end(0.0, 1.0, shade, 0.8, 2)
+    tip = fit_expected(image, expected, False, DetectionSettings())
+    plain, _ = drawn_end(0.0, 1.0, 0.0, 0.8, 2)
+    alone = fit_expected(plain, expected, False, DetectionSettings())
+    assert tip is not None
+    assert alone is not None
+    assert alone.sigma_across < 0.08
+    assert tip.sigma_across > 2.0 * alone.sigma_across
+    assert abs(tip.point[1] - 49.5) < 3.5 * tip.sigma_across
+
+
 def test_two_shafts_without_an_end_go_on_for_a_while_only(
     tracker: StereoTracker,
     draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],

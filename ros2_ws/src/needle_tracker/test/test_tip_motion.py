@@ -56,6 +56,19 @@ def test_a_spoilt_view_moves_the_tip_less_than_a_clear_one() -> None:
     assert moved[1] < 0.1e-3
 
 
+def test_a_surprise_leaves_open_which_of_the_two_is_wrong() -> None:
+    start = measured(np.zeros(3), np.full(3, 2e-5), np.array([0.0, 0.0, 1.0]))
+    motion = TipMotion.start(start).advanced(1e-3, CURVATURE)
+    for off in (0.5e-3, 1e-3, 3e-3):
+        tip = measured(np.array([off, 0.0, 1e-3]), np.full(3, 5e-5), start.direction)
+        merged = motion.merged(tip)
+        for truth in (motion.position, tip.position):
+            error = merged.position - truth
+            assert error @ np.linalg.solve(merged.covariance, error) < 9.0
+    near = measured(np.array([0.05e-3, 0.0, 1e-3]), np.full(3, 5e-5), start.direction)
+    assert motion.merged(near).covariance[0, 0] < 2.0 * 5e-5**2
+
+
 def test_drawn_back_it_goes_back() -> None:
     start = measured(np.array([0.0, 0.0, 0.05]), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
     back = TipMotion.start(start).advanced(-2e-3, CURVATURE)

@@ -1,0 +1,120 @@
+"""How much must be seen before a tip is believed that was found without a prediction.
+
+One good sight in both views is enough where the needle must be; what contradicts the track, or is
+seen less well, has to be seen again, and again in agreement with itself.
+"""
+
+from __future__ import annotations
+
+from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, SOUND_ALONG_PX, SOUND_PX
+from needle_tracker.tip_fit import ImageTip
+from needle_tracker.track import TrackState
+
+Found = tuple[ImageTip | None, ImageTip | None]
+
+# Standard deviations of an end that is seen, across and along [px]: well enough where it must be,
+# and to be asked for again.
+NEAR_PX, NEAR_ALONG_PX = 0.6, 3.0
+CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
+_CONTRAST_RATIO = 2.2  # of the two views
+# So many in a row that agree win against the track, or without one that is good.
+_SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
+_MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
+_MORE_TRACKING = 2  # while the needle is followed
+_CONTRAST_CHANGE = 1.4
+_NEW_SHARE = 0.2
+
+
+def is_sound(found: Found, across_px: float, along_px: float) -> bool:
+    """Return whether both views show the same needle's end well.
+
+    Parameters
+    ----------
+    found : pair of (ImageTip or None)
+        What the left and the right image show.
+    across_px, along_px : float
+        Largest standard deviations of the end [px].
+    """
+    left, right = found
+    if left is None or right is None or not (left.clear and right.clear):
+        return False
+    contrasts = sorted((left.contrast, right.contrast))
+    return contrasts[1] <= _CONTRAST_RATIO * contrasts[0] and all(
+        tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
+    )
+
+
+class UsualContrast:
+    """How much the needle stands out in both views while it is seen well."""
+
+    def __init__(self) -> None:
+        self._levels: tuple[float, float] | None = None
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._levels = None
+
+    def see(self, tips: tuple[ImageTip, ImageTip]) -> None:
+        """Take in what a good sight shows."""
+        now = (tips[0].contrast, tips[1].contrast)
+        before = now if self._levels is None else self._levels
+        self._levels = (
+            before[0] + _NEW_SHARE * (now[0] - before[0]),
+            before[1] + _NEW_SHARE * (now[1] - before[1]),
+        )
+
+    def is_like(self, tips: tuple[ImageTip, ImageTip]) -> bool:
+        """Return whether both needles stand out about as much; what lies over one does more."""
+        return self._levels is None or all(
+            1.0 / _CONTRAST_CHANGE < tip.contrast / level < _CONTRAST_CHANGE
+            for tip, level in zip(tips, self._levels, strict=True)
+        )
+
+
+def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:
+    """Return how many sights in a row win against a track that contradicts them; 0 where none do.
+
+    Parameters
+    ----------
+    state : TrackState
+        The track's.
+    found : pair of (ImageTip or None)
+        What both views show.
+    alike : bool
+        Whether the needle stands out as it did.
+    on_way : bool
+        Whether it lies where its tip has been.
+    """
+    if not is_sound(found, SOUND_PX, SOUND_ALONG_PX):
+        return 0
+    sure = on_way or is_sound(found, PLAIN_PX, PLAIN_ALONG_PX) or state is not TrackState.TRACKING
+    return _SOUND_SIGHTS + (0 if alike else _MORE_UNLIKE) + (0 if sure else _MORE_TRACKING)
+
+
+def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> int | None:
+    """Return how many sights in a row are wanted of a tip that nothing contradicts.
+
+    Parameters
+    ----------
+    state : TrackState
+        The track's.
+    found : pair of (ImageTip or None)
+        What both views show.
+    alike : bool
+        Whether the needle stands out as it did.
+    near : bool
+        Whether it lies on the needle's way, and where it should have got to.
+
+    Returns
+    -------
+    int or None
+        0 where one will do, None where it is not seen well enough for any number.
+    """
+    if near and alike and is_sound(found, NEAR_PX, NEAR_ALONG_PX):
+        return 0
+    more = 0 if alike else _MORE_UNLIKE
+    if is_sound(found, SOUND_PX, SOUND_ALONG_PX):
+        return _SOUND_SIGHTS + more if state is TrackState.LOST else 0
+    if not (near and alike) and not is_sound(found, CLEAR_PX, CLEAR_ALONG_PX):
+        return None
+    return _UNSOUND_SIGHTS + more + (_MORE_TRACKING if state is TrackState.TRACKING else 0)

@@ -1,0 +1,148 @@
+"""How much must be seen of a tip that was found without a prediction, and where it is sought."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from needle_tracker.calibration import StereoCalibration
+from needle_tracker.corridor import within_corridor
+from needle_tracker.evidence import UsualContrast, sights_against, sights_for
+from needle_tracker.refraction import RefractedCamera
+from needle_tracker.search_grid import make_search_grid
+from needle_tracker.tip_fit import ImageTip, hidden
+from needle_tracker.track import Track, TrackState
+from needle_tracker.tracker import StereoTracker
+from needle_tracker.tracker_settings import TrackerSettings
+from needle_tracker.triangulation import SpatialTip
+
+Views = tuple[RefractedCamera, RefractedCamera]
+GOOD = ImageTip(np.zeros(2), np.array([1.0, 0.0]), 0.05, 0.15, 0.005, 100.0)
+POOR = dataclasses.replace(GOOD, sigma_across=0.7)
+AHEAD = np.array([0.0, 0.0, 1.0])
+
+
+def tip(x: float = 0.0, z: float = 0.05, sigma: float = 0.03e-3) -> SpatialTip:
+    covariance = sigma**2 * np.eye(3)
+    return SpatialTip(np.array([x, 0.0, z]), covariance, AHEAD, 1e-4 * np.eye(3), 0.0, 0.0)
+
+
+def established(settings: TrackerSettings) -> Track:
+    """Return a track that both views showed for 20 mm, to an insertion of 60 mm."""
+    track = Track(settings.gates)
+    for z in np.arange(0.040, 0.0601, 0.001):
+        track.accept(tip(z=float(z)), float(z))
+    return track
+
+
+@pytest.mark.parametrize("state", [TrackState.TRACKING, TrackState.LOST])
+def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> None:
+    assert sights_against(state, (GOOD, GOOD), alike=True, on_way=True) > 1
+    assert sights_against(state, (GOOD, GOOD), alike=False, on_way=True) > 2
+    for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (GOOD, None)):
+        assert sights_against(state, found, alike=True, on_way=True) == 0
+
+
+def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
+    lost = TrackState.LOST
+    assert sights_for(lost, (GOOD, GOOD), alike=True, near=True) == 0
+    assert sights_for(lost, (GOOD, GOOD), alike=True, near=False) == 2
+    assert sights_for(lost, (GOOD, GOOD), alike=False, near=True) == 3
+    assert sights_for(lost, (POOR, GOOD), alike=True, near=True) == 3
+    # A line without an end is the shaft's or any other's.
+    assert sights_for(lost, (GOOD, hidden(GOOD)), alike=True, near=False) is None
+
+
+def test_what_lies_over_the_needle_is_not_like_it() -> None:
+    usual = UsualContrast()
+    assert usual.is_like((GOOD, GOOD))
+    usual.see((GOOD, GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, contrast=85.0), GOOD))
+    assert not usual.is_like((dataclasses.replace(GOOD, contrast=160.0), GOOD))
+    for _ in range(30):
+        usual.see((dataclasses.replace(GOOD, contrast=160.0), GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, contrast=160.0), GOOD))
+
+
+def test_what_one_pair_shows_twice_counts_once(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert [track.contest(tip(x=2e-3, z=0.06), 0.061, 2) for _ in range(4)] == [False] * 4
+    track.miss()
+    assert track.contest(tip(x=2e-3, z=0.061), 0.062, 2)
+
+
+def test_rivals_win_in_a_row_or_not_at_all(settings: TrackerSettings) -> None:
+    track = established(settings)
+    track.contest(tip(x=2e-3, z=0.06), 0.061, 2)
+    track.miss()
+    track.miss()
+    assert not track.contest(tip(x=2e-3, z=0.062), 0.063, 2)
+
+
+def test_a_needle_seen_well_cannot_be_elsewhere(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert track.is_established
+    assert track.is_excluded(tip(x=-8e-3, z=0.0605), 0.061)
+    assert not track.is_excluded(tip(x=0.5e-3, z=0.061), 0.061)
+    for _ in range(settings.gates.forget_after + 5):
+        track.miss()
+    assert track.anchor is not None
+    fresh = Track(settings.gates)
+    fresh.accept(tip(), 0.05)
+    assert not fresh.is_excluded(tip(x=-8e-3, z=0.0505), 0.051)
+
+
+def test_a_needle_drawn_back_leaves_its_way(settings: TrackerSettings) -> None:
+    track = established(settings)
+    way = track.way(0.0505)
+    assert way is not None
+    assert way[0][:, 2].max() == pytest.approx(0.0505, abs=1e-4)
+    assert np.all(np.diff(way[0][:, 2]) > 0.0)
+
+
+def test_the_corridor_keeps_the_needle_and_drops_what_is_beside_it(
+    views: Views, settings: TrackerSettings, make_arc: Callable[..., np.ndarray]
+) -> None:
+    path = make_arc(0.09, 7.0, -0.8)
+    way, half_widths = path[30::4], np.full(len(path[30::4]), 2e-3)
+    for view in views:
+        grid = make_search_grid(view, settings.gates.reach, first_distance=2e-3)
+        narrowed = within_corridor(grid, view, way, half_widths)
+        assert np.count_nonzero(narrowed.reachable) < 0.5 * np.count_nonzero(grid.reachable)
+        for offset, kept in ((0.0, True), (1.5e-3, True), (-1.5e-3, True), (5e-3, False)):
+            for point in view.project(way + np.array([0.0, offset, 0.0])):
+                near = np.linalg.norm(narrowed.pixels - point, axis=-1)
+                row, column = np.unravel_index(int(np.argmin(near)), near.shape)
+                assert narrowed.reachable[row, column] == kept
+
+
+def test_found_again_beside_another_line(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    """Both cameras blocked for 12 mm; then a second line, as long and as dark, is there, too."""
+    tracker = StereoTracker(calibration, settings)
+    for insertion in np.arange(0.040, 0.0521, 0.001):
+        pair = draw_pair(make_arc(float(insertion), 4.0, 1.0))
+        assert tracker.process(*pair, float(insertion)).tip is not None
+    dark = np.full_like(pair[0], 30)
+    for insertion in np.arange(0.053, 0.0641, 0.001):
+        assert tracker.process(dark, dark, float(insertion)).tip is None
+    found = []
+    for insertion in (0.065, 0.066, 0.067):
+        needle = make_arc(insertion, 4.0, 1.0)
+        other = make_arc(insertion, 3.0, 2.5, math.radians(-6.0))
+        left, right = (
+            np.minimum(a, b) for a, b in zip(draw_pair(needle), draw_pair(other), strict=True)
+        )
+        measured = tracker.process(left, right, insertion)
+        if measured.tip is not None:
+            found.append(np.linalg.norm(measured.tip.position - needle[-1]))
+    assert len(found) == 3
+    assert max(found) < 0.3e-3
