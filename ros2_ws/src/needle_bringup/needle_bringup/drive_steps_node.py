@@ -165,7 +165,8 @@ class _RandomSteps:
             self._retractions += 1
             self._at = (hand.motors[-1].insertion, self._at[1])
         self._at = (self._at[0] + length, self._at[1] + turn)
-        duration = max(length / _FAST, abs(turn) / 3.0) * rng.uniform(1.0, 1.5) + 1e-6
+        # A count's rounding of where it begins must not make the fastest step too fast.
+        duration = max(length / _FAST, abs(turn) / 3.0) * rng.uniform(1.01, 1.5)
         stamp = hand.command(*self._at, duration)
         while stamp not in hand.results:
             hand.look(0.002)
