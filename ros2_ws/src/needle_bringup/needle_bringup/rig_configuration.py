@@ -61,6 +61,8 @@ OPTIONS = {
 # How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
 # seven processes that start on two cores keep one waiting for a second [s].
 PATIENT_WATCHDOG = 5.0
+# The same in real time: as long as on a rig whose motors turn by themselves it may be [s].
+REAL_TIME_WATCHDOG = 0.5
 
 Parameters = dict[str, dict[str, Any]]
 
@@ -145,9 +147,9 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         "lock_step": options.real_time_factor == 0.0,
         "wait_for_recorder": True,
     }
-    if driver["lock_step"]:
-        # Motors stand still while nobody sends SYNC: a starved machine may take its time.
-        driver["watchdog"] = driver["reply_age_limit"] = PATIENT_WATCHDOG
+    driver["watchdog"] = driver["reply_age_limit"] = (
+        PATIENT_WATCHDOG if driver["lock_step"] else REAL_TIME_WATCHDOG
+    )
     parameters: Parameters = {
         "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
         "sim_rig": sim_rig,
