@@ -32,7 +32,7 @@ from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import RECORDER
+from needle_common.partners_node import RECORDER, full_name
 
 HELP = """\
 operator: stands in for the person who holds the needle's switch, in simulation.
@@ -157,7 +157,7 @@ class OperatorNode(Node):
         if not self._settings.values.wait_for_recorder:
             return []
         names = {
-            f"{namespace.rstrip('/')}/{name}"
+            full_name(namespace, name)
             for name, namespace in self.get_node_names_and_namespaces()
             if not name.startswith("_")
         }

@@ -12,6 +12,8 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.task import Future
 
+from needle_common import partners_node
+
 GIVE_UP_AFTER = 30.0
 # An answer can be lost when the node that gives it does not know the client yet [s].
 ASK_AGAIN = 0.5
@@ -106,7 +108,7 @@ class ParameterSnapshots:
         for name, namespace in self._node.get_node_names_and_namespaces():
             if name.startswith("_"):
                 continue
-            full_name = f"{namespace.rstrip('/')}/{name}"
+            full_name = partners_node.full_name(namespace, name)
             if full_name == self._node.get_fully_qualified_name():
                 self._take_own(full_name)
             elif full_name in self._settled:

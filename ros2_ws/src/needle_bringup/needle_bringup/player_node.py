@@ -35,7 +35,7 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes
+from needle_common.partners_node import AnsweringNodes, full_name
 
 CLOCK: Final = "/clock"
 # How long a rig that is there has to show itself before the first message; how much longer those
@@ -165,7 +165,7 @@ class Player(Node):
     def _listeners(self) -> set[str]:
         """Return the full names of the nodes that subscribe to what is played."""
         return {
-            f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+            full_name(info.node_namespace, info.node_name)
             for sender in self._senders.values()
             for info in self.get_subscriptions_info_by_topic(sender.topic_name)
             if not info.node_name.startswith("_")

@@ -39,29 +39,31 @@ def unrecorded(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
     return [
         f"recorder of {publisher.topic_name}"
         for publisher in publishers
-        if RECORDER not in _listeners(node, publisher)
+        if RECORDER not in _listeners(node, publisher.topic_name)
     ]
 
 
-def unheard(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
-    """Return what `node` publishes and nobody but a recorder listens to, as `subscriber of T`.
+def unheard(node: Node, topics: Iterable[str]) -> list[str]:
+    """Return the topics that nobody listens to but `node` itself or a recorder.
 
     Parameters
     ----------
     node : Node
-        The node that publishes.
-    publishers : iterable of Publisher
-        Its publishers.
+        The node that asks.
+    topics : iterable of str
+        Names as the node would give them; each missing one comes as `subscriber of T`.
     """
-    return [
-        f"subscriber of {publisher.topic_name}"
-        for publisher in publishers
-        if not _listeners(node, publisher) - {RECORDER, _UNKNOWN}
-    ]
+    nobody = {RECORDER, _UNKNOWN, node.get_name()}
+    return [f"subscriber of {topic}" for topic in topics if not _listeners(node, topic) - nobody]
 
 
-def _listeners(node: Node, publisher: Publisher[Any]) -> set[str]:
-    infos = node.get_subscriptions_info_by_topic(publisher.topic_name)
+def full_name(namespace: str, name: str) -> str:
+    """Return a node's fully qualified name."""
+    return f"{namespace.rstrip('/')}/{name}"
+
+
+def _listeners(node: Node, topic: str) -> set[str]:
+    infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     return {info.node_name for info in infos}
 
 
@@ -113,7 +115,7 @@ class AnsweringNodes:
         for subscription in subscriptions:
             infos = self._node.get_publishers_info_by_topic(subscription.topic_name)
             known = {
-                f"{info.node_namespace.rstrip('/')}/{info.node_name}"
+                full_name(info.node_namespace, info.node_name)
                 for info in infos
                 if info.node_name != _UNKNOWN
             } - {self._node.get_fully_qualified_name()}

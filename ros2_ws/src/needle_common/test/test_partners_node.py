@@ -60,16 +60,16 @@ def test_a_recorder_is_nobody_who_acts(graph: Graph) -> None:
     rig = graph.node("rig")
     words = rig.create_publisher(Header, "words", 10)
     recorder = graph.node("recorder")
-    assert unheard(rig, [words]) == ["subscriber of /words"]
+    assert unheard(rig, [words.topic_name]) == ["subscriber of /words"]
     assert unrecorded(rig, [words]) == ["recorder of /words"]
 
     recorder.create_subscription(Header, "words", lambda _: None, 10)
     graph.until(lambda: unrecorded(rig, [words]) == [])
     assert words.get_subscription_count() == 1
-    assert unheard(rig, [words]) == ["subscriber of /words"]
+    assert unheard(rig, [words.topic_name]) == ["subscriber of /words"]
 
     graph.node("controller").create_subscription(Header, "words", lambda _: None, 10)
-    graph.until(lambda: unheard(rig, [words]) == [])
+    graph.until(lambda: unheard(rig, [words.topic_name]) == [])
 
 
 def test_a_source_counts_once_it_has_answered(graph: Graph) -> None:

@@ -147,7 +147,7 @@ class PlaneControllerNode(Node):
         )
         return [
             *self._partners.unaware_sources(self._sources),
-            *unheard(self, [self._commands]),
+            *unheard(self, [self._commands.topic_name]),
             *unrecorded(self, mine),
         ]
 

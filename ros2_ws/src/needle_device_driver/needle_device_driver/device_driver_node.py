@@ -122,7 +122,7 @@ class DeviceDriverNode(LifecycleNode):
         missing = []
         publishers = [self._device.joint_states, self._device.results, self._device.statuses]
         if self._settings.lock_step:
-            missing += unheard(self, publishers)
+            missing += unheard(self, [publisher.topic_name for publisher in publishers])
         if self._settings.wait_for_recorder:
             missing += unrecorded(self, publishers)
             missing += self._partners.unaware_sources(self._sources)

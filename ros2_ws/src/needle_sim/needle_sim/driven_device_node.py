@@ -21,6 +21,7 @@ from needle_common.conversions import (
     values_of,
 )
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.partners_node import unheard
 from needle_sim.bench import SimulatedBench
 from needle_sim.driven_tick import DrivenTick
 
@@ -89,14 +90,7 @@ class DrivenDevice:
         state = self._status.get("state", "")
         missing = [] if state not in ("", "UNCONFIGURED") else ["a configured device_driver"]
         # The controller's ears, which the driver cannot hear without a word of ours.
-        for name in ("joint_states", "device/result", "device/status"):
-            listeners = self._node.get_subscriptions_info_by_topic(
-                self._node.resolve_topic_name(name)
-            )
-            others = {info.node_name for info in listeners} - {self._node.get_name(), "recorder"}
-            if not others:
-                missing.append(f"subscriber of {name}")
-        return missing
+        return missing + unheard(self._node, ("joint_states", "device/result", "device/status"))
 
     def observe(self, _: float) -> None:
         """Do nothing: the driver watches."""

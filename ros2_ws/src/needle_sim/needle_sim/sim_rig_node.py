@@ -305,7 +305,7 @@ class SimRigNode(Node):
             self._controller_status,
             *self._sensors.subscriptions,
         ]
-        missing = unheard(self, publishers)
+        missing = unheard(self, [publisher.topic_name for publisher in publishers])
         missing += [
             f"publisher of {subscription.topic_name}"
             for subscription in subscriptions
