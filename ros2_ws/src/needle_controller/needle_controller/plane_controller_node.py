@@ -134,9 +134,13 @@ class PlaneControllerNode(Node):
         return response
 
     def _missing(self) -> list[str]:
-        """Return who must be there before a message counts, where a recorder is waited for."""
+        """Return who must be there before a message counts: the device, and for a bag everybody.
+
+        A device that is heard may not know yet who commands it; the first step would be lost.
+        """
+        no_device = unheard(self, [self._commands.topic_name])
         if not self._settings.values.wait_for_recorder:
-            return []
+            return no_device
         mine = (
             self._commands,
             self._estimates,
@@ -147,7 +151,7 @@ class PlaneControllerNode(Node):
         )
         return [
             *self._partners.unaware_sources(self._sources),
-            *unheard(self, [self._commands.topic_name]),
+            *no_device,
             *unrecorded(self, mine),
         ]
 

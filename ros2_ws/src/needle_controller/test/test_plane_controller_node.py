@@ -309,6 +309,19 @@ def test_start_says_why_not(bench: Bench) -> None:
     assert (response.success, response.message) == (False, "no device/status has come")
 
 
+def test_a_start_waits_for_a_device_that_listens(bench: Bench) -> None:
+    bench.device()
+    listening = next(
+        subscription
+        for subscription in bench.outside.subscriptions
+        if subscription.topic_name == "/device/joint_trajectory"
+    )
+    bench.outside.destroy_subscription(listening)
+    said = "waiting for subscriber of /device/joint_trajectory"
+    bench.until(lambda: bench.call("start").message == said)
+    assert bench.status["state"] == "IDLE"
+
+
 def test_a_recorded_start_waits_for_the_tips_sources_too(context: Context) -> None:
     bench = Bench(
         context, target_offset=0.003, wait_for_recorder=True, tip_covariance="from_tip_pose"
