@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.measurement import Measurement
 from needle_tracker.tip_fit import Expected, ImageTip
-from needle_tracker.tracker import Measurement
 
 Image = NDArray[np.uint8]
 

@@ -16,12 +16,12 @@ Found = tuple[ImageTip | None, ImageTip | None]
 # and to be asked for again.
 NEAR_PX, NEAR_ALONG_PX = 0.6, 3.0
 CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
-_CONTRAST_RATIO = 2.2  # of the two views
+_VISIBILITY_RATIO = 1.8  # of the two views
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
-_CONTRAST_CHANGE = 1.4
+_VISIBILITY_CHANGE = 1.4
 _NEW_SHARE = 0.2
 
 
@@ -38,13 +38,29 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
     left, right = found
     if left is None or right is None or not (left.clear and right.clear):
         return False
-    contrasts = sorted((left.contrast, right.contrast))
-    return contrasts[1] <= _CONTRAST_RATIO * contrasts[0] and all(
+    return _look_alike(left, right) and all(
         tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
     )
 
 
-class UsualContrast:
+def is_half_sound(found: Found) -> bool:
+    """Return whether one view shows the needle's end well, and the other at least its line."""
+    left, right = found
+    if left is None or right is None or not _look_alike(left, right):
+        return False
+    lines = max(left.sigma_across, right.sigma_across) <= NEAR_PX
+    return lines and any(
+        tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= SOUND_ALONG_PX
+        for tip in (left, right)
+    )
+
+
+def _look_alike(left: ImageTip, right: ImageTip) -> bool:
+    fainter, plainer = sorted((left.visibility, right.visibility))
+    return plainer <= _VISIBILITY_RATIO * fainter
+
+
+class UsualVisibility:
     """How much the needle stands out in both views while it is seen well."""
 
     def __init__(self) -> None:
@@ -56,7 +72,7 @@ class UsualContrast:
 
     def see(self, tips: tuple[ImageTip, ImageTip]) -> None:
         """Take in what a good sight shows."""
-        now = (tips[0].contrast, tips[1].contrast)
+        now = (tips[0].visibility, tips[1].visibility)
         before = now if self._levels is None else self._levels
         self._levels = (
             before[0] + _NEW_SHARE * (now[0] - before[0]),
@@ -65,10 +81,13 @@ class UsualContrast:
 
     def is_like(self, tips: tuple[ImageTip, ImageTip]) -> bool:
         """Return whether both needles stand out about as much; what lies over one does more."""
-        return self._levels is None or all(
-            1.0 / _CONTRAST_CHANGE < tip.contrast / level < _CONTRAST_CHANGE
-            for tip, level in zip(tips, self._levels, strict=True)
-        )
+        return self.is_like_in(0, tips[0]) and self.is_like_in(1, tips[1])
+
+    def is_like_in(self, i: int, tip: ImageTip) -> bool:
+        """Return whether the needle stands out about as much in the left (0) or right (1) view."""
+        if self._levels is None:
+            return True
+        return 1.0 / _VISIBILITY_CHANGE < tip.visibility / self._levels[i] < _VISIBILITY_CHANGE
 
 
 def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:

@@ -29,7 +29,7 @@ _ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma)
 _SPREAD = 0.1  # both grow with the way ahead
 _FOLLOW_DIRECTLY = 6e-3  # up to here the prediction is as good as the strip is wide [m]
 _ODD, _STRANGE = 2.0, 4.0  # standard deviations
-_SLACK = 0.05e-3  # of the stage and the needle, along it [m]
+SLACK = 0.05e-3  # of the stage and the needle, along it [m]
 _LOOSE_ANGLE = 0.1  # [rad]
 
 
@@ -46,6 +46,11 @@ class Follower:
         Its diameter [m].
     hole_clearance : float
         Radius around the entry that is not looked at [m].
+
+    Attributes
+    ----------
+    views : pair of RefractedCamera
+        As given.
     """
 
     def __init__(
@@ -55,7 +60,7 @@ class Follower:
         needle_width: float,
         hole_clearance: float,
     ) -> None:
-        self._views = views
+        self.views = views
         self._detection = detection
         self._scales = tuple(look.needle_width_px / needle_width for look in detection)
         self._entries = tuple(view.project(np.zeros(3)) for view in views)
@@ -75,34 +80,72 @@ class Follower:
         last : pair of ImageTip
             How it was seen last.
         """
+        left, right = (self.look_in(i, images[i], predicted, last[i]) for i in range(2))
+        if left is None or right is None:
+            return None
+        return (left[0], right[0]), (left[1], right[1])
+
+    def look_in(
+        self, i: int, image: Image, predicted: Anchor, last: ImageTip
+    ) -> tuple[ImageTip, Expected] | None:
+        """Return one view's end and where it was looked for; None where there is none.
+
+        Parameters
+        ----------
+        i : int
+            0: left, 1: right.
+        image : ndarray of uint8
+            Of that camera.
+        predicted : Anchor
+            Where the tip must be now.
+        last : ImageTip
+            How that camera saw it last.
+        """
         loose = _SPREAD * abs(predicted.ahead)
-        tips: list[ImageTip] = []
-        regions: list[Expected] = []
-        for i in range(2):
-            point = np.empty(2)
-            project_point(self._views[i].packed, predicted.motion.position, point)
-            scale = self._scales[i]
-            if not math.isfinite(point[0]):
-                return None
-            expected = Expected(
-                point,
-                last[i].direction,
-                math.dist(point, self._entries[i]) - self._hole_clearance * scale,
-                round(min(max((_SIDEWAYS + loose) * scale, 6.0), 20.0)),
-                (_ALONG + loose) * scale if predicted.known else 0.0,
-                last[i].contrast,
-            )
-            tip = None
-            if predicted.known and abs(predicted.ahead) < _FOLLOW_DIRECTLY:
-                on_line = dataclasses.replace(expected, search=0)
-                tip = fit_expected(images[i], on_line, last[i].bright, self._detection[i])
-            if tip is None:
-                tip = fit_expected(images[i], expected, last[i].bright, self._detection[i])
-            if tip is None:
-                return None
-            tips.append(tip)
-            regions.append(expected)
-        return (tips[0], tips[1]), (regions[0], regions[1])
+        point = np.empty(2)
+        project_point(self.views[i].packed, predicted.motion.position, point)
+        scale = self._scales[i]
+        if not math.isfinite(point[0]):
+            return None
+        expected = Expected(
+            point,
+            last.direction,
+            math.dist(point, self._entries[i]) - self._hole_clearance * scale,
+            round(min(max((_SIDEWAYS + loose) * scale, 6.0), 20.0)),
+            (_ALONG + loose) * scale if predicted.known else 0.0,
+            last.contrast,
+        )
+        tip = None
+        if predicted.known and abs(predicted.ahead) < _FOLLOW_DIRECTLY:
+            on_line = dataclasses.replace(expected, search=0)
+            tip = fit_expected(image, on_line, last.bright, self._detection[i])
+        if tip is None:
+            tip = fit_expected(image, expected, last.bright, self._detection[i])
+        return None if tip is None else (tip, expected)
+
+
+class HiddenEnds:
+    """Lets a view that does not show the end count once, not pair by pair.
+
+    What hides the end in one pair hides it in the next, and draws the line aside as far.
+    """
+
+    def __init__(self) -> None:
+        self._pairs = [0, 0]
+
+    def forget(self) -> None:
+        """Begin anew."""
+        self._pairs = [0, 0]
+
+    def see(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
+        """Return the tips, with a line across as uncertain as pairs in a row hid its end."""
+        for i, tip in enumerate(tips):
+            self._pairs[i] = 0 if tip.clear else self._pairs[i] + 1
+        left, right = (
+            dataclasses.replace(tip, sigma_across=max(pairs, 1) * tip.sigma_across)
+            for tip, pairs in zip(tips, self._pairs, strict=True)
+        )
+        return left, right
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +165,7 @@ class Sights:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Misfit:
+class Misfit:
     """How far a view's tip is from the prediction.
 
     Attributes
@@ -161,7 +204,7 @@ def weighed(
     Sights or None
         None where neither view bears the prediction out.
     """
-    left, right = (_misfit(view, tip, predicted) for view, tip in zip(views, tips, strict=True))
+    left, right = (misfit(view, tip, predicted) for view, tip in zip(views, tips, strict=True))
     misfits = (left, right)
     strange = [abs(m.across) > _STRANGE * m.sigma_across for m in misfits]
     if all(strange):
@@ -190,7 +233,7 @@ def is_plain(tip: ImageTip) -> bool:
     return tip.clear and tip.sigma_across <= PLAIN_PX and tip.sigma_along <= PLAIN_ALONG_PX
 
 
-def _softened(tip: ImageTip, misfit: _Misfit) -> ImageTip:
+def _softened(tip: ImageTip, misfit: Misfit) -> ImageTip:
     """Return a tip that counts across the shaft as much as its distance allows (Huber's weight)."""
     distance = abs(misfit.across)
     if distance <= _ODD * misfit.sigma_across:
@@ -205,22 +248,23 @@ def _softened(tip: ImageTip, misfit: _Misfit) -> ImageTip:
 
 
 def _one_end(
-    tips: tuple[ImageTip, ImageTip], misfits: tuple[_Misfit, _Misfit]
+    tips: tuple[ImageTip, ImageTip], misfits: tuple[Misfit, Misfit]
 ) -> tuple[ImageTip, ImageTip]:
     """Return the tips; of two ends that are apart, only the one that the prediction bears out."""
     left, right = misfits
-    apart = math.hypot(left.sigma_along, right.sigma_along, _SLACK)
+    apart = math.hypot(left.sigma_along, right.sigma_along, SLACK)
     both = tips[0].clear and tips[1].clear
     if not both or abs(left.along - right.along) <= _STRANGE * apart:
         return tips
     nearer = min(misfits, key=lambda misfit: abs(misfit.along))
-    allowed = math.hypot(nearer.sigma_along, nearer.sigma_predicted, _SLACK)
+    allowed = math.hypot(nearer.sigma_along, nearer.sigma_predicted, SLACK)
     if abs(nearer.along) > _STRANGE * allowed:
         return tips
     return (tips[0], hidden(tips[1])) if nearer is left else (hidden(tips[0]), tips[1])
 
 
-def _misfit(view: RefractedCamera, tip: ImageTip, predicted: TipMotion) -> _Misfit:
+def misfit(view: RefractedCamera, tip: ImageTip, predicted: TipMotion) -> Misfit:
+    """Return how far one view's tip is from the prediction."""
     pixel, jacobian = np.empty(2), np.empty((2, 3))
     project_point(view.packed, predicted.position, pixel)
     point_jacobian(view.packed, predicted.position, jacobian)
@@ -232,7 +276,7 @@ def _misfit(view: RefractedCamera, tip: ImageTip, predicted: TipMotion) -> _Misf
     sigma = math.sqrt(float(row @ covariance @ row) + tip.sigma_across**2)
     scale = float(along @ jacobian @ predicted.heading)
     heading = predicted.heading
-    return _Misfit(
+    return Misfit(
         float(across @ off),
         sigma,
         float(along @ off) / scale,

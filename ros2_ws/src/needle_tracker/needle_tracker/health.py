@@ -8,9 +8,9 @@ from typing import Any
 
 from needle_common.diagnostics import Diagnostic, Level
 from needle_tracker.insertion_history import InsertionHistory
+from needle_tracker.measurement import Measurement
 from needle_tracker.pairing import OTHER_SIDE, PairMatcher
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import Measurement
 
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]

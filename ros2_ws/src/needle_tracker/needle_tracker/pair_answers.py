@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.insertion_history import InsertionHistory
+from needle_tracker.measurement import Measurement
 from needle_tracker.pairing import Pair, PairMatcher
 from needle_tracker.pre_bend import heading_of
-from needle_tracker.tracker import Measurement, StereoTracker
+from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 

@@ -207,7 +207,7 @@ def fine_strip(
     ahead: int,
     width: float,
     sign: float,
-) -> tuple[Array, float]:
+) -> tuple[Array, float, float]:
     """Return the needle's darkness in a fine strip about its line.
 
     Returns
@@ -216,6 +216,8 @@ def fine_strip(
         Columns are `STEP_PX` apart, about the middle [grey levels].
     noise : float
         Of a pixel [grey levels].
+    light : float
+        How bright it is beside the needle [grey levels].
     """
     rows = behind + ahead + 1
     reach = math.ceil(2.2 * width / STEP_PX)
@@ -272,7 +274,8 @@ def fine_strip(
             share = min(max((across + 1.7 * width) / (3.4 * width), 0.0), 1.0)
             light = (1.0 - share) * smooth[i, 0] + share * smooth[i, 1]
             darkness[i, j] = light - darkness[i, j]
-    return darkness, max(noise, _NOISE_FLOOR)
+    light = sign * float(smooth[: behind + 1].mean())
+    return darkness, max(noise, _NOISE_FLOOR), light
 
 
 @compiled

@@ -25,6 +25,7 @@ from needle_tracker.strip import (
     row_masses,
     straight_line,
 )
+from needle_tracker.strip_edges import edges_middle
 from needle_tracker.strip_end import edge_fall, find_end, taper_beyond
 
 Array = NDArray[np.float64]
@@ -34,6 +35,7 @@ _BEHIND_WIDTHS = 12.2
 _AHEAD_WIDTHS = 6.5
 _AGREE_PX = 0.7  # what agrees with a line [px]
 _VOTE_STEP_PX = 0.3
+_EDGES_APART_PX = 0.25  # from the centroid: something disturbs that
 _SHIFTS, _TILTS = 9, 8
 _ROWS_ALIKE = 3.0
 # The needle's edges by what is a little darker than the light beside it and what is nearly as dark
@@ -66,9 +68,10 @@ def vote_line(place: Array, centre: Array, length: float) -> tuple[float, float]
 def middle_line(
     darkness: Array, mass: Array, behind: int, width: float, end: float, level: float
 ) -> tuple[float, float, float, float, int]:
-    """Fit a parabola to the centroids near the end, robustly.
+    """Fit a parabola to the middles of the rows near the end, robustly.
 
-    Only what is about as dark as the needle has weight, and no pixel more than another: neither a
+    A row's middle is its centroid, or that of its edges where the two differ. In the centroid only
+    what is about as dark as the needle has weight, and no pixel more than another: neither a
     shadow beside the needle nor the light on its middle draws the centroid aside.
 
     Returns
@@ -89,6 +92,7 @@ def middle_line(
     centre = np.empty(max(last - first + 1, 0))
     place = np.empty(len(centre))
     lean = np.empty(len(centre))
+    steep = np.empty(columns)
     rows = 0
     for i in range(first, last + 1):
         if not 0.25 < mass[i] < 1.5:
@@ -108,6 +112,10 @@ def middle_line(
         if total < 0.3:
             continue
         centre[rows] = moment / total
+        # Both agree on a needle that nothing disturbs; the centroid has less noise.
+        edges = edges_middle(darkness, i, last, width, contrast, steep)
+        if abs(edges - centre[rows]) > _EDGES_APART_PX:
+            centre[rows] = edges
         lean[rows] = top_moment / top - foot_moment / foot if top > 0.0 < foot else 0.0
         place[rows] = i - behind - end
         rows += 1
@@ -203,8 +211,8 @@ def fit_strip(
         The needle's contrast so far [grey levels]; 0: not known.
     result : ndarray, shape (12,)
         Takes end u, v; direction u, v; sigma across, along, of the angle; contrast; mass before
-        and after the end over the level; end along the shaft from the expected one; rows in the
-        line fit.
+        and after the end over the level; end along the shaft from the expected one; how bright it
+        is beside the needle.
 
     Returns
     -------
@@ -237,7 +245,7 @@ def fit_strip(
         shift = a + b * stop
     prior = 0.0
     along = line = slope = sigma_line = sigma_slope = level = noise = before = after = fall = 0.0
-    doubt = sigma_end = 0.0
+    doubt = sigma_end = light = 0.0
     count = 0
     for _ in range(3):
         scale = math.sqrt(1.0 + b * b)
@@ -252,7 +260,7 @@ def fit_strip(
         if behind < 14:
             return 0
         prior = (point[0] - end[0]) * direction[0] + (point[1] - end[1]) * direction[1]
-        darkness, noise = fine_strip(image, end, direction, behind, ahead, width, sign)
+        darkness, noise, light = fine_strip(image, end, direction, behind, ahead, width, sign)
         expected = prior if prior_sigma > 0.0 else 0.0
         level = needle_level(darkness, behind, width, noise, expected, hint * width)
         if level <= 0.0:
@@ -287,5 +295,5 @@ def fit_strip(
     result[8] = before
     result[9] = after
     result[10] = stop - prior
-    result[11] = count
+    result[11] = light
     return 1

@@ -43,6 +43,8 @@ class ImageTip:
         Standard deviation of the direction [rad].
     contrast : float
         Needle against its surroundings [grey levels].
+    visibility : float
+        The same over the brighter of the two: as much in good light as in bad.
     clear : bool
         Whether the end itself is seen; otherwise only the shaft is.
     bright : bool
@@ -55,6 +57,7 @@ class ImageTip:
     sigma_along: float
     sigma_angle: float
     contrast: float
+    visibility: float
     clear: bool = True
     bright: bool = False
 
@@ -159,7 +162,7 @@ def fit_expected(
     )
     if found != 1 or result[7] < settings.min_contrast:
         return None
-    u, v, d_u, d_v, across, along, angle, contrast, before, after, far, _ = result.tolist()
+    u, v, d_u, d_v, across, along, angle, contrast, before, after, far, light = result.tolist()
     clear = _CLEAR_BEFORE[0] < before < _CLEAR_BEFORE[1] and abs(after) < _CLEAR_AFTER
     if expected.sigma_along > 0.0 and abs(far) > 3.0 * expected.sigma_along:
         clear = False
@@ -177,6 +180,7 @@ def fit_expected(
         sigma_along=math.hypot(along, _END_SYSTEMATIC_PX, doubt) if clear else _HIDDEN_END_PX,
         sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC_PX / line_px),
         contrast=contrast,
+        visibility=contrast / max(light + contrast if bright else light, 1.0),
         clear=clear,
         bright=bright,
     )

@@ -78,21 +78,32 @@ class TipMotion:
 
     def updated(self, tip: SpatialTip) -> TipMotion:
         """Return the state with a measured tip taken in."""
-        off = tip.position - self.position
-        both = self.covariance[:3, :3] + tip.covariance
-        gain = self.covariance[:, :3] @ np.linalg.inv(both)
+        return self.taken_in(tip.position - self.position, np.eye(3), tip.covariance)
+
+    def taken_in(self, off: Array, slope: Array, covariance: Array) -> TipMotion:
+        """Return the state with a measurement that depends on the position taken in.
+
+        Parameters
+        ----------
+        off : ndarray, shape (n,)
+            Measured less expected.
+        slope : ndarray, shape (n, 3)
+            Of the measurement over the position.
+        covariance : ndarray, shape (n, n)
+            Of the measurement.
+        """
+        both = slope @ self.covariance[:3, :3] @ slope.T + covariance
+        gain = self.covariance[:, :3] @ slope.T @ np.linalg.inv(both)
         change = gain @ off
-        covariance = self.covariance - gain @ self.covariance[:3, :]
+        left = self.covariance - gain @ slope @ self.covariance[:3, :]
         # K (1 - K): most where prediction and measurement count alike.
-        gain = gain[:3]
-        covariance[:3, :3] += _ALIKE * (np.eye(3) - gain) @ gain @ covariance[:3, :3]
+        share = gain[:3] @ slope
+        left[:3, :3] += _ALIKE * (np.eye(3) - share) @ share @ left[:3, :3]
         # A surprise says that one of the two is wrong, not which.
         surprise = float(off @ np.linalg.solve(both, off))
         if surprise > _NO_SURPRISE:
-            share = _APART * (1.0 - _NO_SURPRISE / surprise)
-            covariance[:3, :3] += share * np.outer(off, off)
+            apart = np.linalg.pinv(slope) @ off
+            left[:3, :3] += _APART * (1.0 - _NO_SURPRISE / surprise) * np.outer(apart, apart)
         return TipMotion(
-            self.position + change[:3],
-            self.heading + change[3:],
-            0.5 * (covariance + covariance.T),
+            self.position + change[:3], self.heading + change[3:], 0.5 * (left + left.T)
         )

@@ -29,6 +29,7 @@ _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
 _BESIDE = 2.0e-3
 _CONFIRM_KNOWN = 2
+_CONFIRM_MISSES = 2  # so many pairs may lie between
 _NO_SURPRISE = 9.0  # squared, over its covariance
 _NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
@@ -55,15 +56,18 @@ class Anchor:
     insertion : float or None
         Of that moment [m].
     ahead : float
-        How far this is ahead of the last believed tip [m].
+        How far this is ahead of what was seen last [m].
     known : bool
         Whether that follows from the insertion.
+    unseen : float
+        How far the needle went since both views showed it [m].
     """
 
     motion: TipMotion
     insertion: float | None
     ahead: float = 0.0
     known: bool = False
+    unseen: float = 0.0
 
 
 class Track:
@@ -117,7 +121,21 @@ class Track:
         if insertion is not None and anchor.insertion is not None:
             ahead, known = insertion - anchor.insertion, True
         motion = anchor.motion.advanced(ahead, self._settings.reach.curvature)
-        return Anchor(motion, insertion, ahead, known)
+        return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
+
+    def keep_up(self, motion: TipMotion, insertion: float) -> None:
+        """Take what one view alone says of a needle that is not believed for the moment.
+
+        Parameters
+        ----------
+        motion : TipMotion
+            The prediction, with that taken in.
+        insertion : float
+            Length of needle in the phantom at the exposure [m].
+        """
+        predicted = self.predict(insertion)
+        assert predicted is not None
+        self.anchor = Anchor(motion, insertion, unseen=predicted.unseen)
 
     def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
         """Return why a measured tip is not believed, None where it passes all gates.
@@ -308,13 +326,19 @@ class Track:
         if self.state is TrackState.TRACKING:
             if self._misses >= settings.lost_after:
                 self.state = TrackState.LOST
-        elif self.state is not TrackState.LOST:
+        elif self.state is not TrackState.LOST and not self._may_confirm_yet():
             rival = self._rival, self._rivals
             self.reset()
             self._rival, self._rivals = rival
         patience = _PATIENCE if self.is_established else 1
         if self.state is TrackState.LOST and self._misses >= patience * settings.forget_after:
             self.reset()
+
+    def _may_confirm_yet(self) -> bool:
+        """Return whether a first tip may still be confirmed, though pairs without one came."""
+        known = self.anchor is not None and self.anchor.insertion is not None
+        confirming = self.state is TrackState.CONFIRMING
+        return confirming and known and self._misses <= _CONFIRM_MISSES
 
     def hide(self) -> None:
         """Note a pair that shows the shaft where it should be, but its end in neither view."""
@@ -332,6 +356,6 @@ class Track:
         settings = self._settings
         if not predicted.known:
             return settings.free_step * (self._misses + self._hidden + 1)
-        ahead = abs(predicted.ahead)
-        bend = 0.5 * settings.reach.curvature * ahead * ahead
-        return settings.step_margin + _HEADING_TOLERANCE * ahead + bend
+        way = predicted.unseen
+        bend = 0.5 * settings.reach.curvature * way * way
+        return settings.step_margin + _HEADING_TOLERANCE * way + bend

@@ -18,8 +18,9 @@ from needle_common.errors import UserError
 from needle_common.options import CommandParser, number, output_file
 from needle_tracker.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.image_files import NamedPair, PairSequence, open_pairs, read_insertions
+from needle_tracker.measurement import Measurement
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import Measurement, StereoTracker
+from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import default_settings
 
 DESCRIPTION = """\

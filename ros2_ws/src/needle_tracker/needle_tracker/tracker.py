@@ -7,92 +7,40 @@ randomness, one thread.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import cv2
 import numpy as np
 
+from needle_tracker.acquisition import Acquisition
 from needle_tracker.calibration import SIDES, StereoCalibration
-from needle_tracker.corridor import within_corridor
-from needle_tracker.detection import (
-    DetectionSettings,
-    Image,
-    Path,
-    cut_path,
-    distinct,
-    find_paths,
-    without_shadows,
-)
-from needle_tracker.evidence import (
-    CLEAR_ALONG_PX,
-    CLEAR_PX,
-    NEAR_ALONG_PX,
-    NEAR_PX,
-    UsualContrast,
-    is_sound,
-    sights_against,
-    sights_for,
-)
+from needle_tracker.detection import DetectionSettings, Image
+from needle_tracker.evidence import CLEAR_ALONG_PX, CLEAR_PX, UsualVisibility, is_sound
 from needle_tracker.following import (
     PLAIN_ALONG_PX,
     PLAIN_PX,
     SOUND_ALONG_PX,
     SOUND_PX,
     Follower,
+    HiddenEnds,
     weighed,
 )
-from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
+from needle_tracker.gates import UNCERTAIN, tip_at_entry
+from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
-from needle_tracker.search_grid import SearchGrid, make_search_grid
-from needle_tracker.shaft import shaft_points, shaft_problem
-from needle_tracker.tip_fit import Expected, ImageTip, fit_tip, hidden
-from needle_tracker.tip_motion import TipMotion
-from needle_tracker.track import SURPRISING, TOO_FAR, Track, TrackState
+from needle_tracker.single_view import kept_up
+from needle_tracker.tip_fit import ImageTip
+from needle_tracker.track import Track
 from needle_tracker.tracker_settings import TrackerSettings
-from needle_tracker.triangulation import SpatialTip, triangulate
+from needle_tracker.triangulation import SpatialTip
 
-UNCLEAR = "not clear enough to begin with"
 HIDDEN = "the end is hidden in both images"
-# A needle so short [m] is near where the entry has it, to so much of its covariance.
-_YOUNG, _YOUNG_SURPRISE = 15e-3, 9.0
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
 _ALONE_WAY = 5e-3  # and for so much insertion after both showed the needle well [m]
 # With no end in sight, lines so good tell where the needle is, for so much more insertion [px, m].
 _HIDDEN_LINE_PX, _HIDDEN_WAY = 1.0, 5e-3
 _FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
-_CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
-_GRID_AHEAD = 1.5e-3
 _DRAWN_SHARE, _DRAWN_POINTS = 0.3, 20  # of the longest insertion, to warm up on
-_GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
-
-
-@dataclasses.dataclass(frozen=True)
-class Measurement:
-    """What a pair of images gave.
-
-    Attributes
-    ----------
-    tip : SpatialTip or None
-        The believed tip; None where there is none.
-    state : TrackState
-        State of the track after this pair.
-    reason : str
-        Why there is no believed tip; empty where there is one.
-    image_tips : pair of (ImageTip or None)
-        What was found in the left and the right image, believed or not.
-    contested : SpatialTip or None
-        The tip that is not believed.
-    regions : pair of (Expected or None)
-        Where in the left and the right image was searched; None: everywhere, or not at all.
-    """
-
-    tip: SpatialTip | None
-    state: TrackState
-    reason: str
-    image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
-    contested: SpatialTip | None = None
-    regions: tuple[Expected | None, Expected | None] = (None, None)
 
 
 class StereoTracker:
@@ -115,18 +63,21 @@ class StereoTracker:
             RefractedCamera(cameras[0], calibration.phantom),
             RefractedCamera(cameras[1], calibration.phantom),
         )
-        self.grids = (self._grid(self.views[0]), self._grid(self.views[1]))
         self._detection = (self._look(self.views[0]), self._look(self.views[1]))
         self._follower = Follower(
             self.views, self._detection, settings.needle_width, settings.hole_clearance
         )
         self._shapes = tuple((camera.height, camera.width) for camera in cameras)
         self.track = Track(settings.gates)
+        self._usual = UsualVisibility()
+        self._acquisition = Acquisition(
+            self.views, self._detection, settings, self.track, self._usual
+        )
         self._last: tuple[ImageTip, ImageTip] | None = None
         self._contradicted = 0
+        self._hidden_ends = HiddenEnds()
         self._clear_at: float | None = None
         self._sound_at: float | None = None
-        self._usual = UsualContrast()
 
     def warm_up(self) -> None:
         """Compile, or load, all that is compiled: the first pair must not wait for it.
@@ -152,6 +103,7 @@ class StereoTracker:
         self.track.reset()
         self._last = None
         self._contradicted = 0
+        self._hidden_ends.forget()
         self._clear_at = None
         self._sound_at = None
         self._usual.forget()
@@ -183,6 +135,7 @@ class StereoTracker:
                 raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
         for side, image in zip(SIDES, images, strict=True):
             if int(image[::8, ::8].max()) < self.settings.min_contrast:
+                self._keep_up(images, insertion)
                 return self.skip(f"{side} image is black")
         if insertion is not None and insertion < self.settings.entry_zone:
             self._last = None
@@ -196,8 +149,9 @@ class StereoTracker:
             return Measurement(tip, self.track.state, "")
         measured = self._follow(images, insertion)
         if measured is None:
-            measured = self._acquire(images, insertion)
+            measured = self._acquisition.look(images, insertion, self._last)
         if measured.tip is None:
+            self._keep_up(images, insertion)
             if measured.reason in (HIDDEN, UNCERTAIN):
                 self.track.hide()
             else:
@@ -207,6 +161,18 @@ class StereoTracker:
                 self._usual.forget()
             return dataclasses.replace(measured, state=self.track.state)
         return self._taken(measured, measured.tip, insertion)
+
+    def _keep_up(self, images: tuple[Image, Image], insertion: float | None) -> None:
+        """Follow with one view what both together do not show."""
+        predicted, last = self.track.predict(insertion), self._last
+        if predicted is None or last is None or insertion is None or not predicted.known:
+            return
+        if not self.track.has_begun or abs(predicted.ahead) > _FOLLOW_AHEAD:
+            return
+        kept = kept_up(self._follower, images, predicted, last, self._usual)
+        if kept is not None:
+            self.track.keep_up(kept[0], insertion)
+            self._last = self._steadied(*kept[1])
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
@@ -268,6 +234,7 @@ class StereoTracker:
         if looked is None:
             return None
         found, regions = looked
+        found = self._hidden_ends.see(found)
         if predicted.known:
             sights = weighed(self.views, found, predicted.motion)
             contradicted = sights is not None and sights.contradicted
@@ -286,7 +253,7 @@ class StereoTracker:
         if not (found[0].clear or found[1].clear or self._goes_on(found, insertion)):
             measured = Measurement(None, self.track.state, HIDDEN, found)
         else:
-            measured = self._judged(found, insertion)
+            measured = judged(self.views, self.track, found, insertion)
             sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
             if measured.tip is None and (sound or measured.reason != UNCERTAIN):
                 return None
@@ -298,184 +265,6 @@ class StereoTracker:
             return False
         lines = all(tip.sigma_across <= _HIDDEN_LINE_PX for tip in found)
         return lines and abs(insertion - self._clear_at) <= _HIDDEN_WAY
-
-    def _acquire(self, images: tuple[Image, Image], insertion: float | None) -> Measurement:
-        """Look along the way that the needle has gone, then everywhere that can be reached."""
-        way = self.track.way(insertion)
-        if way is not None:
-            left, right = (
-                within_corridor(grid, view, *way)
-                for grid, view in zip(self.grids, self.views, strict=True)
-            )
-            measured = self._search(images, insertion, (left, right), on_way=True)
-            if measured.tip is not None or self.track.is_established:
-                return measured
-        return self._search(images, insertion, self.grids)
-
-    def _search(
-        self,
-        images: tuple[Image, Image],
-        insertion: float | None,
-        grids: tuple[SearchGrid, SearchGrid],
-        *,
-        on_way: bool = False,
-    ) -> Measurement:
-        """Look for the needle in the grids (as long as this insertion, where known)."""
-        state = self.track.state
-        paths: list[list[Path]] = []
-        for i, side in enumerate(SIDES):
-            paths.append(self._paths(images[i], i, grids[i], insertion))
-            if not paths[i]:
-                return Measurement(None, state, f"no needle in the {side} image")
-        paths = _of_one_polarity(paths)
-        # Fitted as they are needed: the first pair is mostly the right one.
-        fitted: tuple[dict[int, ImageTip | None], dict[int, ImageTip | None]] = ({}, {})
-        pairs = [
-            pair
-            for pair in itertools.product(range(len(paths[0])), range(len(paths[1])))
-            if paths[0][pair[0]].bright is paths[1][pair[1]].bright
-        ]
-        pairs.sort(key=lambda pair: -paths[0][pair[0]].evidence - paths[1][pair[1]].evidence)
-        first: Measurement | None = None
-        for pair in pairs:
-            for i in range(2):
-                if pair[i] not in fitted[i]:
-                    path = paths[i][pair[i]]
-                    sigma = 0.0 if insertion is None else _CUT * self._scale(i)
-                    fitted[i][pair[i]] = fit_tip(images[i], path, self._detection[i], sigma)
-            left, right = fitted[0][pair[0]], fitted[1][pair[1]]
-            left_path, right_path = paths[0][pair[0]], paths[1][pair[1]]
-            if left is None or right is None or not (left.clear or right.clear):
-                continue
-            chosen = (left_path, right_path)
-            measured = self._considered(chosen, (left, right), insertion, on_way=on_way)
-            if measured.tip is not None:
-                return measured
-            first = first or measured
-        if first is not None:
-            return first
-        for i, side in enumerate(SIDES):
-            if not any(fitted[i].values()):
-                return Measurement(None, state, f"no clear tip in the {side} image")
-        return Measurement(None, state, "views do not meet")
-
-    def _considered(
-        self,
-        paths: tuple[Path, Path],
-        found: tuple[ImageTip, ImageTip],
-        insertion: float | None,
-        *,
-        on_way: bool,
-    ) -> Measurement:
-        """Judge a pair that was found without a prediction; its whole shaft counts too."""
-        measured = self._judged(found, insertion)
-        if measured.reason == DISAGREE_ALONG and insertion is not None and self._last:
-            measured = self._one_sided(found, insertion) or measured
-        wanted = self._sights_wanted(measured, found, insertion, on_way=on_way)
-        if wanted is None:
-            return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
-        tip = measured.contested if measured.tip is None and wanted else measured.tip
-        if tip is None:
-            return measured
-        problem = self._shaft_problem(paths, tip, insertion)
-        if problem is not None:
-            return dataclasses.replace(measured, tip=None, reason=problem)
-        if not wanted:
-            return measured
-        if self.track.contest(tip, insertion, wanted):
-            return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
-        return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
-
-    def _sights_wanted(
-        self,
-        measured: Measurement,
-        found: tuple[ImageTip, ImageTip],
-        insertion: float | None,
-        *,
-        on_way: bool,
-    ) -> int | None:
-        """Return how many such tips in a row must agree, 0 where one will do, None for never."""
-        track, tip = self.track, measured.tip or measured.contested
-        if tip is not None and track.is_excluded(tip, insertion):
-            return None
-        alike = self._usual.is_like(found)
-        if measured.tip is None:
-            refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
-            return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
-        if track.fits(measured.tip, insertion, on_way=False):
-            return 0
-        near = on_way and track.fits(measured.tip, insertion, on_way=True)
-        if self._is_young(measured, insertion) and not track.has_begun:
-            return 0
-        return sights_for(track.state, measured.image_tips, alike=alike, near=near)
-
-    def _is_young(self, measured: Measurement, insertion: float | None) -> bool:
-        """Return whether a short needle is seen about where the entry has it.
-
-        There it is enough to see it less well: nothing else begins at the entry, and a needle that
-        waits for its first tip to be found never gets to where it is seen better.
-        """
-        if insertion is None or insertion > _YOUNG or measured.tip is None:
-            return False
-        if not is_sound(measured.image_tips, NEAR_PX, NEAR_ALONG_PX):
-            return False
-        reach = self.settings.gates.reach
-        entry = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
-        return TipMotion.start(entry).surprise(measured.tip) < _YOUNG_SURPRISE
-
-    def _paths(self, image: Image, i: int, grid: SearchGrid, insertion: float | None) -> list[Path]:
-        """Return what may be the needle in an image, as long as the insertion says."""
-        look = self._detection[i]
-        following = self._last is not None and self.track.state is TrackState.TRACKING
-        if self._last is not None and following and look.bright is None:
-            look = dataclasses.replace(look, bright=self._last[i].bright)
-        paths = find_paths(image, grid, look, ends=self._ends(i, insertion))
-        if insertion is not None:
-            paths = [cut_path(path, grid, insertion) for path in paths]
-        return without_shadows(distinct(paths))
-
-    def _scale(self, i: int) -> float:
-        """Return the pixels per metre of one camera."""
-        return self._detection[i].needle_width_px / self.settings.needle_width
-
-    def _shaft_problem(
-        self, paths: tuple[Path, Path], tip: SpatialTip, insertion: float | None
-    ) -> str | None:
-        gates = self.settings.gates
-        points = shaft_points(self.views, paths, tip.position)
-        return shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
-
-    def _one_sided(self, found: tuple[ImageTip, ImageTip], insertion: float) -> Measurement | None:
-        """Believe the one end of two that fits the track; None where none or both do."""
-        left, right = found
-        sides = [(left, hidden(right)), (hidden(left), right)]
-        measured = [self._judged(side, insertion) for side in sides]
-        fitting = [m for m in measured if m.tip is not None]
-        return fitting[0] if len(fitting) == 1 else None
-
-    def _judged(self, found: tuple[ImageTip, ImageTip], insertion: float | None) -> Measurement:
-        state = self.track.state
-        tip = triangulate(self.views, found)
-        if tip is None:
-            return Measurement(None, state, "views do not meet", found)
-        refused = self.track.judge(tip, insertion)
-        if refused is None:
-            return Measurement(tip, state, "", found)
-        return Measurement(None, state, refused, found, tip)
-
-    def _ends(self, i: int, insertion: float | None) -> tuple[int, int] | None:
-        """Return the rows of a grid in which the needle can end, None for all."""
-        if insertion is None:
-            return None
-        gates, grid = self.settings.gates, self.grids[i]
-        room = gates.insertion_margin + _GRID_MARGIN
-        shortest = gates.reach.shortest_chord(insertion)
-        return grid.row_of(shortest - room), grid.row_of(insertion + _GRID_AHEAD)
-
-    def _grid(self, view: RefractedCamera) -> SearchGrid:
-        return make_search_grid(
-            view, self.settings.gates.reach, first_distance=self.settings.hole_clearance
-        )
 
     def _look(self, view: RefractedCamera) -> DetectionSettings:
         settings = self.settings
@@ -491,15 +280,3 @@ class StereoTracker:
 
 def _plain(image: Image) -> Image:
     return np.require(image, requirements=["C", "W"])
-
-
-def _of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
-    """Return the dark paths of both views, or the bright ones: those that stand out more.
-
-    Beside a dark line there are bright ones, such as the gap between needle and shadow.
-    """
-    best = [
-        sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
-        for bright in (False, True)
-    ]
-    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]

@@ -11,7 +11,13 @@ import pytest
 
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.corridor import within_corridor
-from needle_tracker.evidence import UsualContrast, sights_against, sights_for
+from needle_tracker.evidence import (
+    UsualVisibility,
+    is_half_sound,
+    is_sound,
+    sights_against,
+    sights_for,
+)
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import make_search_grid
 from needle_tracker.tip_fit import ImageTip, hidden
@@ -21,7 +27,7 @@ from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 
 Views = tuple[RefractedCamera, RefractedCamera]
-GOOD = ImageTip(np.zeros(2), np.array([1.0, 0.0]), 0.05, 0.15, 0.005, 100.0)
+GOOD = ImageTip(np.zeros(2), np.array([1.0, 0.0]), 0.05, 0.15, 0.005, 100.0, 0.6)
 POOR = dataclasses.replace(GOOD, sigma_across=0.7)
 AHEAD = np.array([0.0, 0.0, 1.0])
 
@@ -58,14 +64,35 @@ def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
 
 
 def test_what_lies_over_the_needle_is_not_like_it() -> None:
-    usual = UsualContrast()
+    usual = UsualVisibility()
     assert usual.is_like((GOOD, GOOD))
     usual.see((GOOD, GOOD))
-    assert usual.is_like((dataclasses.replace(GOOD, contrast=85.0), GOOD))
-    assert not usual.is_like((dataclasses.replace(GOOD, contrast=160.0), GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, visibility=0.5), GOOD))
+    assert not usual.is_like((dataclasses.replace(GOOD, visibility=0.95), GOOD))
     for _ in range(30):
-        usual.see((dataclasses.replace(GOOD, contrast=160.0), GOOD))
-    assert usual.is_like((dataclasses.replace(GOOD, contrast=160.0), GOOD))
+        usual.see((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+
+
+def test_how_much_light_there_is_says_nothing() -> None:
+    dim = dataclasses.replace(GOOD, contrast=GOOD.contrast / 4.0)
+    usual = UsualVisibility()
+    usual.see((GOOD, GOOD))
+    assert usual.is_like((dim, GOOD))
+    assert is_sound((dim, GOOD), 0.3, 2.0)
+    shadow = dataclasses.replace(GOOD, visibility=GOOD.visibility / 2.0)
+    assert not usual.is_like((shadow, GOOD))
+    assert not is_sound((shadow, GOOD), 0.3, 2.0)
+
+
+def test_one_end_and_the_other_view_s_line_are_half_a_sight() -> None:
+    line = hidden(GOOD)
+    assert is_half_sound((GOOD, line))
+    assert is_half_sound((line, GOOD))
+    assert not is_half_sound((line, line))
+    assert not is_half_sound((GOOD, dataclasses.replace(line, sigma_across=0.9)))
+    assert not is_half_sound((GOOD, dataclasses.replace(line, visibility=0.3)))
+    assert not is_half_sound((GOOD, None))
 
 
 def test_what_one_pair_shows_twice_counts_once(settings: TrackerSettings) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from needle_tracker.detection import DetectionSettings
-from needle_tracker.following import weighed
+from needle_tracker.following import HiddenEnds, weighed
 from needle_tracker.refraction import RefractedCamera
-from needle_tracker.tip_fit import Expected, ImageTip, fit_expected
+from needle_tracker.tip_fit import Expected, ImageTip, fit_expected, hidden
 from needle_tracker.tip_motion import TipMotion
 from needle_tracker.tracker import StereoTracker
 from needle_tracker.triangulation import triangulate
@@ -30,7 +30,7 @@ def tips(views: Views) -> tuple[ImageTip, ImageTip]:
     for view in views:
         pixel = view.project(TIP)
         along = view.jacobian(TIP) @ HEADING
-        found.append(ImageTip(pixel, along / np.linalg.norm(along), 0.05, 0.1, 0.005, 100.0))
+        found.append(ImageTip(pixel, along / np.linalg.norm(along), 0.05, 0.1, 0.005, 100.0, 0.6))
     return found[0], found[1]
 
 
@@ -76,6 +76,17 @@ def test_a_plain_view_is_not_outvoted_by_the_prediction(
     views: Views, tips: tuple[ImageTip, ImageTip]
 ) -> None:
     assert weighed(views, (moved(tips[0], 6.0, 0.0), tips[1]), PREDICTED) is None
+
+
+def test_a_hidden_end_s_line_counts_once(tips: tuple[ImageTip, ImageTip]) -> None:
+    ends = HiddenEnds()
+    line = hidden(tips[0])
+    counted = [ends.see((line, tips[1])) for _ in range(50)]
+    information = sum(left.sigma_across**-2 for left, _ in counted)
+    assert information < 2.0 * line.sigma_across**-2
+    assert all(right == tips[1] for _, right in counted)
+    assert ends.see(tips) == tips
+    assert ends.see((line, tips[1]))[0] == line
 
 
 def test_of_two_ends_the_predicted_one_counts(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 
@@ -61,6 +62,50 @@ def test_a_bent_shaft_does_not_pull_the_end_aside(make_line: Callable[..., np.nd
     assert tip is not None
     np.testing.assert_allclose(tip.point, [150.0, 150.0], atol=0.1)
     np.testing.assert_allclose(tip.direction, [1.0, 0.0], atol=0.01)
+
+
+@pytest.mark.parametrize("beside", [-3.5, -2.5, 2.5, 3.5])
+@pytest.mark.parametrize("glint", [False, True])
+def test_a_shadow_along_the_needle_does_not_draw_it_aside(
+    make_line: Callable[..., np.ndarray], beside: float, glint: bool
+) -> None:
+    """The shadow is half as dark, blurred and ends farther on; a glint shines on the shaft."""
+    start, end = np.array([40.0, 152.3]), np.array([150.0, 150.0])
+    line, shape = np.stack([start, end]), (300, 300)
+    shift = np.array([0.0, beside])
+    shadow = make_line(
+        shape, np.stack([start, end + np.array([14.0, -0.3])]) + shift, 5.0, 1.0, 0.0
+    )
+    light = 160.0 * (1.0 - 0.5 * cv2.GaussianBlur(shadow, (0, 0), 2.0))
+    needle = make_line(shape, line, 4.6, 1.0, 0.0)
+    image = light + (35.0 - light) * cv2.GaussianBlur(needle, (0, 0), 0.7)
+    if glint:
+        image += 120.0 * make_line(shape, line[0] + [[0.55], [0.8]] * (end - start), 1.6, 1.0, 0.0)
+    image += np.random.default_rng(2).normal(0.0, 3.0, shape)
+    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
+    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS)
+    assert tip is not None
+    direction = (end - start) / np.linalg.norm(end - start)
+    across = float((tip.point - end) @ [-direction[1], direction[0]])
+    assert abs(across) < 0.35
+    assert abs(across) < 3.0 * tip.sigma_across
+
+
+@pytest.mark.parametrize("bright", [False, True])
+def test_how_plainly_it_shows_does_not_depend_on_the_light(
+    make_line: Callable[..., np.ndarray], bright: bool
+) -> None:
+    start, end = np.array([40.0, 150.0]), np.array([150.0, 150.0])
+    levels = (120.0, 45.0) if bright else (45.0, 120.0)
+    drawn = make_line((300, 300), np.stack([start, end]), 4.6, *levels)
+    seen = []
+    for light in (0.7, 1.0, 2.0):
+        image = np.clip(np.round(light * drawn), 0, 255).astype(np.uint8)
+        tip = fit_tip(image, coarse_path(start, end, np.zeros(2), bright), SETTINGS)
+        assert tip is not None
+        assert tip.contrast == pytest.approx(75.0 * light, rel=0.1)
+        seen.append(tip.visibility)
+    assert seen == pytest.approx([75.0 / 120.0] * 3, rel=0.06)
 
 
 def test_nothing_there_is_no_tip() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
 from needle_tracker.tip_motion import TipMotion
@@ -73,3 +74,18 @@ def test_drawn_back_it_goes_back() -> None:
     start = measured(np.array([0.0, 0.0, 0.05]), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
     back = TipMotion.start(start).advanced(-2e-3, CURVATURE)
     np.testing.assert_allclose(back.position, [0.0, 0.0, 0.048])
+
+
+def test_one_direction_taken_in_says_nothing_of_the_others() -> None:
+    start = measured(np.zeros(3), np.full(3, 2e-5), np.array([0.0, 0.0, 1.0]))
+    motion = TipMotion.start(start).advanced(5e-3, CURVATURE)
+    slope = np.array([[0.0, 3.0, 0.0]])
+    taken = motion.taken_in(np.array([1e-4]), slope, np.array([[1e-12]]))
+    assert taken.position[1] - motion.position[1] == pytest.approx(1e-4 / 3.0, rel=0.01)
+    np.testing.assert_allclose(taken.position[[0, 2]], motion.position[[0, 2]], atol=1e-12)
+    before, after = np.diag(motion.covariance), np.diag(taken.covariance)
+    np.testing.assert_allclose(after[[0, 2]], before[[0, 2]], rtol=1e-9)
+    assert after[1] < 0.01 * before[1]
+    # The heading follows where the tip turned out to be.
+    assert taken.heading[1] > motion.heading[1]
+    assert after[4] < before[4]

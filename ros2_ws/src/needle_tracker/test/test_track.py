@@ -103,6 +103,35 @@ def test_without_it_several_must_agree(gates: GateSettings) -> None:
     assert track.anchor is None
 
 
+@pytest.mark.parametrize(("missed", "confirmed"), [(2, True), (3, False)])
+def test_what_is_seen_twice_within_a_few_pairs_is_confirmed(
+    gates: GateSettings, missed: int, confirmed: bool
+) -> None:
+    track = Track(gates)
+    assert track.accept(tip(), 0.05, certain=False) is None
+    for _ in range(missed):
+        track.miss()
+    later = track.accept(tip(z=0.0505), 0.0505, certain=False)
+    assert (later is not None) is confirmed
+
+
+def test_a_needle_kept_up_with_stays_uncertain_by_its_way(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(z=0.05), 0.05)
+    for insertion in (0.052, 0.054, 0.056):
+        predicted = track.predict(insertion)
+        assert predicted is not None
+        track.keep_up(predicted.motion, insertion)
+    kept = track.predict(0.057)
+    assert kept is not None
+    assert kept.ahead == pytest.approx(1e-3)
+    other = Track(gates)
+    other.accept(tip(z=0.05), 0.05)
+    left_alone = other.predict(0.057)
+    assert left_alone is not None
+    assert track.tolerance(kept) == pytest.approx(other.tolerance(left_alone))
+
+
 def test_a_tip_too_far_from_the_last_is_refused(gates: GateSettings) -> None:
     track = Track(gates)
     track.accept(tip(z=0.05), 0.05)

@@ -14,8 +14,9 @@ from needle_sim.plant import NeedlePlant, initial_pose
 from needle_sim.renderer import StereoRenderer
 from needle_sim.stereo_rig import load_stereo_rig
 from needle_tracker.calibration import StereoCalibration
+from needle_tracker.measurement import Measurement
 from needle_tracker.track import TrackState
-from needle_tracker.tracker import Measurement, StereoTracker
+from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import TrackerSettings
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]

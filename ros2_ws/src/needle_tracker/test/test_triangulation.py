@@ -21,7 +21,7 @@ def seen(views: Views, tip: np.ndarray = TIP, heading: np.ndarray = HEADING) -> 
     for view in views:
         ahead, behind = view.project(np.stack([tip + 5e-5 * heading, tip - 5e-5 * heading]))
         direction = (ahead - behind) / np.linalg.norm(ahead - behind)
-        tips.append(ImageTip(view.project(tip), direction, 0.05, 0.5, 2e-3, 80.0))
+        tips.append(ImageTip(view.project(tip), direction, 0.05, 0.5, 2e-3, 80.0, 0.6))
     return tips
 
 

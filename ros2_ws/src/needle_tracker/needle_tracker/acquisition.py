@@ -1,0 +1,294 @@
+"""Find the needle where no prediction says where its end must be, and judge what is found.
+
+First along the way that the needle has gone, then everywhere that it can reach. What is found so
+has to be seen better, or more often, than what is followed; the whole shaft counts, not its end
+alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+
+from needle_tracker.calibration import SIDES
+from needle_tracker.corridor import within_corridor
+from needle_tracker.detection import (
+    DetectionSettings,
+    Image,
+    Path,
+    cut_path,
+    distinct,
+    find_paths,
+    without_shadows,
+)
+from needle_tracker.evidence import (
+    NEAR_ALONG_PX,
+    NEAR_PX,
+    UsualVisibility,
+    is_half_sound,
+    is_sound,
+    sights_against,
+    sights_for,
+)
+from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
+from needle_tracker.measurement import Measurement, judged
+from needle_tracker.refraction import RefractedCamera
+from needle_tracker.search_grid import SearchGrid, make_search_grid
+from needle_tracker.shaft import shaft_points, shaft_problem
+from needle_tracker.tip_fit import ImageTip, fit_tip, hidden
+from needle_tracker.tip_motion import TipMotion
+from needle_tracker.track import SURPRISING, TOO_FAR, Track, TrackState
+from needle_tracker.tracker_settings import TrackerSettings
+from needle_tracker.triangulation import SpatialTip
+
+Last = tuple[ImageTip, ImageTip]
+
+UNCLEAR = "not clear enough to begin with"
+# A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
+# that is to say which of two ends is the needle's.
+_YOUNG, _YOUNG_SURPRISE, _YOUNG_NEAR = 15e-3, 9.0, 2.0
+_CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
+_GRID_AHEAD = 1.5e-3
+_GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
+
+
+class Acquisition:
+    """Searches both images for the needle.
+
+    Parameters
+    ----------
+    views : pair of RefractedCamera
+        Left and right.
+    detection : pair of DetectionSettings
+        How the needle looks in each.
+    settings : TrackerSettings
+        What else is known.
+    track : Track
+        What is known of the needle; contested tips are noted there.
+    usual : UsualVisibility
+        How much it stands out.
+    """
+
+    def __init__(
+        self,
+        views: tuple[RefractedCamera, RefractedCamera],
+        detection: tuple[DetectionSettings, DetectionSettings],
+        settings: TrackerSettings,
+        track: Track,
+        usual: UsualVisibility,
+    ) -> None:
+        self._views = views
+        self._detection = detection
+        self._settings = settings
+        self._track = track
+        self._usual = usual
+        self._grids = (self._grid(views[0]), self._grid(views[1]))
+
+    def look(
+        self, images: tuple[Image, Image], insertion: float | None, last: Last | None
+    ) -> Measurement:
+        """Look along the way that the needle has gone, then everywhere that can be reached.
+
+        Parameters
+        ----------
+        images : pair of ndarray of uint8
+            Left and right.
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+        last : pair of ImageTip or None
+            How the needle was seen last.
+        """
+        way = self._track.way(insertion)
+        if way is not None:
+            left, right = (
+                within_corridor(grid, view, *way)
+                for grid, view in zip(self._grids, self._views, strict=True)
+            )
+            measured = self._search(images, insertion, last, (left, right), on_way=True)
+            if measured.tip is not None or self._track.is_established:
+                return measured
+        return self._search(images, insertion, last, self._grids)
+
+    def _search(
+        self,
+        images: tuple[Image, Image],
+        insertion: float | None,
+        last: Last | None,
+        grids: tuple[SearchGrid, SearchGrid],
+        *,
+        on_way: bool = False,
+    ) -> Measurement:
+        """Look for the needle in the grids (as long as this insertion, where known)."""
+        state = self._track.state
+        paths: list[list[Path]] = []
+        for i, side in enumerate(SIDES):
+            paths.append(self._paths(images[i], i, grids[i], insertion, last))
+            if not paths[i]:
+                return Measurement(None, state, f"no needle in the {side} image")
+        paths = _of_one_polarity(paths)
+        # Fitted as they are needed: the first pair is mostly the right one.
+        fitted: tuple[dict[int, ImageTip | None], dict[int, ImageTip | None]] = ({}, {})
+        pairs = [
+            pair
+            for pair in itertools.product(range(len(paths[0])), range(len(paths[1])))
+            if paths[0][pair[0]].bright is paths[1][pair[1]].bright
+        ]
+        pairs.sort(key=lambda pair: -paths[0][pair[0]].evidence - paths[1][pair[1]].evidence)
+        first: Measurement | None = None
+        for pair in pairs:
+            for i in range(2):
+                if pair[i] not in fitted[i]:
+                    path = paths[i][pair[i]]
+                    sigma = 0.0 if insertion is None else _CUT * self._scale(i)
+                    fitted[i][pair[i]] = fit_tip(images[i], path, self._detection[i], sigma)
+            left, right = fitted[0][pair[0]], fitted[1][pair[1]]
+            left_path, right_path = paths[0][pair[0]], paths[1][pair[1]]
+            if left is None or right is None or not (left.clear or right.clear):
+                continue
+            measured = self._considered(
+                (left_path, right_path), (left, right), insertion, last, on_way=on_way
+            )
+            if measured.tip is not None:
+                return measured
+            first = first or measured
+        if first is not None:
+            return first
+        for i, side in enumerate(SIDES):
+            if not any(fitted[i].values()):
+                return Measurement(None, state, f"no clear tip in the {side} image")
+        return Measurement(None, state, "views do not meet")
+
+    def _considered(
+        self,
+        paths: tuple[Path, Path],
+        found: tuple[ImageTip, ImageTip],
+        insertion: float | None,
+        last: Last | None,
+        *,
+        on_way: bool,
+    ) -> Measurement:
+        """Judge a pair that was found without a prediction; its whole shaft counts too."""
+        measured = judged(self._views, self._track, found, insertion)
+        if measured.reason == DISAGREE_ALONG and insertion is not None:
+            measured = self._one_sided(found, insertion, last) or measured
+        wanted = self._sights_wanted(measured, found, insertion, on_way=on_way)
+        if wanted is None:
+            return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
+        tip = measured.contested if measured.tip is None and wanted else measured.tip
+        if tip is None:
+            return measured
+        problem = self._shaft_problem(paths, tip, insertion)
+        if problem is not None:
+            return dataclasses.replace(measured, tip=None, reason=problem)
+        if not wanted:
+            return measured
+        if self._track.contest(tip, insertion, wanted):
+            return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
+        return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
+
+    def _sights_wanted(
+        self,
+        measured: Measurement,
+        found: tuple[ImageTip, ImageTip],
+        insertion: float | None,
+        *,
+        on_way: bool,
+    ) -> int | None:
+        """Return how many such tips in a row must agree, 0 where one will do, None for never."""
+        track, tip = self._track, measured.tip or measured.contested
+        if tip is not None and track.is_excluded(tip, insertion):
+            return None
+        alike = self._usual.is_like(found)
+        if measured.tip is None:
+            refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
+            return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
+        if track.fits(measured.tip, insertion, on_way=False):
+            return 0
+        near = on_way and track.fits(measured.tip, insertion, on_way=True)
+        if not track.has_begun and self._begins_at_entry(measured, insertion):
+            return 0
+        return sights_for(track.state, measured.image_tips, alike=alike, near=near)
+
+    def _begins_at_entry(self, measured: Measurement, insertion: float | None) -> bool:
+        """Return whether a short needle is seen about where the entry has it.
+
+        There it is enough to see it less well: nothing else begins at the entry, and a needle that
+        waits for its first tip to be found never gets to where it is seen better.
+        """
+        if insertion is None or insertion > _YOUNG or measured.tip is None:
+            return False
+        found = measured.image_tips
+        if not (is_sound(found, NEAR_PX, NEAR_ALONG_PX) or is_half_sound(found)):
+            return False
+        return self._entry_surprise(measured.tip, insertion) < _YOUNG_SURPRISE
+
+    def _entry_surprise(self, tip: SpatialTip, insertion: float) -> float:
+        """Return how far a tip is from where the entry has it, squared, over the covariance."""
+        reach = self._settings.gates.reach
+        entry = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
+        return TipMotion.start(entry).surprise(tip)
+
+    def _one_sided(
+        self, found: tuple[ImageTip, ImageTip], insertion: float, last: Last | None
+    ) -> Measurement | None:
+        """Believe the one end of two that fits what is known; None where none or both do."""
+        left, right = found
+        fitting = [
+            measured
+            for side in ((left, hidden(right)), (hidden(left), right))
+            if (measured := judged(self._views, self._track, side, insertion)).tip is not None
+            and (last is not None or self._is_near_entry(measured.tip, insertion))
+        ]
+        return fitting[0] if len(fitting) == 1 else None
+
+    def _is_near_entry(self, tip: SpatialTip, insertion: float) -> bool:
+        return insertion <= _YOUNG and self._entry_surprise(tip, insertion) < _YOUNG_NEAR
+
+    def _shaft_problem(
+        self, paths: tuple[Path, Path], tip: SpatialTip, insertion: float | None
+    ) -> str | None:
+        gates = self._settings.gates
+        points = shaft_points(self._views, paths, tip.position)
+        return shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
+
+    def _paths(
+        self, image: Image, i: int, grid: SearchGrid, insertion: float | None, last: Last | None
+    ) -> list[Path]:
+        """Return what may be the needle in an image, as long as the insertion says."""
+        look = self._detection[i]
+        following = last is not None and self._track.state is TrackState.TRACKING
+        if last is not None and following and look.bright is None:
+            look = dataclasses.replace(look, bright=last[i].bright)
+        paths = find_paths(image, grid, look, ends=self._ends(i, insertion))
+        if insertion is not None:
+            paths = [cut_path(path, grid, insertion) for path in paths]
+        return without_shadows(distinct(paths))
+
+    def _scale(self, i: int) -> float:
+        """Return the pixels per metre of one camera."""
+        return self._detection[i].needle_width_px / self._settings.needle_width
+
+    def _ends(self, i: int, insertion: float | None) -> tuple[int, int] | None:
+        """Return the rows of a grid in which the needle can end, None for all."""
+        if insertion is None:
+            return None
+        gates, grid = self._settings.gates, self._grids[i]
+        room = gates.insertion_margin + _GRID_MARGIN
+        shortest = gates.reach.shortest_chord(insertion)
+        return grid.row_of(shortest - room), grid.row_of(insertion + _GRID_AHEAD)
+
+    def _grid(self, view: RefractedCamera) -> SearchGrid:
+        settings = self._settings
+        return make_search_grid(view, settings.gates.reach, first_distance=settings.hole_clearance)
+
+
+def _of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
+    """Return the dark paths of both views, or the bright ones: those that stand out more.
+
+    Beside a dark line there are bright ones, such as the gap between needle and shadow.
+    """
+    best = [
+        sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
+        for bright in (False, True)
+    ]
+    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]

@@ -1,0 +1,90 @@
+"""What one view alone says of a followed needle that both together do not show.
+
+A needle that one camera does not see for a while is not lost: the other says where it is but for
+the depth, and that hardly changes on its way. No tip is measured so; but it is found again at once.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from needle_tracker.compiled_projection import point_jacobian, project_point
+from needle_tracker.detection import Image
+from needle_tracker.evidence import UsualVisibility
+from needle_tracker.following import SLACK, Follower, is_sound, misfit
+from needle_tracker.refraction import RefractedCamera
+from needle_tracker.tip_fit import ImageTip
+from needle_tracker.tip_motion import TipMotion
+from needle_tracker.track import Anchor
+
+# Standard deviations: what is farther from the prediction is something else. A prediction that is
+# not known so well [px] says too little of what is seen.
+_BORNE_OUT, _KNOWN_PX = 3.0, 2.5
+
+
+def kept_up(
+    follower: Follower,
+    images: tuple[Image, Image],
+    predicted: Anchor,
+    last: tuple[ImageTip, ImageTip],
+    usual: UsualVisibility,
+) -> tuple[TipMotion, tuple[ImageTip, ImageTip]] | None:
+    """Return the prediction with what single views bear out of it taken in, and what they see.
+
+    Parameters
+    ----------
+    follower : Follower
+        Looks for the needle.
+    images : pair of ndarray of uint8
+        Left and right.
+    predicted : Anchor
+        Where the tip must be now.
+    last : pair of ImageTip
+        How it was seen last.
+    usual : UsualVisibility
+        How much it stands out.
+
+    Returns
+    -------
+    motion : TipMotion
+        In `rig`.
+    seen : pair of ImageTip
+        As seen now, where it is, or last.
+    """
+    motion, seen = predicted.motion, list(last)
+    for i, view in enumerate(follower.views):
+        looked = follower.look_in(i, images[i], predicted, last[i])
+        if looked is None:
+            continue
+        tip, _ = looked
+        if is_sound(tip) and usual.is_like_in(i, tip) and _is_borne_out(view, tip, predicted):
+            motion, seen[i] = _taken_in(view, tip, motion), tip
+    if motion is predicted.motion:
+        return None
+    return motion, (seen[0], seen[1])
+
+
+def _is_borne_out(view: RefractedCamera, tip: ImageTip, predicted: Anchor) -> bool:
+    """Return whether a tip is where it must be, and that is known well enough to tell."""
+    off = misfit(view, tip, predicted.motion)
+    along = math.hypot(off.sigma_along, off.sigma_predicted, SLACK)
+    return (
+        off.sigma_across**2 - tip.sigma_across**2 < _KNOWN_PX**2
+        and abs(off.across) < _BORNE_OUT * off.sigma_across
+        and abs(off.along) < _BORNE_OUT * along
+    )
+
+
+def _taken_in(view: RefractedCamera, tip: ImageTip, motion: TipMotion) -> TipMotion:
+    """Return a state with what one view says taken in, across and along the shaft."""
+    pixel, jacobian = np.empty(2), np.empty((2, 3))
+    project_point(view.packed, motion.position, pixel)
+    point_jacobian(view.packed, motion.position, jacobian)
+    axes = np.array([[-tip.direction[1], tip.direction[0]], tip.direction])
+    return motion.taken_in(
+        axes @ (tip.point - pixel),
+        axes @ jacobian,
+        np.diag([tip.sigma_across**2, tip.sigma_along**2]),
+    )
