@@ -21,7 +21,7 @@ _VISIBILITY_RATIO = 1.8  # of the two views
 _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
-_VISIBILITY_CHANGE = 1.4
+_FAINTER, _PLAINER = 0.7, 1.25  # than it did; what lies over it adds to it
 _NEW_SHARE = 0.2
 
 
@@ -87,7 +87,7 @@ class UsualVisibility:
         """Return whether the needle stands out about as much in the left (0) or right (1) view."""
         if self._levels is None:
             return True
-        return 1.0 / _VISIBILITY_CHANGE < tip.visibility / self._levels[i] < _VISIBILITY_CHANGE
+        return _FAINTER < tip.visibility / self._levels[i] < _PLAINER
 
 
 def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:
@@ -104,7 +104,9 @@ def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool
     on_way : bool
         Whether it lies where its tip has been.
     """
-    if not is_sound(found, SOUND_PX, SOUND_ALONG_PX):
+    # While the needle is followed, what looks unlike it is what lies beside or over it.
+    unlike = state is TrackState.TRACKING and not alike
+    if unlike or not is_sound(found, SOUND_PX, SOUND_ALONG_PX):
         return 0
     sure = on_way or is_sound(found, PLAIN_PX, PLAIN_ALONG_PX) or state is not TrackState.TRACKING
     return _SOUND_SIGHTS + (0 if alike else _MORE_UNLIKE) + (0 if sure else _MORE_TRACKING)
@@ -134,6 +136,8 @@ def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> i
     more = 0 if alike else _MORE_UNLIKE
     if is_sound(found, SOUND_PX, SOUND_ALONG_PX):
         return _SOUND_SIGHTS + more if state is TrackState.LOST else 0
+    if near and is_half_sound(found):
+        return _SOUND_SIGHTS + more
     if not (near and alike) and not is_sound(found, CLEAR_PX, CLEAR_ALONG_PX):
         return None
     return _UNSOUND_SIGHTS + more + (_MORE_TRACKING if state is TrackState.TRACKING else 0)

@@ -214,7 +214,7 @@ def weighed(
         if strange[i] and (not tips[1 - i].clear or is_plain(tips[i])):
             return None
     first, second = (
-        tip if is_sound(tip) and not odd else _softened(tip, misfit)
+        tip if is_plain(tip) and not odd else _softened(tip, misfit)
         for tip, misfit, odd in zip(tips, misfits, strange, strict=True)
     )
     tips = (first, second)

@@ -29,11 +29,13 @@ _FAR_FROM_MIDDLE = 0.01  # what each column costs
 _BOTH, _ONE, _FULL = 0.6, 0.2, 1.0
 _LOOK_COLUMNS = 2  # an edge is so near where the needle's width has it
 _PEAK_COLUMNS, _PEAK_SHARE = 6, 0.4
+# What lies beside an edge, so far and so wide [columns], is something if it is so dark, or bright.
+_BESIDE_FROM, _BESIDE_COLUMNS, _SOMETHING = 1.6, 4, 0.15
 
 
 @compiled
 def edges_middle(
-    darkness: Array, row: int, last: int, width: float, contrast: float, steep: Array
+    darkness: Array, row: int, last: int, width: float, contrast: float, level: Array, steep: Array
 ) -> float:
     """Return the middle between a needle's edges about one row [px from the strip's middle].
 
@@ -47,8 +49,8 @@ def edges_middle(
         Of the needle [px].
     contrast : float
         Of the needle [grey levels].
-    steep : ndarray, shape (columns,)
-        Is written over.
+    level, steep : ndarray, shape (columns,)
+        Are written over.
 
     Returns
     -------
@@ -57,7 +59,9 @@ def edges_middle(
     """
     columns = darkness.shape[1]
     reach = columns // 2
-    steepness(darkness, max(row - _EITHER_WAY, 0), min(row + _EITHER_WAY, last), contrast, steep)
+    steepness(
+        darkness, max(row - _EITHER_WAY, 0), min(row + _EITHER_WAY, last), contrast, level, steep
+    )
     half = 0.5 * width / STEP_PX
     search = int(_SEARCH_PX / STEP_PX)
     largest, middle = _BOTH, -1
@@ -83,19 +87,41 @@ def edges_middle(
         weight = steep[edge] ** 4
         total += weight
         moment += weight * (peak_place(steep, edge) - side * half - reach)
-    return STEP_PX * moment / total if total > 0.0 else np.nan
+    if not total > 0.0:
+        return np.nan
+    place = reach + moment / total
+    if not (is_something(level, place, half, -1) or is_something(level, place, half, 1)):
+        return np.nan
+    return STEP_PX * (place - reach)
 
 
 @compiled
-def steepness(darkness: Array, first: int, last: int, contrast: float, steep: Array) -> None:
+def is_something(level: Array, place: float, half: float, side: int) -> bool:
+    """Return whether something lies beside the needle.
+
+    Else its edges are as steep as its own shading has them, and say nothing.
+    """
+    beside = 0.0
+    for k in range(_BESIDE_COLUMNS):
+        column = place + side * (half + _BESIDE_FROM + k)
+        beside += abs(between(level, column)) / _BESIDE_COLUMNS
+    return beside > _SOMETHING
+
+
+@compiled
+def steepness(
+    darkness: Array, first: int, last: int, contrast: float, level: Array, steep: Array
+) -> None:
     """Write how steeply rows first to last, together, get darker to the right [contrasts]."""
     columns = darkness.shape[1]
     scale = 1.0 / ((last - first + 1) * contrast)
+    level[:] = 0.0
+    for i in range(first, last + 1):
+        for j in range(columns):
+            level[j] += scale * darkness[i, j]
     for j in range(columns):
         left, right = max(j - _SLOPE_COLUMNS, 0), min(j + _SLOPE_COLUMNS, columns - 1)
-        steep[j] = 0.0
-        for i in range(first, last + 1):
-            steep[j] += scale * (darkness[i, right] - darkness[i, left])
+        steep[j] = level[right] - level[left]
 
 
 @compiled

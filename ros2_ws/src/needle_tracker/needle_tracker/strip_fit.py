@@ -92,7 +92,7 @@ def middle_line(
     centre = np.empty(max(last - first + 1, 0))
     place = np.empty(len(centre))
     lean = np.empty(len(centre))
-    steep = np.empty(columns)
+    profile, steep = np.empty(columns), np.empty(columns)
     rows = 0
     for i in range(first, last + 1):
         if not 0.25 < mass[i] < 1.5:
@@ -113,7 +113,7 @@ def middle_line(
             continue
         centre[rows] = moment / total
         # Both agree on a needle that nothing disturbs; the centroid has less noise.
-        edges = edges_middle(darkness, i, last, width, contrast, steep)
+        edges = edges_middle(darkness, i, last, width, contrast, profile, steep)
         if abs(edges - centre[rows]) > _EDGES_APART_PX:
             centre[rows] = edges
         lean[rows] = top_moment / top - foot_moment / foot if top > 0.0 < foot else 0.0

@@ -8,6 +8,7 @@ kappa s), with s the insertion in between.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,11 +51,23 @@ class TipMotion:
         covariance[3:, 3:] = _LEAN_SIGMA**2 * np.eye(3)
         return cls(tip.position, tip.direction, covariance)
 
-    def advanced(self, ahead: float, curvature: float) -> TipMotion:
-        """Return the state `ahead` farther along the insertion (negative: drawn back) [m]."""
+    def advanced(self, ahead: float, curvature: float, unseen: float = 0.0) -> TipMotion:
+        """Return the state farther along the insertion.
+
+        Parameters
+        ----------
+        ahead : float
+            How far; negative where the needle is drawn back [m].
+        curvature : float
+            The largest [1/m].
+        unseen : float
+            How far the needle went before without being seen by both views [m]: it may have bent
+            the same way all along.
+        """
         transition = np.eye(6)
         transition[:3, 3:] = ahead * np.eye(3)
-        turned = curvature * abs(ahead)
+        way = abs(ahead)
+        turned = curvature * math.sqrt(way * (way + 2.0 * unseen))
         noise = np.zeros((6, 6))
         noise[:3, :3] = (_DRIFT**2 + (0.5 * turned * ahead) ** 2) * np.eye(3)
         noise[3:, 3:] = turned**2 * np.eye(3)

@@ -25,6 +25,7 @@ _HIDDEN_PER_LOST = 4
 _CERTAIN = 0.5e-3  # [m]
 # A needle that both views showed so often lies where it was seen; that is not soon forgotten.
 _ESTABLISHED, _PATIENCE = 10, 5
+_BEGUN = 2  # both views must have shown its end so often, or once beyond doubt, to be sure of it
 _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
 _BESIDE = 2.0e-3
@@ -94,6 +95,7 @@ class Track:
         self._rivals = self._next_rivals = 0
         self._agreeing = 0
         self._sights = 0
+        self._is_begun = False
         self._passed: list[tuple[float, Array]] = []
 
     def enter(self) -> None:
@@ -120,7 +122,7 @@ class Track:
         ahead, known = 0.0, False
         if insertion is not None and anchor.insertion is not None:
             ahead, known = insertion - anchor.insertion, True
-        motion = anchor.motion.advanced(ahead, self._settings.reach.curvature)
+        motion = anchor.motion.advanced(ahead, self._settings.reach.curvature, anchor.unseen)
         return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
 
     def keep_up(self, motion: TipMotion, insertion: float) -> None:
@@ -201,8 +203,9 @@ class Track:
         self._misses = self._hidden = self._rivals = self._next_rivals = 0
         self._rival = self._next_rival = None
         if anew and (predicted is None or not self._is_on_way(tip, predicted)):
-            self._sights, self._passed = 0, []
+            self._sights, self._is_begun, self._passed = 0, False, []
         self._sights += seen
+        self._is_begun = self._is_begun or certain or self._sights >= _BEGUN
         motion = TipMotion.start(tip)
         if predicted is not None and predicted.known and not anew:
             motion = predicted.motion.updated(tip)
@@ -261,6 +264,8 @@ class Track:
         """Return whether the tip's place is known so well that half a sight of it is enough."""
         predicted = self.predict(insertion)
         if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
+            return False
+        if not self._is_begun:
             return False
         variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
         return variance < _CERTAIN**2

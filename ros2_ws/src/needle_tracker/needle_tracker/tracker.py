@@ -36,6 +36,7 @@ from needle_tracker.triangulation import SpatialTip
 HIDDEN = "the end is hidden in both images"
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
+_LOOSE_PX = 3.0  # a line so uncertain says next to nothing
 _ALONE_WAY = 5e-3  # and for so much insertion after both showed the needle well [m]
 # With no end in sight, lines so good tell where the needle is, for so much more insertion [px, m].
 _HIDDEN_LINE_PX, _HIDDEN_WAY = 1.0, 5e-3
@@ -246,7 +247,8 @@ class StereoTracker:
                 or insertion is None
                 or abs(insertion - self._sound_at) > _ALONE_WAY
             )
-            alone = contradicted and (far or not self.track.is_unbroken)
+            loose = sights is not None and any(tip.sigma_across > _LOOSE_PX for tip in sights.tips)
+            alone = (contradicted or loose) and (far or not self.track.is_unbroken)
             if sights is None or alone or self._contradicted > _CONTRADICTED:
                 return None
             found = sights.tips

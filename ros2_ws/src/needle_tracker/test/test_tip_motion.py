@@ -89,3 +89,12 @@ def test_one_direction_taken_in_says_nothing_of_the_others() -> None:
     # The heading follows where the tip turned out to be.
     assert taken.heading[1] > motion.heading[1]
     assert after[4] < before[4]
+
+
+def test_a_needle_out_of_sight_may_bend_the_same_way_all_along() -> None:
+    start = measured(np.zeros(3), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
+    at_once = TipMotion.start(start).advanced(12e-3, CURVATURE)
+    motion, way = TipMotion.start(start), 0.0
+    for _ in range(12):
+        motion, way = motion.advanced(1e-3, CURVATURE, way), way + 1e-3
+    np.testing.assert_allclose(motion.covariance[3:, 3:], at_once.covariance[3:, 3:], rtol=1e-9)
