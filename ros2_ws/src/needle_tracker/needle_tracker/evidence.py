@@ -16,7 +16,7 @@ Found = tuple[ImageTip | None, ImageTip | None]
 # and to be asked for again.
 NEAR_PX, NEAR_ALONG_PX = 0.6, 3.0
 CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
-_VISIBILITY_RATIO = 1.8  # of the two views
+_VISIBILITY_RATIO = 2.2  # of the two views
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did

@@ -26,6 +26,7 @@ _CERTAIN = 0.5e-3  # [m]
 # A needle that both views showed so often lies where it was seen; that is not soon forgotten.
 _ESTABLISHED, _PATIENCE = 10, 5
 _BEGUN = 2  # both views must have shown its end so often, or once beyond doubt, to be sure of it
+_NEAR_ENTRY = 10e-3  # up to here the entry says where it is [m]
 _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
 _BESIDE = 2.0e-3
@@ -265,7 +266,8 @@ class Track:
         predicted = self.predict(insertion)
         if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
             return False
-        if not self._is_begun:
+        assert insertion is not None
+        if not self._is_begun and insertion > _NEAR_ENTRY:
             return False
         variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
         return variance < _CERTAIN**2

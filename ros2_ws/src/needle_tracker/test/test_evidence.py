@@ -82,7 +82,7 @@ def test_how_much_light_there_is_says_nothing() -> None:
     usual.see((GOOD, GOOD))
     assert usual.is_like((dim, GOOD))
     assert is_sound((dim, GOOD), 0.3, 2.0)
-    shadow = dataclasses.replace(GOOD, visibility=GOOD.visibility / 2.0)
+    shadow = dataclasses.replace(GOOD, visibility=GOOD.visibility / 2.5)
     assert not usual.is_like((shadow, GOOD))
     assert not is_sound((shadow, GOOD), 0.3, 2.0)
 
@@ -93,7 +93,7 @@ def test_one_end_and_the_other_view_s_line_are_half_a_sight() -> None:
     assert is_half_sound((line, GOOD))
     assert not is_half_sound((line, line))
     assert not is_half_sound((GOOD, dataclasses.replace(line, sigma_across=0.9)))
-    assert not is_half_sound((GOOD, dataclasses.replace(line, visibility=0.3)))
+    assert not is_half_sound((GOOD, dataclasses.replace(line, visibility=0.25)))
     assert not is_half_sound((GOOD, None))
 
 

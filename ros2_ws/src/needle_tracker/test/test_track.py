@@ -115,6 +115,19 @@ def test_what_is_seen_twice_within_a_few_pairs_is_confirmed(
     assert (later is not None) is confirmed
 
 
+@pytest.mark.parametrize(("sights", "certain"), [(0, False), (1, False), (2, True)])
+def test_a_track_that_no_two_views_showed_is_not_certain(
+    gates: GateSettings, sights: int, certain: bool
+) -> None:
+    track = Track(gates)
+    for i in range(4):
+        track.accept(tip(z=0.05 + 1e-3 * i), 0.05 + 1e-3 * i, certain=False, seen=i < sights)
+    assert track.is_certain(0.054) is certain
+    plain = Track(gates)
+    plain.accept(tip(), 0.05)
+    assert plain.is_certain(0.05)
+
+
 def test_a_needle_kept_up_with_stays_uncertain_by_its_way(gates: GateSettings) -> None:
     track = Track(gates)
     track.accept(tip(z=0.05), 0.05)
