@@ -92,7 +92,7 @@ def edges_middle(
     place = reach + moment / total
     if not (is_something(level, place, half, -1) or is_something(level, place, half, 1)):
         return np.nan
-    return STEP_PX * (place - reach)
+    return float(STEP_PX * (place - reach))
 
 
 @compiled
