@@ -6,6 +6,9 @@ seen less well, has to be seen again, and again in agreement with itself.
 
 from __future__ import annotations
 
+import dataclasses
+import math
+
 from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, SOUND_ALONG_PX, SOUND_PX
 from needle_tracker.tip_fit import ImageTip
 from needle_tracker.track import TrackState
@@ -23,6 +26,7 @@ _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
 _FAINTER, _PLAINER = 0.7, 1.25  # than it did; what lies over it adds to it
 _NEW_SHARE = 0.2
+_UNLIKE_PX = 2.0  # what is unlike the needle lies so far beside it [px]
 
 
 def is_sound(found: Found, across_px: float, along_px: float) -> bool:
@@ -88,6 +92,16 @@ class UsualVisibility:
         if self._levels is None:
             return True
         return _FAINTER < tip.visibility / self._levels[i] < _PLAINER
+
+    def doubted(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
+        """Return the tips, with the line of one that is unlike the needle hardly known."""
+        left, right = (
+            tip
+            if self.is_like_in(i, tip)
+            else dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, _UNLIKE_PX))
+            for i, tip in enumerate(tips)
+        )
+        return left, right
 
 
 def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:

@@ -236,6 +236,8 @@ class StereoTracker:
             return None
         found, regions = looked
         found = self._hidden_ends.see(found)
+        if not self.track.is_unbroken:
+            found = self._usual.doubted(found)
         if predicted.known:
             sights = weighed(self.views, found, predicted.motion)
             contradicted = sights is not None and sights.contradicted

@@ -87,6 +87,18 @@ def test_how_much_light_there_is_says_nothing() -> None:
     assert not is_sound((shadow, GOOD), 0.3, 2.0)
 
 
+def test_what_is_unlike_the_needle_hardly_says_where_it_is() -> None:
+    usual = UsualVisibility()
+    unlike = dataclasses.replace(GOOD, visibility=0.95)
+    assert usual.doubted((unlike, GOOD)) == (unlike, GOOD)
+    usual.see((GOOD, GOOD))
+    assert usual.doubted((GOOD, GOOD)) == (GOOD, GOOD)
+    left, right = usual.doubted((unlike, GOOD))
+    assert left.sigma_across > 20.0 * GOOD.sigma_across
+    assert left.sigma_along == GOOD.sigma_along
+    assert right == GOOD
+
+
 def test_one_end_and_the_other_view_s_line_are_half_a_sight() -> None:
     line = hidden(GOOD)
     assert is_half_sound((GOOD, line))
