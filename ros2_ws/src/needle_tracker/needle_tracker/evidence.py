@@ -10,6 +10,7 @@ import dataclasses
 import math
 
 from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, SOUND_ALONG_PX, SOUND_PX
+from needle_tracker.following import is_sound as shows_end_well
 from needle_tracker.tip_fit import ImageTip
 from needle_tracker.track import TrackState
 
@@ -53,10 +54,7 @@ def is_half_sound(found: Found) -> bool:
     if left is None or right is None or not _look_alike(left, right):
         return False
     lines = max(left.sigma_across, right.sigma_across) <= NEAR_PX
-    return lines and any(
-        tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= SOUND_ALONG_PX
-        for tip in (left, right)
-    )
+    return lines and (shows_end_well(left) or shows_end_well(right))
 
 
 def _look_alike(left: ImageTip, right: ImageTip) -> bool:

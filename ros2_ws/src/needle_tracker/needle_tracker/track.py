@@ -25,7 +25,7 @@ _HIDDEN_PER_LOST = 4
 _CERTAIN = 0.5e-3  # [m]
 # A needle that both views showed so often lies where it was seen; that is not soon forgotten.
 _ESTABLISHED, _PATIENCE = 10, 5
-_BEGUN = 2  # both views must have shown its end so often, or once beyond doubt, to be sure of it
+_SURE = 2  # both views must have shown its end so often, or once beyond doubt, to be sure of it
 _NEAR_ENTRY = 10e-3  # up to here the entry says where it is [m]
 _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
@@ -96,7 +96,7 @@ class Track:
         self._rivals = self._next_rivals = 0
         self._agreeing = 0
         self._sights = 0
-        self._is_begun = False
+        self._is_sure = False
         self._passed: list[tuple[float, Array]] = []
 
     def enter(self) -> None:
@@ -126,19 +126,17 @@ class Track:
         motion = anchor.motion.advanced(ahead, self._settings.reach.curvature, anchor.unseen)
         return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
 
-    def keep_up(self, motion: TipMotion, insertion: float) -> None:
+    def keep_up(self, predicted: Anchor, motion: TipMotion) -> None:
         """Take what one view alone says of a needle that is not believed for the moment.
 
         Parameters
         ----------
+        predicted : Anchor
+            From `predict`.
         motion : TipMotion
-            The prediction, with that taken in.
-        insertion : float
-            Length of needle in the phantom at the exposure [m].
+            The same with that taken in.
         """
-        predicted = self.predict(insertion)
-        assert predicted is not None
-        self.anchor = Anchor(motion, insertion, unseen=predicted.unseen)
+        self.anchor = Anchor(motion, predicted.insertion, unseen=predicted.unseen)
 
     def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
         """Return why a measured tip is not believed, None where it passes all gates.
@@ -204,9 +202,9 @@ class Track:
         self._misses = self._hidden = self._rivals = self._next_rivals = 0
         self._rival = self._next_rival = None
         if anew and (predicted is None or not self._is_on_way(tip, predicted)):
-            self._sights, self._is_begun, self._passed = 0, False, []
+            self._sights, self._is_sure, self._passed = 0, False, []
         self._sights += seen
-        self._is_begun = self._is_begun or certain or self._sights >= _BEGUN
+        self._is_sure = self._is_sure or certain or self._sights >= _SURE
         motion = TipMotion.start(tip)
         if predicted is not None and predicted.known and not anew:
             motion = predicted.motion.updated(tip)
@@ -267,7 +265,7 @@ class Track:
         if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
             return False
         assert insertion is not None
-        if not self._is_begun and insertion > _NEAR_ENTRY:
+        if not self._is_sure and insertion > _NEAR_ENTRY:
             return False
         variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
         return variance < _CERTAIN**2

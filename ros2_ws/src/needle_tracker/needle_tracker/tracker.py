@@ -166,13 +166,13 @@ class StereoTracker:
     def _keep_up(self, images: tuple[Image, Image], insertion: float | None) -> None:
         """Follow with one view what both together do not show."""
         predicted, last = self.track.predict(insertion), self._last
-        if predicted is None or last is None or insertion is None or not predicted.known:
+        if predicted is None or last is None or not predicted.known:
             return
         if not self.track.has_begun or abs(predicted.ahead) > _FOLLOW_AHEAD:
             return
         kept = kept_up(self._follower, images, predicted, last, self._usual)
         if kept is not None:
-            self.track.keep_up(kept[0], insertion)
+            self.track.keep_up(predicted, kept[0])
             self._last = self._steadied(*kept[1])
 
     def skip(self, reason: str) -> Measurement:
