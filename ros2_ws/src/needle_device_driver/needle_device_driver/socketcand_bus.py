@@ -41,6 +41,7 @@ class SocketcandBus(BusABC):
         self.malformed = 0
         self._write_timeout = write_timeout
         self._piece = b""
+        self._too_long = False
         self._said: deque[str] = deque()
         self._socket = socket.create_connection((host, port), _CONNECT_WAIT)
         try:
@@ -109,13 +110,21 @@ class SocketcandBus(BusABC):
             raise CanOperationError("the server hung up")
         # An answer at once, not with the next frame.
         self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
-        *whole, self._piece = (self._piece + data).split(b">")
+        *whole, piece = (self._piece + data).split(b">")
         for message in whole:
-            start = message.rfind(b"<")
-            if start < 0:
-                self.malformed += 1
-                continue
-            self._said.append(message[start:].decode("ascii", errors="replace") + ">")
-        if len(self._piece) > _LONGEST_MESSAGE:
-            self.malformed += 1
-            self._piece = b""
+            too_long = self._is_too_long(message)
+            self._too_long = False
+            start = message.rfind(b"<", -_LONGEST_MESSAGE)
+            if start >= 0:
+                self._said.append(message[start:].decode("ascii", errors="replace") + ">")
+            else:
+                self.malformed += not too_long
+        self._too_long = self._is_too_long(piece)
+        self._piece = piece[-_LONGEST_MESSAGE:]
+
+    def _is_too_long(self, message: bytes) -> bool:
+        """Count what does not end, once: in whatever pieces it comes, it is one error."""
+        if self._too_long or len(message) <= _LONGEST_MESSAGE:
+            return self._too_long
+        self.malformed += 1
+        return True

@@ -319,18 +319,25 @@ def test_socketcand_carries_frames_and_its_end_is_a_lost_link(make_link: Make) -
     assert not thread.is_alive()
 
 
-def test_socketcand_frames_may_come_with_the_answer_in_any_pieces(make_link: Make) -> None:
+@pytest.mark.parametrize("length", [1, 7, 150, 250, 1000])
+def test_socketcand_frames_may_come_with_the_answer_in_any_pieces(
+    make_link: Make, length: int
+) -> None:
     daemon = Daemon(b"< hi >", b"< ok >", b"< ok >< frame 181 1.5 3702 >< frame 18")
     link = make_link(LinkSettings("socketcand", "can0", host="localhost", port=daemon.port))
     frames = received(link, 0x181)
     link.open()
     daemon.thread.join(5.0)
     assert daemon.connection is not None
-    daemon.connection.sendall(b"1 1.6  >\xff\xfe>< frame x y z >" + b"?" * 300)
-    daemon.connection.sendall(b">< error 004 1.7 >< frame 181 1.8 ab >")
-    wait_for(link, lambda: len(frames) == 3)
-    assert frames == [b"\x37\x02", b"", b"\xab"]
-    assert link.errors == 4
+    daemon.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    # Five errors: no frame, a frame of nonsense, two that do not end, and the bus's own.
+    rest = b"1 1.6  >\xff\xfe>< frame x y z >" + b"?" * 300 + b">< error 004 1.7 >"
+    rest += b"< frame 181 1.8 ab >" + b"?" * 300 + b"< frame 181 1.9 cd >"
+    for start in range(0, len(rest), length):
+        daemon.connection.sendall(rest[start : start + length])
+    wait_for(link, lambda: len(frames) == 4)
+    assert frames == [b"\x37\x02", b"", b"\xab", b"\xcd"]
+    assert link.errors == 5
     assert not link.lost
     daemon.close()
 
