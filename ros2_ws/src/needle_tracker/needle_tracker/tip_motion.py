@@ -1,8 +1,9 @@
 """Where the tip goes: a Kalman filter over the insertion for its position and heading.
 
-The state is the tip p and its heading h, a vector of about unit length; the needle goes its
-heading's way, which bends by at most the largest curvature: p' = p + s h, h' = h + (random, up to
-kappa s), with s the insertion in between.
+The state is the tip p and its heading h, a unit vector; the needle goes its heading's way, which
+bends by at most the largest curvature: p' = p + s h, h' = h + (random across h, up to kappa s),
+with s the insertion in between. It goes as far as the stage pushes it: what is off along h changes
+p, not the length of h.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class TipMotion:
     position : ndarray, shape (3,)
         In `rig` [m].
     heading : ndarray, shape (3,)
-        About a unit vector.
+        Unit vector.
     covariance : ndarray, shape (6, 6)
         Of both [m^2, m, -].
     """
@@ -48,7 +49,7 @@ class TipMotion:
         """Return the state after a first tip: the heading is that of the visible end, loosely."""
         covariance = np.zeros((6, 6))
         covariance[:3, :3] = tip.covariance
-        covariance[3:, 3:] = _LEAN_SIGMA**2 * np.eye(3)
+        covariance[3:, 3:] = _LEAN_SIGMA**2 * across(tip.direction)
         return cls(tip.position, tip.direction, covariance)
 
     def advanced(self, ahead: float, curvature: float, unseen: float = 0.0) -> TipMotion:
@@ -70,12 +71,17 @@ class TipMotion:
         turned = curvature * math.sqrt(way * (way + 2.0 * unseen))
         noise = np.zeros((6, 6))
         noise[:3, :3] = (_DRIFT**2 + (0.5 * turned * ahead) ** 2) * np.eye(3)
-        noise[3:, 3:] = turned**2 * np.eye(3)
+        noise[3:, 3:] = turned**2 * across(self.heading)
         return TipMotion(
             self.position + ahead * self.heading,
             self.heading,
             transition @ self.covariance @ transition.T + noise,
         )
+
+    @property
+    def sigma(self) -> float:
+        """Largest standard deviation of the position in any direction [m]."""
+        return math.sqrt(float(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
 
     def surprise(self, tip: SpatialTip) -> float:
         """Return the squared distance of a measured tip, over the covariance of both."""
@@ -112,11 +118,25 @@ class TipMotion:
         # K (1 - K): most where prediction and measurement count alike.
         share = gain[:3] @ slope
         left[:3, :3] += _ALIKE * (np.eye(3) - share) @ share @ left[:3, :3]
+        # What shifts an end along the needle (bevel, blur, light) shifts the next one as far: along
+        # it nothing averages out.
+        along = self.heading
+        k = min(max(float(along @ share @ along), 0.0), 1.0)
+        same = 2.0 * math.sqrt(k * (1.0 - k)) * float(along @ left[:3, :3] @ along)
+        left[:3, :3] += same * np.outer(along, along)
         # A surprise says that one of the two is wrong, not which.
         surprise = float(off @ np.linalg.solve(both, off))
         if surprise > _NO_SURPRISE:
             apart = np.linalg.pinv(slope) @ off
             left[:3, :3] += _APART * (1.0 - _NO_SURPRISE / surprise) * np.outer(apart, apart)
+        heading = self.heading + change[3:]
         return TipMotion(
-            self.position + change[:3], self.heading + change[3:], 0.5 * (left + left.T)
+            self.position + change[:3],
+            heading / np.linalg.norm(heading),
+            0.5 * (left + left.T),
         )
+
+
+def across(unit: Array) -> Array:
+    """Return the projection onto the plane across a unit vector, (3, 3)."""
+    return np.eye(3) - np.outer(unit, unit)

@@ -91,6 +91,51 @@ def test_one_direction_taken_in_says_nothing_of_the_others() -> None:
     assert after[4] < before[4]
 
 
+def test_the_stage_says_how_fast_the_needle_goes() -> None:
+    """Ends that are seen too far along it, time after time, do not make it go faster."""
+    start = measured(np.zeros(3), np.full(3, 2e-5), np.array([0.0, 0.0, 1.0]))
+    motion = TipMotion.start(start)
+    for number in range(1, 6):
+        motion = motion.advanced(1e-3, CURVATURE)
+        motion = motion.updated(
+            measured(
+                np.array([number * 0.2e-3, 0.0, number * 1.3e-3]), np.full(3, 1e-4), start.direction
+            )
+        )
+    assert motion.heading[0] > 0.1
+    way = motion.advanced(4e-3, CURVATURE).position - motion.position
+    assert np.linalg.norm(way) == pytest.approx(4e-3, rel=1e-12)
+
+
+def test_what_shifts_every_end_along_the_needle_does_not_average_out() -> None:
+    """A bevel, blur or light is the same in the next pair; noise across is not."""
+    rng, sigma = np.random.default_rng(8), np.array([1e-4, 1e-4, 1e-4])
+    heading, shift = np.array([0.0, 0.0, 1.0]), 1.5e-4
+    motion = TipMotion.start(measured(np.array([0.0, 0.0, shift]), sigma, heading))
+    for number in range(1, 31):
+        noise = np.array([*rng.normal(0.0, sigma[:2]), shift])
+        motion = motion.advanced(1e-3, CURVATURE)
+        motion = motion.updated(measured(number * 1e-3 * heading + noise, sigma, heading))
+    known = np.sqrt(np.diag(motion.covariance)[:3])
+    assert known[2] > 0.9 * sigma[2]
+    assert max(known[:2]) < 0.8 * sigma[0]
+
+
+def test_how_far_the_needle_goes_is_not_in_doubt() -> None:
+    start = measured(np.zeros(3), np.full(3, 2e-5), np.array([0.6, 0.0, 0.8]))
+    motion = TipMotion.start(start).advanced(5e-3, CURVATURE)
+    heading = motion.covariance[3:, 3:]
+    np.testing.assert_allclose(heading @ start.direction, 0.0, atol=1e-12)
+    assert np.linalg.matrix_rank(heading, tol=1e-6) == 2
+
+
+def test_the_largest_sigma_is_that_of_the_worst_direction() -> None:
+    sigmas = np.array([1e-5, 4e-5, 2e-5])
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
+    tip = SpatialTip(np.zeros(3), turn @ np.diag(sigmas**2) @ turn.T, turn[2], np.eye(3), 0.0, 0.0)
+    assert TipMotion.start(tip).sigma == pytest.approx(4e-5)
+
+
 def test_a_needle_out_of_sight_may_bend_the_same_way_all_along() -> None:
     start = measured(np.zeros(3), np.full(3, 1e-5), np.array([0.0, 0.0, 1.0]))
     at_once = TipMotion.start(start).advanced(12e-3, CURVATURE)
