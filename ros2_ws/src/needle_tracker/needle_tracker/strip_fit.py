@@ -42,6 +42,9 @@ _ROWS_ALIKE = 3.0
 # as the needle [its contrast]; how far their middles may be apart [px], and what more is worth.
 _FOOT, _TOP = (0.15, 0.4), (0.5, 0.8)
 _EVEN_PX, _LOPSIDED, _MOST_LOPSIDED_PX = 0.05, 0.8, 0.25
+# Edges that fall over more than this are blurred: what shape the end has, and what lies beside the
+# needle, then hardly shows, across and along [px]. A bevel draws the middle line aside, too.
+_SHARP_PX, _BLUR_ACROSS, _BLUR_ALONG, _TAPER_ACROSS = 1.7, 0.1, 1.7, 0.025
 
 
 @compiled
@@ -245,7 +248,7 @@ def fit_strip(
         shift = a + b * stop
     prior = 0.0
     along = line = slope = sigma_line = sigma_slope = level = noise = before = after = fall = 0.0
-    doubt = sigma_end = light = 0.0
+    doubt = sigma_end = light = edge = beyond = 0.0
     count = 0
     for _ in range(3):
         scale = math.sqrt(1.0 + b * b)
@@ -288,8 +291,10 @@ def fit_strip(
     result[1] = end[1] + stop * direction[1] + shift * direction[0]
     result[2] = (direction[0] - b * direction[1]) / scale
     result[3] = (direction[1] + b * direction[0]) / scale
-    result[4] = sigma_line
-    result[5] = math.hypot(sigma_end, doubt)
+    blur = max(edge - _SHARP_PX, 0.0)
+    aside = math.hypot(_BLUR_ACROSS * blur, _TAPER_ACROSS * beyond)
+    result[4] = math.hypot(sigma_line, aside)
+    result[5] = math.hypot(math.hypot(sigma_end, doubt), _BLUR_ALONG * blur)
     result[6] = sigma_slope
     result[7] = level / width
     result[8] = before

@@ -119,3 +119,40 @@ def test_a_line_without_an_end_is_no_tip(make_line: Callable[..., np.ndarray]) -
     image = np.round(make_line((300, 300), ends, 4.6, 60.0, 150.0)).astype(np.uint8)
     path = coarse_path(np.array([50.0, 150.0]), np.array([150.0, 150.0]), np.zeros(2))
     assert fit_tip(image, path, SETTINGS) is None
+
+
+def draw_needle(end: np.ndarray, bevel: float, blur: float, noise: np.ndarray) -> np.ndarray:
+    """Return a needle along u that is 4.6 px wide; one of its edges ends `bevel` px before it."""
+    fine = 8
+    corners = np.array([[0.0, -2.3], [-bevel, 2.3], [-100.0, 2.3], [-100.0, -2.3]]) + end
+    mask = np.zeros((300 * fine, 300 * fine), np.uint8)
+    cv2.fillPoly(mask, [np.round((corners + 0.5) * fine - 0.5).astype(np.int32)], 255)
+    share = cv2.resize(mask, (300, 300), interpolation=cv2.INTER_AREA) / 255.0
+    image = cv2.GaussianBlur(180.0 - 120.0 * share, (0, 0), blur) + noise
+    return np.asarray(np.clip(np.round(image), 0, 255), dtype=np.uint8)
+
+
+@pytest.mark.parametrize("bevel", [0.0, 5.0, 10.0])
+@pytest.mark.parametrize("blur", [0.7, 1.5, 2.2])
+def test_how_well_an_end_is_known_fits_bevels_and_blur(bevel: float, blur: float) -> None:
+    rng = np.random.default_rng(3)
+    squares, sigmas = [], []
+    for _ in range(12):
+        end = np.array([180.0, 150.0]) + rng.uniform(-0.5, 0.5, 2)
+        image = draw_needle(end, bevel, blur, rng.normal(0.0, 3.0, (300, 300)))
+        about = end + np.array([rng.uniform(-4, 4), 0.0])
+        path = coarse_path(end - np.array([100.0, 0.0]), about, rng.uniform(-1.0, 1.0, 2))
+        tip = fit_tip(image, path, SETTINGS, 8.0)
+        assert tip is not None
+        assert tip.clear
+        error = tip.point - end
+        squares.append([(error[1] / tip.sigma_across) ** 2, (error[0] / tip.sigma_along) ** 2])
+        sigmas.append([tip.sigma_across, tip.sigma_along])
+    assert np.all(np.mean(squares, axis=0) < 6.0)
+    across, along = np.median(sigmas, axis=0)
+    if blur > 2.0:
+        assert across > 0.1
+        assert along > 0.8
+    elif bevel == 0.0 and blur < 1.0:
+        assert across < 0.06
+        assert along < 0.2
