@@ -22,14 +22,13 @@ from needle_tracker.detection import (
     without_shadows,
 )
 from needle_tracker.evidence import (
-    NEAR_ALONG_PX,
-    NEAR_PX,
     UsualVisibility,
-    is_half_sound,
     is_sound,
+    shows_lines,
     sights_against,
     sights_for,
 )
+from needle_tracker.following import SOUND_ALONG_PX, SOUND_PX
 from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
 from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
@@ -47,6 +46,7 @@ UNCLEAR = "not clear enough to begin with"
 # A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
 # that is to say which of two ends is the needle's.
 _YOUNG, _YOUNG_SURPRISE, _YOUNG_NEAR = 15e-3, 9.0, 2.0
+_AGREE = 1e-3  # two views that say the same do so along the needle, too [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
 _GRID_AHEAD = 1.5e-3
 _GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
@@ -177,7 +177,10 @@ class Acquisition:
         tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured
-        problem = self._shaft_problem(paths, tip, insertion)
+        # How long a short shaft is, its coarse path hardly says; its ends do.
+        plain = not wanted and is_sound(found, SOUND_PX, SOUND_ALONG_PX)
+        young = plain and self._begins_at_entry(measured, insertion)
+        problem = self._shaft_problem(paths, tip, None if young else insertion)
         if problem is not None:
             return dataclasses.replace(measured, tip=None, reason=problem)
         if not wanted:
@@ -204,23 +207,36 @@ class Acquisition:
             return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
         if track.fits(measured.tip, insertion, on_way=False):
             return 0
+        if self._is_borne_out(measured.tip, found, insertion, on_way=on_way):
+            return 0
         near = on_way and track.fits(measured.tip, insertion, on_way=True)
-        if not track.has_begun and self._begins_at_entry(measured, insertion):
+        if self._begins_at_entry(measured, insertion):
             return 0
         return sights_for(track.state, measured.image_tips, alike=alike, near=near)
 
+    def _is_borne_out(
+        self, tip: SpatialTip, found: Last, insertion: float | None, *, on_way: bool
+    ) -> bool:
+        """Return whether a tip, seen well or not, is just where it is waited for."""
+        track = self._track
+        if not shows_lines(found) or tip.disagreement > _AGREE:
+            return False
+        if track.state is TrackState.CONFIRMING:
+            return track.fits(tip, insertion, on_way=True)
+        return on_way and track.expects(tip, insertion) and self._usual.allows(found)
+
     def _begins_at_entry(self, measured: Measurement, insertion: float | None) -> bool:
-        """Return whether a short needle is seen about where the entry has it.
+        """Return whether a short needle is first seen about where the entry has it.
 
         There it is enough to see it less well: nothing else begins at the entry, and a needle that
         waits for its first tip to be found never gets to where it is seen better.
         """
-        if insertion is None or insertion > _YOUNG or measured.tip is None:
+        tip = measured.tip
+        if self._track.has_begun or insertion is None or insertion > _YOUNG or tip is None:
             return False
-        found = measured.image_tips
-        if not (is_sound(found, NEAR_PX, NEAR_ALONG_PX) or is_half_sound(found)):
+        if not shows_lines(measured.image_tips):
             return False
-        return self._entry_surprise(measured.tip, insertion) < _YOUNG_SURPRISE
+        return self._entry_surprise(tip, insertion) < _YOUNG_SURPRISE
 
     def _entry_surprise(self, tip: SpatialTip, insertion: float) -> float:
         """Return how far a tip is from where the entry has it, squared, over the covariance."""
@@ -231,15 +247,21 @@ class Acquisition:
     def _one_sided(
         self, found: tuple[ImageTip, ImageTip], insertion: float, last: Last | None
     ) -> Measurement | None:
-        """Believe the one end of two that fits what is known; None where none or both do."""
+        """Believe the one end of two that fits what is known, the more so where both do.
+
+        None where neither does, or both and nothing says which.
+        """
         left, right = found
-        fitting = [
-            measured
-            for side in ((left, hidden(right)), (hidden(left), right))
-            if (measured := judged(self._views, self._track, side, insertion)).tip is not None
-            and (last is not None or self._is_near_entry(measured.tip, insertion))
-        ]
-        return fitting[0] if len(fitting) == 1 else None
+        fitting: list[tuple[SpatialTip, Measurement]] = []
+        for side in ((left, hidden(right)), (hidden(left), right)):
+            measured = judged(self._views, self._track, side, insertion)
+            tip = measured.tip
+            if tip is not None and (last is not None or self._is_near_entry(tip, insertion)):
+                fitting.append((tip, measured))
+        if len(fitting) > 1:
+            fitting = [each for each in fitting if self._track.expects(each[0], insertion)]
+            fitting.sort(key=lambda each: self._track.surprise(each[0], insertion))
+        return fitting[0][1] if fitting else None
 
     def _is_near_entry(self, tip: SpatialTip, insertion: float) -> bool:
         return insertion <= _YOUNG and self._entry_surprise(tip, insertion) < _YOUNG_NEAR

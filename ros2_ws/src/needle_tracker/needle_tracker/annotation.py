@@ -61,7 +61,7 @@ def annotate(left: Image, right: Image, measured: Measurement) -> Image:
 
 
 def describe(measured: Measurement) -> str:
-    """Return one line of text: the state, and the tip or why there is none."""
+    """Return one line of text: the state, the tip, and why there is none, or of one view alone."""
     if measured.tip is None:
         return f"{measured.state.value}: {measured.reason}"
     place = ", ".join(
@@ -70,7 +70,9 @@ def describe(measured: Measurement) -> str:
             "xyz", measured.tip.position, np.diag(measured.tip.covariance), strict=True
         )
     )
-    return f"{measured.state.value}: {place} mm"
+    return f"{measured.state.value}: {place} mm" + (
+        f" ({measured.reason})" if measured.reason else ""
+    )
 
 
 def _view(image: Image, tip: ImageTip | None, region: Expected | None, believed: bool) -> Image:

@@ -18,7 +18,7 @@ Found = tuple[ImageTip | None, ImageTip | None]
 
 # Standard deviations of an end that is seen, across and along [px]: well enough where it must be,
 # and to be asked for again.
-NEAR_PX, NEAR_ALONG_PX = 0.6, 3.0
+_NEAR_PX, _NEAR_ALONG_PX = 0.6, 3.0
 CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
 _VISIBILITY_RATIO = 2.2  # of the two views
 # So many in a row that agree win against the track, or without one that is good.
@@ -26,6 +26,9 @@ _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
 _FAINTER, _PLAINER = 0.7, 1.25  # than it did; what lies over it adds to it
+# Where the needle must be, light on it may take more away; and one whose line [px] nothing disturbs
+# may stand out more.
+_DIM, _PLAINEST, _UNDISTURBED_PX = 0.4, 1.4, 0.2
 _NEW_SHARE = 0.2
 _UNLIKE_PX = 2.0  # what is unlike the needle lies so far beside it [px]
 
@@ -48,12 +51,17 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
     )
 
 
+def shows_lines(found: Found) -> bool:
+    """Return whether both views show at least the needle's line."""
+    return all(tip is not None and tip.sigma_across <= CLEAR_PX for tip in found)
+
+
 def is_half_sound(found: Found) -> bool:
     """Return whether one view shows the needle's end well, and the other at least its line."""
     left, right = found
     if left is None or right is None or not _look_alike(left, right):
         return False
-    lines = max(left.sigma_across, right.sigma_across) <= NEAR_PX
+    lines = max(left.sigma_across, right.sigma_across) <= _NEAR_PX
     return lines and (shows_end_well(left) or shows_end_well(right))
 
 
@@ -91,6 +99,16 @@ class UsualVisibility:
             return True
         return _FAINTER < tip.visibility / self._levels[i] < _PLAINER
 
+    def allows(self, tips: tuple[ImageTip, ImageTip]) -> bool:
+        """Return whether these can be the needle, if they lie where it must be."""
+        return all(self._allows_in(i, tip) for i, tip in enumerate(tips))
+
+    def _allows_in(self, i: int, tip: ImageTip) -> bool:
+        if self._levels is None:
+            return True
+        plainest = _PLAINEST if tip.sigma_across <= _UNDISTURBED_PX else _PLAINER
+        return _DIM < tip.visibility / self._levels[i] < plainest
+
     def doubted(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
         """Return the tips, with the line of one that is unlike the needle hardly known."""
         left, right = (
@@ -118,7 +136,7 @@ def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool
     """
     # While the needle is followed, what looks unlike it is what lies beside or over it.
     unlike = state is TrackState.TRACKING and not alike
-    if unlike or not is_sound(found, SOUND_PX, SOUND_ALONG_PX):
+    if unlike or not is_sound(found, SOUND_PX, _NEAR_ALONG_PX):
         return 0
     sure = on_way or is_sound(found, PLAIN_PX, PLAIN_ALONG_PX) or state is not TrackState.TRACKING
     return _SOUND_SIGHTS + (0 if alike else _MORE_UNLIKE) + (0 if sure else _MORE_TRACKING)
@@ -143,7 +161,7 @@ def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> i
     int or None
         0 where one will do, None where it is not seen well enough for any number.
     """
-    if near and alike and is_sound(found, NEAR_PX, NEAR_ALONG_PX):
+    if near and alike and is_sound(found, _NEAR_PX, _NEAR_ALONG_PX):
         return 0
     more = 0 if alike else _MORE_UNLIKE
     if is_sound(found, SOUND_PX, SOUND_ALONG_PX):

@@ -42,6 +42,7 @@ class Health:
         default_factory=lambda: deque(maxlen=1000)
     )
     _tips: int = 0
+    _single_tips: int = 0
     _state: TrackState = TrackState.SEARCHING
     _reason: str = "no images yet"
 
@@ -65,6 +66,7 @@ class Health:
             self.rejected[measured.reason] += 1
         else:
             self._tips += 1
+            self._single_tips += bool(measured.reason)
 
     def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
         """Note whether images were dropped for want of a partner since the last call."""
@@ -77,6 +79,7 @@ class Health:
         good = self._state in (TrackState.TRACKING, TrackState.ENTRY) and not self._reason
         message = self._state.value + (f": {self._reason}" if self._reason else "")
         values = {"state": self._state.value, "reason": self._reason, "tips": str(self._tips)}
+        values["tips of single views"] = str(self._single_tips)
         values.update({f"no tip: {reason}": str(n) for reason, n in self.rejected.items()})
         return Diagnostic(Level.OK if good else Level.WARN, message, values)
 

@@ -21,7 +21,8 @@ class Measurement:
     state : TrackState
         State of the track after this pair.
     reason : str
-        Why there is no believed tip; empty where there is one.
+        Why both views together gave no believed tip; empty where they did. With it there may be a
+        tip of single views.
     image_tips : pair of (ImageTip or None)
         What was found in the left and the right image, believed or not.
     contested : SpatialTip or None

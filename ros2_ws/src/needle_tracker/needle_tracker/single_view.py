@@ -1,11 +1,13 @@
 """What one view alone says of a followed needle that both together do not show.
 
 A needle that one camera does not see for a while is not lost: the other says where it is but for
-the depth, and that hardly changes on its way. No tip is measured so; but it is found again at once.
+the depth, and that hardly changes on its way. As long as the prediction knows that well, there is a
+tip; and when both see the needle again it is found at once.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -16,12 +18,16 @@ from needle_tracker.evidence import UsualVisibility
 from needle_tracker.following import SLACK, Follower, is_sound, misfit
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.tip_fit import ImageTip
-from needle_tracker.tip_motion import TipMotion
+from needle_tracker.tip_motion import TipMotion, across
 from needle_tracker.track import Anchor
+from needle_tracker.triangulation import SpatialTip
 
 # Standard deviations: what is farther from the prediction is something else. A prediction that is
 # not known so well [px] says too little of what is seen.
-_BORNE_OUT, _KNOWN_PX = 3.0, 2.5
+_BORNE_OUT, _KNOWN_PX = 2.0, 2.5
+_KNOWN = 0.3e-3  # so well must a tip be known, seen by one view and before [m]
+
+Seen = tuple[ImageTip | None, ImageTip | None]
 
 
 def kept_up(
@@ -30,7 +36,7 @@ def kept_up(
     predicted: Anchor,
     last: tuple[ImageTip, ImageTip],
     usual: UsualVisibility,
-) -> tuple[TipMotion, tuple[ImageTip, ImageTip]] | None:
+) -> tuple[TipMotion, Seen] | None:
     """Return the prediction with what single views bear out of it taken in, and what they see.
 
     Parameters
@@ -50,10 +56,11 @@ def kept_up(
     -------
     motion : TipMotion
         In `rig`.
-    seen : pair of ImageTip
-        As seen now, where it is, or last.
+    seen : pair of (ImageTip or None)
+        Of the left and the right view, where it bears the prediction out.
     """
-    motion, seen = predicted.motion, list(last)
+    motion = predicted.motion
+    seen: list[ImageTip | None] = [None, None]
     for i, view in enumerate(follower.views):
         looked = follower.look_in(i, images[i], predicted, last[i])
         if looked is None:
@@ -64,6 +71,41 @@ def kept_up(
     if motion is predicted.motion:
         return None
     return motion, (seen[0], seen[1])
+
+
+def seen_alone(
+    predicted: Anchor, motion: TipMotion, believed: SpatialTip, curvature: float
+) -> SpatialTip | None:
+    """Return the tip of a needle that one view keeps up with.
+
+    Parameters
+    ----------
+    predicted : Anchor
+        Where the tip must be now.
+    motion : TipMotion
+        The same with what is seen taken in.
+    believed : SpatialTip
+        The last tip that both views showed.
+    curvature : float
+        The needle's largest [1/m].
+
+    Returns
+    -------
+    SpatialTip or None
+        Its direction is the last that was seen, the less known the farther the needle went since;
+        None where the tip is not known well enough.
+    """
+    if max(predicted.motion.sigma, motion.sigma) > _KNOWN:
+        return None
+    turned = (curvature * predicted.unseen) ** 2 * across(believed.direction)
+    return dataclasses.replace(
+        believed,
+        position=motion.position,
+        covariance=motion.covariance[:3, :3].copy(),
+        direction_covariance=believed.direction_covariance + turned,
+        disagreement=0.0,
+        disagreement_across=0.0,
+    )
 
 
 def _is_borne_out(view: RefractedCamera, tip: ImageTip, predicted: Anchor) -> bool:

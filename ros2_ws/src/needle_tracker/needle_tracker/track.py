@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,9 @@ _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 _BESIDE = 2.0e-3
 _CONFIRM_KNOWN = 2
 _CONFIRM_MISSES = 2  # so many pairs may lie between
-_NO_SURPRISE = 9.0  # squared, over its covariance
+_EXPECTED, _NO_SURPRISE = 4.0, 9.0  # squared, over its covariance
 _NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
+_ABOUT = 1.5e-3  # what is known worse bears nothing out (one sigma) [m]
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
@@ -267,17 +269,25 @@ class Track:
         assert insertion is not None
         if not self._is_sure and insertion > _NEAR_ENTRY:
             return False
-        variance = float(np.linalg.eigvalsh(predicted.motion.covariance[:3, :3])[-1])
-        return variance < _CERTAIN**2
+        return predicted.motion.sigma < _CERTAIN
 
     def fits(self, tip: SpatialTip, insertion: float | None, *, on_way: bool) -> bool:
         """Return whether a tip is where it must be, by a prediction that is certain."""
-        predicted = self.predict(insertion)
-        certain = predicted is not None and (on_way or self.is_certain(insertion))
-        if predicted is None or not certain:
+        if not (on_way or self.is_certain(insertion)):
             return False
-        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
-        return miss < _NEAR and predicted.motion.surprise(tip) < _NO_SURPRISE
+        return _is_about(tip, self.predict(insertion), _NEAR, _NO_SURPRISE)
+
+    def expects(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Return whether a tip is where it is most likely, and that is known about."""
+        predicted = self.predict(insertion)
+        if predicted is None or predicted.motion.sigma > _ABOUT:
+            return False
+        return _is_about(tip, predicted, _FAR, _EXPECTED)
+
+    def surprise(self, tip: SpatialTip, insertion: float | None) -> float:
+        """Return how far a tip is from its prediction, squared, over the covariance of both."""
+        predicted = self.predict(insertion)
+        return math.inf if predicted is None else predicted.motion.surprise(tip)
 
     def is_excluded(self, tip: SpatialTip, insertion: float | None) -> bool:
         """Return whether a needle that was seen so well before cannot have got to a tip."""
@@ -364,3 +374,11 @@ class Track:
         way = predicted.unseen
         bend = 0.5 * settings.reach.curvature * way * way
         return settings.step_margin + _HEADING_TOLERANCE * way + bend
+
+
+def _is_about(tip: SpatialTip, predicted: Anchor | None, miss: float, surprise: float) -> bool:
+    """Return whether a tip is nearer to its prediction than both [m, squared over covariance]."""
+    if predicted is None or not predicted.known:
+        return False
+    off = float(np.linalg.norm(tip.position - predicted.motion.position))
+    return off < miss and predicted.motion.surprise(tip) < surprise

@@ -27,13 +27,14 @@ from needle_tracker.following import (
 from needle_tracker.gates import UNCERTAIN, tip_at_entry
 from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
-from needle_tracker.single_view import kept_up
+from needle_tracker.single_view import Seen, kept_up, seen_alone
 from needle_tracker.tip_fit import ImageTip
-from needle_tracker.track import Track
+from needle_tracker.track import SURPRISING, TOO_FAR, Track, TrackState
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 
 HIDDEN = "the end is hidden in both images"
+ONE_VIEW, EACH_VIEW = "one view alone", "each view by itself"
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
 _LOOSE_PX = 3.0  # a line so uncertain says next to nothing
@@ -75,6 +76,7 @@ class StereoTracker:
             self.views, self._detection, settings, self.track, self._usual
         )
         self._last: tuple[ImageTip, ImageTip] | None = None
+        self._believed: SpatialTip | None = None
         self._contradicted = 0
         self._hidden_ends = HiddenEnds()
         self._clear_at: float | None = None
@@ -103,6 +105,7 @@ class StereoTracker:
         """Forget the track."""
         self.track.reset()
         self._last = None
+        self._believed = None
         self._contradicted = 0
         self._hidden_ends.forget()
         self._clear_at = None
@@ -152,28 +155,51 @@ class StereoTracker:
         if measured is None:
             measured = self._acquisition.look(images, insertion, self._last)
         if measured.tip is None:
-            self._keep_up(images, insertion)
-            if measured.reason in (HIDDEN, UNCERTAIN):
-                self.track.hide()
-            else:
-                self.track.miss()
-            if self.track.anchor is None:
-                self._last = None
-                self._usual.forget()
-            return dataclasses.replace(measured, state=self.track.state)
+            return self._missed(measured, images, insertion)
         return self._taken(measured, measured.tip, insertion)
 
-    def _keep_up(self, images: tuple[Image, Image], insertion: float | None) -> None:
-        """Follow with one view what both together do not show."""
+    def _missed(
+        self, measured: Measurement, images: tuple[Image, Image], insertion: float | None
+    ) -> Measurement:
+        """Note that both views together give no tip; return what single ones say."""
+        alone = self._keep_up(images, insertion)
+        if measured.reason in (HIDDEN, UNCERTAIN):
+            self.track.hide()
+        else:
+            self.track.miss()
+        if self.track.anchor is None:
+            self._last = None
+            self._usual.forget()
+        measured = dataclasses.replace(measured, state=self.track.state)
+        elsewhere = measured.reason in (TOO_FAR, SURPRISING)
+        if alone is None or elsewhere or self.track.state is not TrackState.TRACKING:
+            return measured
+        tip, seen = alone
+        reason = f"{ONE_VIEW if None in seen else EACH_VIEW}, {measured.reason}"
+        return dataclasses.replace(
+            measured, tip=tip, contested=None, image_tips=seen, reason=reason
+        )
+
+    def _keep_up(
+        self, images: tuple[Image, Image], insertion: float | None
+    ) -> tuple[SpatialTip, Seen] | None:
+        """Follow with one view what both together do not show; return its tip and what it sees."""
         predicted, last = self.track.predict(insertion), self._last
         if predicted is None or last is None or not predicted.known:
-            return
+            return None
         if not self.track.has_begun or abs(predicted.ahead) > _FOLLOW_AHEAD:
-            return
+            return None
         kept = kept_up(self._follower, images, predicted, last, self._usual)
-        if kept is not None:
-            self.track.keep_up(predicted, kept[0])
-            self._last = self._steadied(*kept[1])
+        if kept is None:
+            return None
+        motion, seen = kept
+        self.track.keep_up(predicted, motion)
+        self._last = self._steadied(seen[0] or last[0], seen[1] or last[1])
+        if self._believed is None or not self.track.is_established:
+            return None
+        curvature = self.settings.gates.reach.curvature
+        tip = seen_alone(predicted, motion, self._believed, curvature)
+        return None if tip is None else (tip, seen)
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
@@ -189,6 +215,7 @@ class StereoTracker:
         sound = is_sound(measured.image_tips, SOUND_PX, SOUND_ALONG_PX)
         seen = is_sound(measured.image_tips, CLEAR_PX, CLEAR_ALONG_PX)
         believed = self.track.accept(tip, insertion, anew=anew, certain=beyond_doubt, seen=seen)
+        self._believed = believed or self._believed
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:
             self._last = (left_tip, right_tip) if anew else self._steadied(left_tip, right_tip)

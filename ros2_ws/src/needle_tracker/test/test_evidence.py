@@ -9,12 +9,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from needle_tracker import acquisition
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.corridor import within_corridor
 from needle_tracker.evidence import (
     UsualVisibility,
     is_half_sound,
     is_sound,
+    shows_lines,
     sights_against,
     sights_for,
 )
@@ -50,7 +52,10 @@ def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> Non
     assert sights_against(state, (GOOD, GOOD), alike=True, on_way=True) > 1
     unlike = sights_against(state, (GOOD, GOOD), alike=False, on_way=True)
     assert unlike == (0 if state is TrackState.TRACKING else 3)
-    for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (GOOD, None)):
+    long = dataclasses.replace(GOOD, sigma_along=2.5)
+    assert sights_against(state, (long, GOOD), alike=True, on_way=True) > 1
+    longer = dataclasses.replace(GOOD, sigma_along=3.5)
+    for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (longer, GOOD), (GOOD, None)):
         assert sights_against(state, found, alike=True, on_way=True) == 0
 
 
@@ -74,6 +79,46 @@ def test_what_lies_over_the_needle_is_not_like_it() -> None:
     for _ in range(30):
         usual.see((dataclasses.replace(GOOD, visibility=0.95), GOOD))
     assert usual.is_like((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+
+
+def test_where_the_needle_must_be_light_on_it_is_allowed_and_something_over_it_is_not() -> None:
+    usual = UsualVisibility()
+    usual.see((GOOD, GOOD))
+
+    def allowed(share: float, sigma: float) -> bool:
+        other = dataclasses.replace(GOOD, visibility=share * GOOD.visibility, sigma_across=sigma)
+        assert usual.allows((other, GOOD)) is usual.allows((GOOD, other))
+        return usual.allows((other, GOOD))
+
+    assert allowed(0.5, 0.05)
+    assert allowed(0.5, 0.5)
+    assert not allowed(0.3, 0.05)
+    # Plainer, only if nothing disturbs its line.
+    assert allowed(1.35, 0.05)
+    assert not allowed(1.35, 0.5)
+    assert not allowed(1.5, 0.05)
+
+
+def test_a_line_is_enough_of_a_sight_to_bear_out_what_is_known() -> None:
+    assert shows_lines((GOOD, hidden(POOR)))
+    assert not shows_lines((GOOD, dataclasses.replace(GOOD, sigma_across=0.9)))
+    assert not shows_lines((GOOD, None))
+
+
+def test_a_tip_just_where_it_is_expected_is_told_from_one_beside(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert track.expects(tip(z=0.061), 0.061)
+    assert not track.expects(tip(x=1e-3, z=0.061), 0.061)
+    # After some way out of sight the same place is no surprise; in the end nothing is.
+    assert track.expects(tip(x=1e-3, z=0.072), 0.072)
+    assert not track.expects(tip(x=4e-3, z=0.075), 0.075)
+    assert track.surprise(tip(x=1e-3, z=0.1), 0.1) < 1.0
+    assert not track.expects(tip(x=1e-3, z=0.1), 0.1)
+    assert track.surprise(tip(x=1e-3, z=0.061), 0.061) > track.surprise(tip(z=0.061), 0.061)
+    assert not track.expects(tip(), None)
+    assert track.fits(tip(z=0.061), 0.061, on_way=True)
+    assert not track.fits(tip(z=0.06), None, on_way=True)
+    assert Track(settings.gates).surprise(tip(), 0.05) == math.inf
 
 
 def test_how_much_light_there_is_says_nothing() -> None:
@@ -187,3 +232,59 @@ def test_found_again_beside_another_line(
             found.append(np.linalg.norm(measured.tip.position - needle[-1]))
     assert len(found) == 3
     assert max(found) < 0.3e-3
+
+
+@pytest.mark.parametrize("spoilt", [0, 1])
+@pytest.mark.parametrize("trouble", ["shorter", "fainter"])
+def test_found_again_at_once_where_it_is_waited_for(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+    spoilt: int,
+    trouble: str,
+) -> None:
+    """Both cameras blocked for 12 mm; then one view shows less of the needle, or less clearly."""
+    tracker = StereoTracker(calibration, settings)
+    for insertion in np.arange(0.040, 0.0521, 0.001):
+        pair = list(draw_pair(make_arc(float(insertion), 4.0, 1.0)))
+        assert tracker.process(pair[0], pair[1], float(insertion)).tip is not None
+    dark = np.full_like(pair[0], 90)
+    for insertion in np.arange(0.053, 0.0641, 0.001):
+        assert tracker.process(dark, dark, float(insertion)).tip is None
+    needle = make_arc(0.065, 4.0, 1.0)
+    pair = list(draw_pair(needle))
+    if trouble == "shorter":
+        pair[spoilt] = draw_pair(make_arc(0.0632, 4.0, 1.0))[spoilt]
+    else:
+        background = float(np.median(pair[spoilt]))
+        faint = background + 0.6 * (pair[spoilt].astype(float) - background)
+        pair[spoilt] = faint.round().astype(np.uint8)
+    found = tracker.process(pair[0], pair[1], 0.065).tip
+    assert found is not None
+    assert np.linalg.norm(found.position - needle[-1]) < 0.4e-3
+
+
+@pytest.mark.parametrize(
+    ("insertion", "bow", "found"), [(0.012, 4.5e-3, True), (0.06, 11e-3, False)]
+)
+def test_how_long_a_short_shaft_is_its_ends_say(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    insertion: float,
+    bow: float,
+    found: bool,
+) -> None:
+    """The coarse path wanders by millimetres; both ends are seen well."""
+    path = make_arc(insertion, 4.0, 1.0)
+    points = path[:: len(path) // 8]
+    aside = bow * np.sin(np.linspace(0.0, np.pi, len(points)))
+    wandering = points + np.outer(aside, [1.0, 0.0, 0.0])
+    monkeypatch.setattr(acquisition, "shaft_points", lambda *_: wandering)
+    tracker = StereoTracker(calibration, settings)
+    measured = tracker.process(*draw_pair(path), insertion)
+    assert (measured.tip is not None) is found
+    assert found or measured.reason == "the shaft's length is not the insertion"

@@ -151,8 +151,9 @@ def test_one_blocked_camera_loses_the_track_and_sight_restores_it(
     assert tracker.process(left, right, 0.05).state is TrackState.TRACKING
     blocked = np.full_like(right, 140)
     answers = [tracker.process(left, blocked, 0.05) for _ in range(4)]
-    assert all(a.tip is None and a.reason == "no needle in the right image" for a in answers)
+    assert all(a.reason.endswith("no needle in the right image") for a in answers)
     assert answers[-1].state is TrackState.LOST
+    assert answers[-1].tip is None
     again = tracker.process(left, right, 0.05)
     assert again.state is TrackState.TRACKING
     assert again.tip is not None
