@@ -2,7 +2,7 @@
 
 First along the way that the needle has gone, then everywhere that it can reach. What is found so
 has to be seen better, or more often, than what is followed; the whole shaft counts, not its end
-alone.
+alone. Where something crosses the needle its path leads astray; then one view guides the other.
 """
 
 from __future__ import annotations
@@ -23,20 +23,23 @@ from needle_tracker.detection import (
 )
 from needle_tracker.evidence import (
     UsualVisibility,
+    is_half_sound,
     is_sound,
     shows_lines,
     sights_against,
     sights_for,
+    sights_of_excluded,
 )
-from needle_tracker.following import SOUND_ALONG_PX, SOUND_PX
+from needle_tracker.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
 from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
+from needle_tracker.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
 from needle_tracker.tip_fit import ImageTip, fit_tip, hidden
 from needle_tracker.tip_motion import TipMotion
-from needle_tracker.track import SURPRISING, TOO_FAR, Track, TrackState
+from needle_tracker.track import SURPRISING, TOO_FAR, Anchor, Track, TrackState
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
 
@@ -46,6 +49,8 @@ UNCLEAR = "not clear enough to begin with"
 # A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
 # that is to say which of two ends is the needle's.
 _YOUNG, _YOUNG_SURPRISE, _YOUNG_NEAR = 15e-3, 9.0, 2.0
+_FROM_ENTRY = 25e-3  # up to here the entry says about where the end is [m]
+_FITTING = 9.0  # squared, over the covariance: place and direction of what one view guides to
 _AGREE = 1e-3  # two views that say the same do so along the needle, too [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
 _GRID_AHEAD = 1.5e-3
@@ -57,8 +62,8 @@ class Acquisition:
 
     Parameters
     ----------
-    views : pair of RefractedCamera
-        Left and right.
+    follower : Follower
+        Fits the needle's end in either view.
     detection : pair of DetectionSettings
         How the needle looks in each.
     settings : TrackerSettings
@@ -71,18 +76,19 @@ class Acquisition:
 
     def __init__(
         self,
-        views: tuple[RefractedCamera, RefractedCamera],
+        follower: Follower,
         detection: tuple[DetectionSettings, DetectionSettings],
         settings: TrackerSettings,
         track: Track,
         usual: UsualVisibility,
     ) -> None:
-        self._views = views
+        self._follower = follower
+        self._views = follower.views
         self._detection = detection
         self._settings = settings
         self._track = track
         self._usual = usual
-        self._grids = (self._grid(views[0]), self._grid(views[1]))
+        self._grids = (self._grid(self._views[0]), self._grid(self._views[1]))
 
     def look(
         self, images: tuple[Image, Image], insertion: float | None, last: Last | None
@@ -105,9 +111,69 @@ class Acquisition:
                 for grid, view in zip(self._grids, self._views, strict=True)
             )
             measured = self._search(images, insertion, last, (left, right), on_way=True)
+            predicted = self._track.predict(insertion)
+            if measured.tip is None and predicted is not None and last is not None:
+                measured = (
+                    self._where_expected(images, insertion, predicted, last)
+                    or self._guided(images, insertion, measured.image_tips, predicted, last)
+                    or measured
+                )
             if measured.tip is not None or self._track.is_established:
                 return measured
-        return self._search(images, insertion, last, self._grids)
+        measured = self._search(images, insertion, last, self._grids)
+        if measured.tip is None and insertion is not None and insertion < _FROM_ENTRY:
+            predicted = predicted_from_entry(self._settings.gates.reach, insertion)
+            guided = self._guided(images, insertion, measured.image_tips, predicted, None)
+            measured = guided or measured
+        return measured
+
+    def _where_expected(
+        self, images: tuple[Image, Image], insertion: float | None, predicted: Anchor, last: Last
+    ) -> Measurement | None:
+        """Look just where the tip should be, though that is not known well."""
+        if abs(predicted.ahead) > FOLLOW_AHEAD:
+            return None
+        looked = self._follower.look(images, predicted, last)
+        if looked is None:
+            return None
+        found, regions = looked
+        measured = judged(self._views, self._track, found, insertion)
+        if measured.tip is None or not (found[0].clear or found[1].clear):
+            return None
+        if not self._is_borne_out(measured.tip, found, insertion, on_way=True):
+            return None
+        return dataclasses.replace(measured, regions=regions)
+
+    def _guided(
+        self,
+        images: tuple[Image, Image],
+        insertion: float | None,
+        seen: tuple[ImageTip | None, ImageTip | None],
+        predicted: Anchor,
+        last: Last | None,
+    ) -> Measurement | None:
+        """Look in each view where the end is that the other shows."""
+        left, right = (
+            tip if tip is not None and self._usual.is_like_in(i, tip) else None
+            for i, tip in enumerate(seen)
+        )
+        best: tuple[Measurement, Last] | None = None
+        least = _FITTING
+        for found in guided_pairs(self._follower, images, predicted, (left, right), last):
+            if not (is_half_sound(found) and self._usual.allows(found)):
+                continue
+            measured = judged(self._views, self._track, found, insertion)
+            tip = measured.tip or measured.contested
+            if tip is None or tip.disagreement > _AGREE:
+                continue
+            surprise = predicted.motion.surprise(tip)
+            if surprise < least and predicted.motion.direction_surprise(tip) < _FITTING:
+                best, least = (measured, found), surprise
+        if best is None:
+            return None
+        wanted = self._sights_wanted(*best, insertion, on_way=True, guided=True)
+        decided = None if wanted is None else self._decided(best[0], insertion, wanted)
+        return None if decided is None or decided.tip is None else decided
 
     def _search(
         self,
@@ -183,7 +249,12 @@ class Acquisition:
         problem = self._shaft_problem(paths, tip, None if young else insertion)
         if problem is not None:
             return dataclasses.replace(measured, tip=None, reason=problem)
-        if not wanted:
+        return self._decided(measured, insertion, wanted)
+
+    def _decided(self, measured: Measurement, insertion: float | None, wanted: int) -> Measurement:
+        """Return what is measured, believed if no more sights are wanted or it has had them."""
+        tip = measured.tip or measured.contested
+        if not wanted or tip is None:
             return measured
         if self._track.contest(tip, insertion, wanted):
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
@@ -196,12 +267,13 @@ class Acquisition:
         insertion: float | None,
         *,
         on_way: bool,
+        guided: bool = False,
     ) -> int | None:
         """Return how many such tips in a row must agree, 0 where one will do, None for never."""
         track, tip = self._track, measured.tip or measured.contested
-        if tip is not None and track.is_excluded(tip, insertion):
-            return None
         alike = self._usual.is_like(found)
+        if tip is not None and track.is_excluded(tip, insertion):
+            return sights_of_excluded(track.state, found, alike=alike)
         if measured.tip is None:
             refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
             return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
@@ -212,7 +284,14 @@ class Acquisition:
         near = on_way and track.fits(measured.tip, insertion, on_way=True)
         if self._begins_at_entry(measured, insertion):
             return 0
-        return sights_for(track.state, measured.image_tips, alike=alike, near=near)
+        return sights_for(
+            track.state,
+            measured.image_tips,
+            alike=alike,
+            possible=self._usual.allows(found),
+            near=near,
+            guided=guided,
+        )
 
     def _is_borne_out(
         self, tip: SpatialTip, found: Last, insertion: float | None, *, on_way: bool

@@ -23,6 +23,7 @@ CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
 _VISIBILITY_RATIO = 2.2  # of the two views
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
+_EXCLUDED_SIGHTS = 4  # of what is plain, where a needle cannot have got to by what was known
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
 _FAINTER, _PLAINER = 0.7, 1.25  # than it did; what lies over it adds to it
@@ -142,7 +143,25 @@ def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool
     return _SOUND_SIGHTS + (0 if alike else _MORE_UNLIKE) + (0 if sure else _MORE_TRACKING)
 
 
-def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> int | None:
+def sights_of_excluded(state: TrackState, found: Found, *, alike: bool) -> int | None:
+    """Return how many sights in a row say that an established track was wrong; None: none do.
+
+    Parameters
+    ----------
+    state : TrackState
+        The track's.
+    found : pair of (ImageTip or None)
+        What both views show where the needle cannot have got to.
+    alike : bool
+        Whether the needle stands out as it did.
+    """
+    plain = alike and is_sound(found, PLAIN_PX, PLAIN_ALONG_PX)
+    return _EXCLUDED_SIGHTS if plain and state is TrackState.LOST else None
+
+
+def sights_for(
+    state: TrackState, found: Found, *, alike: bool, possible: bool, near: bool, guided: bool
+) -> int | None:
     """Return how many sights in a row are wanted of a tip that nothing contradicts.
 
     Parameters
@@ -153,8 +172,12 @@ def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> i
         What both views show.
     alike : bool
         Whether the needle stands out as it did.
+    possible : bool
+        Whether it can stand out so much at all.
     near : bool
         Whether it lies on the needle's way, and where it should have got to.
+    guided : bool
+        Whether one view's end was found from what the other shows and the needle's way.
 
     Returns
     -------
@@ -165,8 +188,10 @@ def sights_for(state: TrackState, found: Found, *, alike: bool, near: bool) -> i
         return 0
     more = 0 if alike else _MORE_UNLIKE
     if is_sound(found, SOUND_PX, SOUND_ALONG_PX):
-        return _SOUND_SIGHTS + more if state is TrackState.LOST else 0
-    if near and is_half_sound(found):
+        if state is TrackState.LOST:
+            return _SOUND_SIGHTS + more
+        return 0 if possible else _SOUND_SIGHTS
+    if (near or guided) and is_half_sound(found):
         return _SOUND_SIGHTS + more
     if not (near and alike) and not is_sound(found, CLEAR_PX, CLEAR_ALONG_PX):
         return None

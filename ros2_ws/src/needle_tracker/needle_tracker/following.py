@@ -27,6 +27,7 @@ SOUND_PX, SOUND_ALONG_PX = 0.3, 2.0  # of an end that is seen well
 _SIDEWAYS = 0.9e-3  # the strip reaches so far beside the prediction [m] ...
 _ALONG = 0.22e-3  # ... and its end is known so well along the shaft (one sigma) [m]
 _SPREAD = 0.1  # both grow with the way ahead
+FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
 _FOLLOW_DIRECTLY = 6e-3  # up to here the prediction is as good as the strip is wide [m]
 _ODD, _STRANGE = 2.0, 4.0  # standard deviations
 SLACK = 0.05e-3  # of the stage and the needle, along it [m]

@@ -67,7 +67,7 @@ def kept_up(
             continue
         tip, _ = looked
         if is_sound(tip) and usual.is_like_in(i, tip) and _is_borne_out(view, tip, predicted):
-            motion, seen[i] = _taken_in(view, tip, motion), tip
+            motion, seen[i] = taken_in(view, tip, motion), tip
     if motion is predicted.motion:
         return None
     return motion, (seen[0], seen[1])
@@ -119,8 +119,18 @@ def _is_borne_out(view: RefractedCamera, tip: ImageTip, predicted: Anchor) -> bo
     )
 
 
-def _taken_in(view: RefractedCamera, tip: ImageTip, motion: TipMotion) -> TipMotion:
-    """Return a state with what one view says taken in, across and along the shaft."""
+def taken_in(view: RefractedCamera, tip: ImageTip, motion: TipMotion) -> TipMotion:
+    """Return a state with what one view says taken in, across and along the shaft.
+
+    Parameters
+    ----------
+    view : RefractedCamera
+        Which one.
+    tip : ImageTip
+        What it shows.
+    motion : TipMotion
+        What was known, in `rig`.
+    """
     pixel, jacobian = np.empty(2), np.empty((2, 3))
     project_point(view.packed, motion.position, pixel)
     point_jacobian(view.packed, motion.position, jacobian)

@@ -88,6 +88,18 @@ class TipMotion:
         off = tip.position - self.position
         return float(off @ np.linalg.solve(self.covariance[:3, :3] + tip.covariance, off))
 
+    def direction_surprise(self, tip: SpatialTip) -> float:
+        """Return the squared angle of a tip's direction to the heading, over all that is unknown.
+
+        That is the covariance of both and what the visible end may lean; infinite backwards.
+        """
+        if float(tip.direction @ self.heading) <= 0.0:
+            return math.inf
+        plane = across(self.heading)
+        unknown = self.covariance[3:, 3:] + tip.direction_covariance + _LEAN_SIGMA**2 * np.eye(3)
+        off = plane @ tip.direction
+        return float(off @ np.linalg.pinv(plane @ unknown @ plane, hermitian=True) @ off)
+
     def merged(self, tip: SpatialTip) -> SpatialTip:
         """Return a measured tip merged with this state."""
         motion = self.updated(tip)

@@ -380,5 +380,7 @@ def _is_about(tip: SpatialTip, predicted: Anchor | None, miss: float, surprise: 
     """Return whether a tip is nearer to its prediction than both [m, squared over covariance]."""
     if predicted is None or not predicted.known:
         return False
+    if predicted.motion.direction_surprise(tip) > _NO_SURPRISE:
+        return False
     off = float(np.linalg.norm(tip.position - predicted.motion.position))
     return off < miss and predicted.motion.surprise(tip) < surprise

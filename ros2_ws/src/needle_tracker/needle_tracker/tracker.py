@@ -16,6 +16,7 @@ from needle_tracker.calibration import SIDES, StereoCalibration
 from needle_tracker.detection import DetectionSettings, Image
 from needle_tracker.evidence import CLEAR_ALONG_PX, CLEAR_PX, UsualVisibility, is_sound
 from needle_tracker.following import (
+    FOLLOW_AHEAD,
     PLAIN_ALONG_PX,
     PLAIN_PX,
     SOUND_ALONG_PX,
@@ -40,8 +41,7 @@ _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other an
 _LOOSE_PX = 3.0  # a line so uncertain says next to nothing
 _ALONE_WAY = 5e-3  # and for so much insertion after both showed the needle well [m]
 # With no end in sight, lines so good tell where the needle is, for so much more insertion [px, m].
-_HIDDEN_LINE_PX, _HIDDEN_WAY = 1.0, 5e-3
-_FOLLOW_AHEAD = 8e-3  # farther from the last tip, all is searched [m]
+_HIDDEN_LINE_PX, _HIDDEN_WAY = 2.0, 5e-3
 _DRAWN_SHARE, _DRAWN_POINTS = 0.3, 20  # of the longest insertion, to warm up on
 
 
@@ -73,7 +73,7 @@ class StereoTracker:
         self.track = Track(settings.gates)
         self._usual = UsualVisibility()
         self._acquisition = Acquisition(
-            self.views, self._detection, settings, self.track, self._usual
+            self._follower, self._detection, settings, self.track, self._usual
         )
         self._last: tuple[ImageTip, ImageTip] | None = None
         self._believed: SpatialTip | None = None
@@ -187,7 +187,7 @@ class StereoTracker:
         predicted, last = self.track.predict(insertion), self._last
         if predicted is None or last is None or not predicted.known:
             return None
-        if not self.track.has_begun or abs(predicted.ahead) > _FOLLOW_AHEAD:
+        if not self.track.has_begun or abs(predicted.ahead) > FOLLOW_AHEAD:
             return None
         kept = kept_up(self._follower, images, predicted, last, self._usual)
         if kept is None:
@@ -254,7 +254,7 @@ class StereoTracker:
         if (
             predicted is None
             or last is None
-            or abs(predicted.ahead) > _FOLLOW_AHEAD
+            or abs(predicted.ahead) > FOLLOW_AHEAD
             or (predicted.known and not self.track.is_certain(insertion))
         ):
             return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 
@@ -19,6 +20,7 @@ from needle_tracker.evidence import (
     shows_lines,
     sights_against,
     sights_for,
+    sights_of_excluded,
 )
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import make_search_grid
@@ -61,13 +63,80 @@ def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> Non
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
     lost = TrackState.LOST
-    assert sights_for(lost, (GOOD, GOOD), alike=True, near=True) == 0
-    assert sights_for(lost, (GOOD, GOOD), alike=True, near=False) == 2
-    assert sights_for(lost, (GOOD, GOOD), alike=False, near=True) == 3
-    assert sights_for(lost, (POOR, GOOD), alike=True, near=True) == 3
+    waiting = functools.partial(sights_for, possible=True, guided=False)
+    assert waiting(lost, (GOOD, GOOD), alike=True, near=True) == 0
+    assert waiting(lost, (GOOD, GOOD), alike=True, near=False) == 2
+    assert waiting(lost, (GOOD, GOOD), alike=False, near=True) == 3
+    assert waiting(lost, (POOR, GOOD), alike=True, near=True) == 3
     # A line without an end is the shaft's or any other's.
-    assert sights_for(lost, (GOOD, hidden(GOOD)), alike=True, near=False) is None
-    assert sights_for(lost, (GOOD, hidden(GOOD)), alike=True, near=True) == 2
+    assert waiting(lost, (GOOD, hidden(GOOD)), alike=True, near=False) is None
+    assert waiting(lost, (GOOD, hidden(GOOD)), alike=True, near=True) == 2
+
+
+def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
+    waiting = functools.partial(sights_for, alike=False, near=True, guided=False)
+    for state in (TrackState.TRACKING, TrackState.CONFIRMING):
+        assert waiting(state, (GOOD, GOOD), possible=True) == 0
+        assert waiting(state, (GOOD, GOOD), possible=False) == 2
+
+
+def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
+    found = (GOOD, dataclasses.replace(GOOD, sigma_across=0.4, sigma_along=3.0))
+    waiting = functools.partial(sights_for, alike=True, possible=True, near=False)
+    for state in (TrackState.TRACKING, TrackState.LOST):
+        assert waiting(state, found, guided=True) == 2
+        assert waiting(state, found, guided=False) != 2
+
+
+def test_an_established_track_is_wrong_where_a_plain_needle_is_seen_elsewhere() -> None:
+    plain = dataclasses.replace(GOOD, sigma_across=0.1)
+    wanted = functools.partial(sights_of_excluded, alike=True)
+    assert wanted(TrackState.LOST, (plain, plain)) == 4
+    assert wanted(TrackState.TRACKING, (plain, plain)) is None
+    for other in (dataclasses.replace(GOOD, sigma_across=0.2), hidden(plain), None):
+        assert wanted(TrackState.LOST, (plain, other)) is None
+    assert sights_of_excluded(TrackState.LOST, (plain, plain), alike=False) is None
+
+
+def test_a_needle_that_was_mistaken_is_found_where_it_is(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    """Something else was followed for 13 mm; the needle is plain to see, but far from it."""
+    tracker = StereoTracker(calibration, settings)
+    for mm in range(40, 53):
+        assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
+    covered = np.full((768, 1024), 90, np.uint8)
+    for mm in range(53, 57):
+        tracker.process(covered, covered, mm * 1e-3)
+    assert tracker.track.state is TrackState.LOST
+    found = []
+    for mm in range(57, 62):
+        path = make_arc(mm * 1e-3, 6.0, -1.0)
+        assert tracker.track.is_excluded(
+            dataclasses.replace(tip(), position=path[-1]), mm * 1e-3
+        ) is (not any(found))
+        measured = tracker.process(*draw_pair(path), mm * 1e-3)
+        found.append(measured.tip is not None)
+        if measured.tip is not None:
+            assert np.linalg.norm(measured.tip.position - path[-1]) < 0.2e-3
+    assert found == [False, False, False, True, True]
+
+
+def test_a_tip_that_points_elsewhere_is_not_the_one_that_is_waited_for(
+    settings: TrackerSettings,
+) -> None:
+    track = established(settings)
+    here = tip(z=0.061)
+    assert track.expects(here, 0.061)
+    assert track.fits(here, 0.061, on_way=True)
+    for angle, goes_on in ((0.1, True), (0.7, False)):
+        direction = np.array([math.sin(angle), 0.0, math.cos(angle)])
+        turned = dataclasses.replace(here, direction=direction)
+        assert track.expects(turned, 0.061) is goes_on
+        assert track.fits(turned, 0.061, on_way=True) is goes_on
 
 
 def test_what_lies_over_the_needle_is_not_like_it() -> None:

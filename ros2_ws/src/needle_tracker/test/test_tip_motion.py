@@ -143,3 +143,16 @@ def test_a_needle_out_of_sight_may_bend_the_same_way_all_along() -> None:
     for _ in range(12):
         motion, way = motion.advanced(1e-3, CURVATURE, way), way + 1e-3
     np.testing.assert_allclose(motion.covariance[3:, 3:], at_once.covariance[3:, 3:], rtol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.05, 0.3, 1.0])
+def test_a_direction_surprises_by_its_angle_over_all_that_is_unknown(angle: float) -> None:
+    motion = TipMotion(np.zeros(3), np.array([0.0, 0.0, 1.0]), np.diag([1e-8] * 3 + [0.05**2] * 3))
+    # The heading's covariance, the measured one's, and what the visible end leans off the heading.
+    unknown = 0.05**2 + 1e-4 + 0.12**2
+    for around in (0.0, 2.0, 4.0):
+        side = np.sin(angle) * np.array([np.cos(around), np.sin(around)])
+        tip = measured(np.zeros(3), np.full(3, 1e-5), np.array([*side, np.cos(angle)]))
+        assert motion.direction_surprise(tip) == pytest.approx(np.sin(angle) ** 2 / unknown)
+    backwards = measured(np.zeros(3), np.full(3, 1e-5), np.array([0.0, 0.0, -1.0]))
+    assert motion.direction_surprise(backwards) == np.inf
