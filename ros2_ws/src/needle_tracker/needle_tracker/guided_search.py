@@ -12,19 +12,15 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
-from needle_tracker.compiled_projection import point_jacobian
 from needle_tracker.detection import Image
 from needle_tracker.following import Follower, is_sound
 from needle_tracker.gates import tip_at_entry
 from needle_tracker.search_grid import Reach
 from needle_tracker.single_view import Seen, taken_in
 from needle_tracker.tip_fit import ImageTip
-from needle_tracker.tip_motion import TipMotion, across
+from needle_tracker.tip_motion import TipMotion
 from needle_tracker.track import Anchor
-
-Array = NDArray[np.float64]
 
 _SPACING = 1e-3  # of the places along the line of sight: about half a needle apart in the image [m]
 _SIGMAS, _FARTHEST = 2.5, 5e-3  # so far from the likeliest [-, m]
@@ -43,11 +39,9 @@ def predicted_from_entry(reach: Reach, insertion: float) -> Anchor:
     Returns
     -------
     Anchor
-        Straight ahead of the entry, in `rig`; how far it may have bent is in the covariance.
+        Straight ahead of the entry, in `rig`.
     """
     tip = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
-    bent = 0.5 * reach.curvature * insertion**2
-    tip = dataclasses.replace(tip, covariance=tip.covariance + bent**2 * across(tip.direction))
     return Anchor(TipMotion.start(tip), insertion, known=True)
 
 
@@ -84,7 +78,8 @@ def guided_pairs(
         other = 1 - i
         motion = taken_in(follower.views[i], tip, predicted.motion)
         if last is None:
-            along = _direction_in_other(follower, i, tip, motion)
+            along = follower.views[other].jacobian(motion.position) @ motion.heading
+            along /= np.linalg.norm(along)
             alike = dataclasses.replace(tip, direction=along, contrast=0.0)
         else:
             alike = last[other]
@@ -99,18 +94,3 @@ def guided_pairs(
             looked = follower.look_in(other, images[other], there, alike)
             if looked is not None and looked[0].clear:
                 yield (tip, looked[0]) if i == 0 else (looked[0], tip)
-
-
-def _direction_in_other(follower: Follower, i: int, tip: ImageTip, motion: TipMotion) -> Array:
-    """Return how a shaft runs in one image that the other, i, shows as it does.
-
-    Of all headings that look so, the nearest to what was known.
-    """
-    jacobian = np.empty((2, 3))
-    point_jacobian(follower.views[i].packed, motion.position, jacobian)
-    sideways = np.array([-tip.direction[1], tip.direction[0]]) @ jacobian
-    turn = across(motion.heading) @ sideways
-    heading = motion.heading - turn * float(sideways @ motion.heading) / float(turn @ turn)
-    point_jacobian(follower.views[1 - i].packed, motion.position, jacobian)
-    along = jacobian @ heading
-    return np.asarray(along / np.linalg.norm(along))

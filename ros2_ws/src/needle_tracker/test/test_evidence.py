@@ -22,6 +22,7 @@ from needle_tracker.evidence import (
     sights_for,
     sights_of_excluded,
 )
+from needle_tracker.measurement import judged
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import make_search_grid
 from needle_tracker.tip_fit import ImageTip, hidden
@@ -78,6 +79,27 @@ def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
     for state in (TrackState.TRACKING, TrackState.CONFIRMING):
         assert waiting(state, (GOOD, GOOD), possible=True) == 0
         assert waiting(state, (GOOD, GOOD), possible=False) == 2
+
+
+@pytest.mark.parametrize("plainer", [1.0, 1.6])
+def test_a_tip_too_plain_for_the_needle_is_not_believed_at_once(
+    settings: TrackerSettings, calibration: StereoCalibration, views: Views, plainer: float
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    tracker.track.__dict__.update(established(settings).__dict__)
+    tracker._acquisition._usual.see((GOOD, GOOD))
+    ends: list[ImageTip] = []
+    for view in views:
+        along = view.jacobian(tip().position) @ AHEAD
+        end = dataclasses.replace(GOOD, point=view.project(np.array([0.0, 0.0, 0.072])))
+        end = dataclasses.replace(end, direction=along / np.linalg.norm(along))
+        ends.append(dataclasses.replace(end, visibility=plainer * GOOD.visibility))
+    found = (ends[0], ends[1])
+    measured = judged(views, tracker.track, found, 0.072)
+    assert measured.tip is not None
+    assert not tracker.track.fits(measured.tip, 0.072, on_way=False)
+    wanted = tracker._acquisition._sights_wanted(measured, found, 0.072, on_way=False)
+    assert wanted == (0 if plainer == 1.0 else 2)
 
 
 def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:

@@ -14,6 +14,7 @@ from needle_tracker import acquisition
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.following import Follower
 from needle_tracker.guided_search import guided_pairs, predicted_from_entry
+from needle_tracker.measurement import Measurement
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach
 from needle_tracker.tip_fit import ImageTip, hidden
@@ -38,7 +39,7 @@ def with_cable(image: Image, pixel: np.ndarray, degrees: float) -> Image:
     angle = math.radians(degrees)
     way = 400.0 * np.array([math.cos(angle), math.sin(angle)])
     first, second = (np.round(16.0 * (pixel + sign * way)).astype(int) for sign in (-1, 1))
-    drawn = image.copy()
+    drawn: Image = image.copy()
     cv2.line(drawn, tuple(first.tolist()), tuple(second.tolist()), (60,), 4, cv2.LINE_AA, 4)
     return drawn
 
@@ -52,6 +53,15 @@ def crossed(
     nearest = np.argmin(np.abs(np.linalg.norm(path - path[-1], axis=1) - before))
     images[side] = with_cable(images[side], views[side].project(path[nearest]), degrees)
     return images[0], images[1]
+
+
+def last_seen(tracker: StereoTracker, draw_pair: Drawer, make_arc: Arc, *, until: int = 60) -> None:
+    """Show a needle up to 52 mm, and then hands."""
+    for mm in range(40, 53):
+        assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
+    covered = np.full((768, 1024), 90, np.uint8)
+    for mm in range(53, until + 1):
+        assert tracker.process(covered, covered, mm * 1e-3).tip is None
 
 
 @pytest.mark.parametrize("crossing", [(0, 26.0, 10e-3), (0, 30.0, 8e-3)])
@@ -69,11 +79,7 @@ def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again
     if not guiding:
         # That is what the search along paths makes of it.
         monkeypatch.setattr(acquisition, "guided_pairs", lambda *_: iter(()))
-    for mm in range(40, 53):
-        assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
-    for mm in range(53, 61):
-        covered = np.full((768, 1024), 90, np.uint8)
-        assert tracker.process(covered, covered, mm * 1e-3).tip is None
+    last_seen(tracker, draw_pair, make_arc)
     for mm in range(61, 64):
         path = make_arc(mm * 1e-3, 6.0, 1.0)
         pair = crossed(views, draw_pair(path), path, crossing)
@@ -83,6 +89,32 @@ def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again
             assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
         elif mm == 61:
             assert measured.tip is None
+
+
+@pytest.mark.parametrize("plainer", [1.0, 2.0])
+def test_the_place_where_the_needle_should_be_is_looked_at(
+    tracker: StereoTracker,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    monkeypatch: pytest.MonkeyPatch,
+    plainer: float,
+) -> None:
+    """Though the search along paths finds nothing; something that is too plain is not the needle."""
+    last_seen(tracker, draw_pair, make_arc, until=57)
+    usual = tracker._usual._levels
+    assert usual is not None
+    tracker._usual._levels = (usual[0] / plainer, usual[1] / plainer)
+    nothing = Measurement(None, TrackState.TRACKING, "no needle")
+    monkeypatch.setattr(acquisition, "guided_pairs", lambda *_: iter(()))
+    monkeypatch.setattr(acquisition.Acquisition, "_search", lambda *_, **__: nothing)
+    monkeypatch.setattr(StereoTracker, "_follow", lambda *_: None)
+    path = make_arc(0.058, 6.0, 1.0)
+    measured = tracker.process(*draw_pair(path), 0.058)
+    assert (measured.tip is not None) is (plainer == 1.0)
+    if measured.tip is not None:
+        assert measured.reason == ""
+        assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
+        assert None not in measured.regions
 
 
 @pytest.mark.parametrize("crossing", [(0, 30.0, 5.5e-3), (0, -25.0, 5.5e-3)])
@@ -109,30 +141,85 @@ def follower(views: Views, tracker: StereoTracker, settings: TrackerSettings) ->
     return Follower(views, tracker._detection, settings.needle_width, settings.hole_clearance)
 
 
+def image_tip(view: RefractedCamera, point: np.ndarray, way: np.ndarray) -> ImageTip:
+    """Return how a view shows a needle's end well."""
+    along = view.jacobian(point) @ way
+    along /= np.linalg.norm(along)
+    return ImageTip(view.project(point), along, 0.05, 0.15, 0.005, 90.0, 0.5)
+
+
 @pytest.mark.parametrize("side", [0, 1])
-@pytest.mark.parametrize("off", [-3e-3, 0.0, 3e-3])
+@pytest.mark.parametrize(
+    ("off", "pitch"), [((-3e-3, 0.0), 0.0), ((3e-3, 0.0), 0.4), ((0.0, 2.5e-3), 0.0)]
+)
 def test_one_view_s_end_leads_to_the_other_s(
-    views: Views, follower: Follower, draw_pair: Drawer, make_arc: Arc, side: int, off: float
+    views: Views,
+    follower: Follower,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    side: int,
+    off: tuple[float, float],
+    pitch: float,
 ) -> None:
-    """However far the prediction is off in depth, the ends are those of one point."""
-    path = make_arc(0.02, 6.0, 1.0)
+    """However far the prediction is off, down or aside, the ends are those of one point."""
+    path = make_arc(0.02, 6.0, 1.0, pitch)
     tip, way = path[-1], (path[-1] - path[-10]) / np.linalg.norm(path[-1] - path[-10])
-    along = views[side].jacobian(tip) @ way
     seen: list[ImageTip | None] = [None, None]
-    seen[side] = ImageTip(
-        views[side].project(tip), along / np.linalg.norm(along), 0.05, 0.15, 0.005, 90.0, 0.5
-    )
-    motion = TipMotion(
-        tip + np.array([off, 0.0, 0.0]), way, np.diag([1.5e-3**2] * 3 + [0.1**2] * 3)
-    )
+    seen[side] = image_tip(views[side], tip, way)
+    straight = np.array([0.0, 0.0, 1.0])
+    motion = TipMotion(tip + np.array([*off, 0.0]), straight, np.diag([2e-3**2] * 3 + [0.1**2] * 3))
     predicted = Anchor(motion, 0.02, known=True)
-    pairs = list(guided_pairs(follower, draw_pair(path), predicted, (seen[0], seen[1]), None))
+    images = list(draw_pair(path))
+    shown = (seen[0], seen[1])
+    pairs = list(guided_pairs(follower, (images[0], images[1]), predicted, shown, None))
     assert pairs
     for pair in pairs:
         assert pair[side] is seen[side]
         other = pair[1 - side]
         assert other.clear
         assert np.linalg.norm(other.point - views[1 - side].project(tip)) < 1.0
+    # A line that does not end there is not the needle's end.
+    images[1 - side] = draw_pair(make_arc(0.04, 6.0, 1.0, pitch))[1 - side]
+    for pair in guided_pairs(follower, (images[0], images[1]), predicted, shown, None):
+        assert pair[1 - side].clear
+
+
+@pytest.mark.parametrize(
+    ("moved", "turned", "plainer", "believed"),
+    [
+        (0.0, 0.0, 1.0, True),
+        (0.8e-3, 0.0, 1.0, True),
+        (1.2e-3, 0.0, 1.0, False),
+        (0.0, 0.2, 1.0, True),
+        (0.0, 0.7, 1.0, False),
+        (0.0, 0.0, 1.6, False),
+    ],
+    ids=["fits", "apart", "far apart", "leaning", "pointing elsewhere", "too plain"],
+)
+def test_what_one_view_leads_to_must_fit(
+    tracker: StereoTracker,
+    views: Views,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    monkeypatch: pytest.MonkeyPatch,
+    moved: float,
+    turned: float,
+    plainer: float,
+    believed: bool,
+) -> None:
+    last_seen(tracker, draw_pair, make_arc)
+    path = make_arc(0.061, 6.0, 1.0)
+    way = (path[-1] - path[-4]) / np.linalg.norm(path[-1] - path[-4])
+    way = math.cos(turned) * way + math.sin(turned) * np.cross(way, [0.0, 1.0, 0.0])
+    left = image_tip(views[0], path[-1], way)
+    right = image_tip(views[1], path[-1] + moved * way, way)
+    left = dataclasses.replace(left, visibility=plainer * left.visibility)
+    monkeypatch.setattr(acquisition, "guided_pairs", lambda *_: iter([(left, right)]))
+    predicted = tracker.track.predict(0.061)
+    assert predicted is not None
+    covered = np.full((768, 1024), 90, np.uint8)
+    found = tracker._acquisition._guided((covered, covered), 0.061, (left, right), predicted, None)
+    assert (found is not None and found.tip is not None) is believed
 
 
 def test_what_is_not_sound_leads_nowhere(
