@@ -134,7 +134,7 @@ def test_a_needle_that_was_mistaken_is_found_where_it_is(
     for mm in range(53, 57):
         tracker.process(covered, covered, mm * 1e-3)
     assert tracker.track.state is TrackState.LOST
-    found = []
+    found: list[bool] = []
     for mm in range(57, 62):
         path = make_arc(mm * 1e-3, 6.0, -1.0)
         assert tracker.track.is_excluded(

@@ -99,7 +99,7 @@ def test_the_place_where_the_needle_should_be_is_looked_at(
     monkeypatch: pytest.MonkeyPatch,
     plainer: float,
 ) -> None:
-    """Though the search along paths finds nothing; something that is too plain is not the needle."""
+    """Though the search along paths finds nothing; what is too plain is not the needle."""
     last_seen(tracker, draw_pair, make_arc, until=57)
     usual = tracker._usual._levels
     assert usual is not None
