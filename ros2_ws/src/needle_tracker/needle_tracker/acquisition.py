@@ -136,7 +136,7 @@ class Acquisition:
         looked = self._follower.look(images, predicted, last)
         if looked is None:
             return None
-        found, regions = looked
+        found, regions = self._usual.unmixed(looked[0]), looked[1]
         measured = judged(self._views, self._track, found, insertion)
         if measured.tip is None or not (found[0].clear or found[1].clear):
             return None
@@ -159,7 +159,8 @@ class Acquisition:
         )
         best: tuple[Measurement, Last] | None = None
         least = _FITTING
-        for found in guided_pairs(self._follower, images, predicted, (left, right), last):
+        for pair in guided_pairs(self._follower, images, predicted, (left, right), last):
+            found = self._usual.unmixed(pair)
             if not (is_half_sound(found) and self._usual.allows(found)):
                 continue
             measured = judged(self._views, self._track, found, insertion)
@@ -234,6 +235,8 @@ class Acquisition:
         on_way: bool,
     ) -> Measurement:
         """Judge a pair that was found without a prediction; its whole shaft counts too."""
+        if on_way:
+            found = self._usual.unmixed(found)
         measured = judged(self._views, self._track, found, insertion)
         if measured.reason == DISAGREE_ALONG and insertion is not None:
             measured = self._one_sided(found, insertion, last) or measured

@@ -27,6 +27,7 @@ _EXCLUDED_SIGHTS = 4  # of what is plain, where a needle cannot have got to by w
 _MORE_UNLIKE = 1  # where the needle stands out more, or less, than it did
 _MORE_TRACKING = 2  # while the needle is followed
 _FAINTER, _PLAINER = 0.7, 1.25  # than it did; what lies over it adds to it
+_MIXED = 0.85  # fainter than this, a line that is disturbed may be half a shadow's
 # Where the needle must be, light on it may take more away; and one whose line [px] nothing disturbs
 # may stand out more.
 _DIM, _PLAINEST, _UNDISTURBED_PX = 0.4, 1.4, 0.2
@@ -113,12 +114,29 @@ class UsualVisibility:
     def doubted(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
         """Return the tips, with the line of one that is unlike the needle hardly known."""
         left, right = (
-            tip
-            if self.is_like_in(i, tip)
-            else dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, _UNLIKE_PX))
-            for i, tip in enumerate(tips)
+            tip if self.is_like_in(i, tip) else _hardly_known(tip)
+            for i, tip in enumerate(self.unmixed(tips))
         )
         return left, right
+
+    def unmixed(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
+        """Return the tips, with a line hardly known that may lie between needle and shadow.
+
+        Such a one is fainter than the needle was, and something disturbs it.
+        """
+        left, right = (
+            _hardly_known(tip) if self._is_mixed_in(i, tip) else tip for i, tip in enumerate(tips)
+        )
+        return left, right
+
+    def _is_mixed_in(self, i: int, tip: ImageTip) -> bool:
+        if self._levels is None or tip.sigma_across <= SOUND_PX:
+            return False
+        return tip.visibility < _MIXED * self._levels[i]
+
+
+def _hardly_known(tip: ImageTip) -> ImageTip:
+    return dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, _UNLIKE_PX))
 
 
 def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:

@@ -102,6 +102,20 @@ def test_a_tip_too_plain_for_the_needle_is_not_believed_at_once(
     assert wanted == (0 if plainer == 1.0 else 2)
 
 
+def test_a_line_that_is_fainter_and_disturbed_may_be_half_a_shadow_s() -> None:
+    usual = UsualVisibility()
+    faint = dataclasses.replace(GOOD, visibility=0.8 * GOOD.visibility)
+    mixed = dataclasses.replace(faint, sigma_across=0.4)
+    assert usual.unmixed((mixed, GOOD)) == (mixed, GOOD)
+    usual.see((GOOD, GOOD))
+    disturbed = dataclasses.replace(GOOD, sigma_across=0.4)
+    assert usual.unmixed((faint, disturbed)) == (faint, disturbed)
+    for shown in (usual.unmixed, usual.doubted):
+        left, right = shown((mixed, GOOD))
+        assert left.sigma_across == pytest.approx(math.hypot(0.4, 2.0))
+        assert right == GOOD
+
+
 def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
     found = (GOOD, dataclasses.replace(GOOD, sigma_across=0.4, sigma_along=3.0))
     waiting = functools.partial(sights_for, alike=True, possible=True, near=False)

@@ -185,16 +185,29 @@ def test_one_view_s_end_leads_to_the_other_s(
 
 
 @pytest.mark.parametrize(
-    ("moved", "turned", "plainer", "believed"),
+    ("moved", "turned", "plainer", "sigma", "believed"),
     [
-        (0.0, 0.0, 1.0, True),
-        (0.8e-3, 0.0, 1.0, True),
-        (1.2e-3, 0.0, 1.0, False),
-        (0.0, 0.2, 1.0, True),
-        (0.0, 0.7, 1.0, False),
-        (0.0, 0.0, 1.6, False),
+        (0.0, 0.0, 1.0, 0.05, True),
+        (0.8e-3, 0.0, 1.0, 0.05, True),
+        (1.2e-3, 0.0, 1.0, 0.05, False),
+        (0.0, 0.2, 1.0, 0.05, True),
+        (0.0, 0.7, 1.0, 0.05, False),
+        (0.0, 0.0, 1.6, 0.05, False),
+        (0.0, 0.0, 0.8, 0.05, True),
+        (0.0, 0.0, 1.0, 0.4, True),
+        (0.0, 0.0, 0.8, 0.4, False),
     ],
-    ids=["fits", "apart", "far apart", "leaning", "pointing elsewhere", "too plain"],
+    ids=[
+        "fits",
+        "apart",
+        "far apart",
+        "leaning",
+        "pointing elsewhere",
+        "too plain",
+        "faint",
+        "disturbed",
+        "faint and disturbed",
+    ],
 )
 def test_what_one_view_leads_to_must_fit(
     tracker: StereoTracker,
@@ -205,6 +218,7 @@ def test_what_one_view_leads_to_must_fit(
     moved: float,
     turned: float,
     plainer: float,
+    sigma: float,
     believed: bool,
 ) -> None:
     last_seen(tracker, draw_pair, make_arc)
@@ -213,7 +227,7 @@ def test_what_one_view_leads_to_must_fit(
     way = math.cos(turned) * way + math.sin(turned) * np.cross(way, [0.0, 1.0, 0.0])
     left = image_tip(views[0], path[-1], way)
     right = image_tip(views[1], path[-1] + moved * way, way)
-    left = dataclasses.replace(left, visibility=plainer * left.visibility)
+    left = dataclasses.replace(left, visibility=plainer * left.visibility, sigma_across=sigma)
     monkeypatch.setattr(acquisition, "guided_pairs", lambda *_: iter([(left, right)]))
     predicted = tracker.track.predict(0.061)
     assert predicted is not None
