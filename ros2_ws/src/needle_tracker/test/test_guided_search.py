@@ -55,10 +55,16 @@ def crossed(
     return images[0], images[1]
 
 
-def last_seen(tracker: StereoTracker, draw_pair: Drawer, make_arc: Arc, *, until: int = 60) -> None:
+@pytest.fixture(scope="module")
+def shown(draw_pair: Drawer, make_arc: Arc) -> list[tuple[Image, Image]]:
+    """Return pairs of a needle from 40 to 52 mm."""
+    return [draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)) for mm in range(40, 53)]
+
+
+def last_seen(tracker: StereoTracker, shown: list[tuple[Image, Image]], *, until: int = 60) -> None:
     """Show a needle up to 52 mm, and then hands."""
-    for mm in range(40, 53):
-        assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
+    for mm, pair in enumerate(shown, 40):
+        assert tracker.process(*pair, mm * 1e-3).tip is not None
     covered = np.full((768, 1024), 90, np.uint8)
     for mm in range(53, until + 1):
         assert tracker.process(covered, covered, mm * 1e-3).tip is None
@@ -71,6 +77,7 @@ def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again
     views: Views,
     draw_pair: Drawer,
     make_arc: Arc,
+    shown: list[tuple[Image, Image]],
     monkeypatch: pytest.MonkeyPatch,
     crossing: tuple[int, float, float],
     guiding: bool,
@@ -79,7 +86,7 @@ def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again
     if not guiding:
         # That is what the search along paths makes of it.
         monkeypatch.setattr(acquisition, "guided_pairs", lambda *_: iter(()))
-    last_seen(tracker, draw_pair, make_arc)
+    last_seen(tracker, shown)
     for mm in range(61, 64):
         path = make_arc(mm * 1e-3, 6.0, 1.0)
         pair = crossed(views, draw_pair(path), path, crossing)
@@ -96,11 +103,12 @@ def test_the_place_where_the_needle_should_be_is_looked_at(
     tracker: StereoTracker,
     draw_pair: Drawer,
     make_arc: Arc,
+    shown: list[tuple[Image, Image]],
     monkeypatch: pytest.MonkeyPatch,
     plainer: float,
 ) -> None:
     """Though the search along paths finds nothing; what is too plain is not the needle."""
-    last_seen(tracker, draw_pair, make_arc, until=57)
+    last_seen(tracker, shown, until=57)
     usual = tracker._usual._levels
     assert usual is not None
     tracker._usual._levels = (usual[0] / plainer, usual[1] / plainer)
@@ -170,8 +178,8 @@ def test_one_view_s_end_leads_to_the_other_s(
     motion = TipMotion(tip + np.array([*off, 0.0]), straight, np.diag([2e-3**2] * 3 + [0.1**2] * 3))
     predicted = Anchor(motion, 0.02, known=True)
     images = list(draw_pair(path))
-    shown = (seen[0], seen[1])
-    pairs = list(guided_pairs(follower, (images[0], images[1]), predicted, shown, None))
+    ends = (seen[0], seen[1])
+    pairs = list(guided_pairs(follower, (images[0], images[1]), predicted, ends, None))
     assert pairs
     for pair in pairs:
         assert pair[side] is seen[side]
@@ -180,7 +188,7 @@ def test_one_view_s_end_leads_to_the_other_s(
         assert np.linalg.norm(other.point - views[1 - side].project(tip)) < 1.0
     # A line that does not end there is not the needle's end.
     images[1 - side] = draw_pair(make_arc(0.04, 6.0, 1.0, pitch))[1 - side]
-    for pair in guided_pairs(follower, (images[0], images[1]), predicted, shown, None):
+    for pair in guided_pairs(follower, (images[0], images[1]), predicted, ends, None):
         assert pair[1 - side].clear
 
 
@@ -212,8 +220,8 @@ def test_one_view_s_end_leads_to_the_other_s(
 def test_what_one_view_leads_to_must_fit(
     tracker: StereoTracker,
     views: Views,
-    draw_pair: Drawer,
     make_arc: Arc,
+    shown: list[tuple[Image, Image]],
     monkeypatch: pytest.MonkeyPatch,
     moved: float,
     turned: float,
@@ -221,7 +229,7 @@ def test_what_one_view_leads_to_must_fit(
     sigma: float,
     believed: bool,
 ) -> None:
-    last_seen(tracker, draw_pair, make_arc)
+    last_seen(tracker, shown)
     path = make_arc(0.061, 6.0, 1.0)
     way = (path[-1] - path[-4]) / np.linalg.norm(path[-1] - path[-4])
     way = math.cos(turned) * way + math.sin(turned) * np.cross(way, [0.0, 1.0, 0.0])
