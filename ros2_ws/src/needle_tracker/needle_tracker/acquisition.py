@@ -31,14 +31,13 @@ from needle_tracker.evidence import (
     sights_of_excluded,
 )
 from needle_tracker.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
-from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN, tip_at_entry
+from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN
 from needle_tracker.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import SearchGrid, make_search_grid
 from needle_tracker.shaft import shaft_points, shaft_problem
 from needle_tracker.tip_fit import ImageTip, fit_tip, hidden
-from needle_tracker.tip_motion import TipMotion
 from needle_tracker.track import SURPRISING, TOO_FAR, Anchor, Track, TrackState
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
@@ -322,9 +321,8 @@ class Acquisition:
 
     def _entry_surprise(self, tip: SpatialTip, insertion: float) -> float:
         """Return how far a tip is from where the entry has it, squared, over the covariance."""
-        reach = self._settings.gates.reach
-        entry = tip_at_entry(insertion, reach.hole_tolerance, reach.entry_angle)
-        return TipMotion.start(entry).surprise(tip)
+        predicted = predicted_from_entry(self._settings.gates.reach, insertion)
+        return predicted.motion.surprise(tip)
 
     def _one_sided(
         self, found: tuple[ImageTip, ImageTip], insertion: float, last: Last | None
