@@ -22,7 +22,7 @@ from needle_tracker.evidence import (
     sights_for,
     sights_of_excluded,
 )
-from needle_tracker.measurement import judged
+from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import make_search_grid
 from needle_tracker.tip_fit import ImageTip, hidden
@@ -100,6 +100,17 @@ def test_a_tip_too_plain_for_the_needle_is_not_believed_at_once(
     assert not tracker.track.fits(measured.tip, 0.072, on_way=False)
     wanted = tracker._acquisition._sights_wanted(measured, found, 0.072, on_way=False)
     assert wanted == (0 if plainer == 1.0 else 2)
+
+
+def test_what_begins_at_the_entry_is_no_needle_that_has_begun(
+    settings: TrackerSettings, calibration: StereoCalibration
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    young = tip(z=0.01)
+    measured = Measurement(young, TrackState.SEARCHING, "", (GOOD, GOOD))
+    assert tracker._acquisition._begins_at_entry(measured, 0.01)
+    assert tracker.track.accept(young, 0.01) is not None
+    assert not tracker._acquisition._begins_at_entry(measured, 0.01)
 
 
 def test_a_line_that_is_fainter_and_disturbed_may_be_half_a_shadow_s() -> None:

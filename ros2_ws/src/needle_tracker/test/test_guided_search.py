@@ -12,6 +12,7 @@ import pytest
 
 from needle_tracker import acquisition
 from needle_tracker.calibration import StereoCalibration
+from needle_tracker.evidence import UsualVisibility
 from needle_tracker.following import Follower
 from needle_tracker.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.measurement import Measurement
@@ -123,6 +124,45 @@ def test_the_place_where_the_needle_should_be_is_looked_at(
         assert measured.reason == ""
         assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
         assert None not in measured.regions
+
+
+@pytest.mark.parametrize("by", ["_search", "_where_expected"])
+def test_a_line_that_may_be_half_a_shadow_s_says_little_however_it_is_found(
+    tracker: StereoTracker,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    shown: list[tuple[Image, Image]],
+    monkeypatch: pytest.MonkeyPatch,
+    by: str,
+) -> None:
+    nothing = {
+        "_search": Measurement(None, TrackState.TRACKING, "no needle"),
+        "_where_expected": None,
+    }
+    other = next(name for name in nothing if name != by)
+    pair = draw_pair(make_arc(0.058, 6.0, 1.0))
+
+    def sigma(across_px: float | None) -> float:
+        tracker.reset()
+        last_seen(tracker, shown, until=57)
+        with monkeypatch.context() as patch:
+            patch.setattr(acquisition, "guided_pairs", lambda *_: iter(()))
+            patch.setattr(acquisition.Acquisition, other, lambda *_, **__: nothing[other])
+            patch.setattr(StereoTracker, "_follow", lambda *_: None)
+            if across_px is not None:
+                patch.setattr(
+                    UsualVisibility,
+                    "unmixed",
+                    lambda _, tips: tuple(
+                        dataclasses.replace(tip, sigma_across=across_px) for tip in tips
+                    ),
+                )
+            measured = tracker.process(*pair, 0.058)
+        if measured.tip is None or measured.reason:
+            return math.inf
+        return float(np.sqrt(np.linalg.eigvalsh(measured.tip.covariance)[-1]))
+
+    assert sigma(2.0) > 2.0 * sigma(None)
 
 
 @pytest.mark.parametrize("crossing", [(0, 30.0, 5.5e-3), (0, -25.0, 5.5e-3)])
