@@ -173,6 +173,8 @@ class Rig(SimRigBench):
             answer = self.call(name, data)
             assert answer.success, answer.message
         self.until(lambda: partner.status.get("homed") == "true", "homed")
+        # They are repeated until the first exposure, and may have been missed before.
+        self.until(lambda: bool(partner.joints), "joints at the start of time")
         partner.pressed = True
         self.until(lambda: partner.status["hold_owner"] == "partner", "hold")
         partner.say("STEERING", "tip", 0)
