@@ -1,4 +1,4 @@
-"""One point through the refracting surface into one camera, compiled: for the tracker's loops.
+"""One point through the refracting surface into one camera, and back: for the tracker's loops.
 
 The same model as `refraction`, which serves arrays and documents it; the tests hold the two
 together.
@@ -20,6 +20,8 @@ from needle_tracker.calibration import Camera, Phantom
 Array = NDArray[np.float64]
 
 _ITERATIONS = 40
+_UNDISTORT_ITERATIONS = 12
+_UNDISTORTED = 1e-9  # what is inverted so well is, at unit focal length
 _JACOBIAN_STEP = 1e-5  # [m]
 
 
@@ -93,6 +95,57 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     pixel[0] = camera[15] * (x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)) + camera[17]
     pixel[1] = camera[16] * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + camera[18]
+
+
+@compiled
+def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> None:
+    """Write the refracted ray that a pixel looks along.
+
+    Parameters
+    ----------
+    camera : ndarray
+        From `pack_camera`.
+    pixel : ndarray, shape (2,)
+        Pixel coordinates.
+    origin, direction : ndarray, shape (3,)
+        Take the point of the surface in `rig` [m] and the unit vector into the phantom; NaN for a
+        pixel that does not look down, or where the distortion has no inverse.
+    """
+    k1, k2, p1, p2, k3 = camera[19], camera[20], camera[21], camera[22], camera[23]
+    seen_x = (pixel[0] - camera[17]) / camera[15]
+    seen_y = (pixel[1] - camera[18]) / camera[16]
+    x, y = seen_x, seen_y
+    miss_x = miss_y = 0.0
+    for _ in range(_UNDISTORT_ITERATIONS):
+        r2 = x * x + y * y
+        radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        miss_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x) - seen_x
+        miss_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y - seen_y
+        if abs(miss_x) + abs(miss_y) < 1e-15:
+            break
+        slope = 2.0 * (k1 + r2 * (2.0 * k2 + 3.0 * r2 * k3))
+        j_xx = radial + slope * x * x + 2.0 * p1 * y + 6.0 * p2 * x
+        j_yy = radial + slope * y * y + 6.0 * p1 * y + 2.0 * p2 * x
+        j_xy = slope * x * y + 2.0 * p1 * x + 2.0 * p2 * y
+        det = j_xx * j_yy - j_xy * j_xy
+        x -= (j_yy * miss_x - j_xy * miss_y) / det
+        y -= (j_xx * miss_y - j_xy * miss_x) / det
+    length = math.sqrt(x * x + y * y + 1.0)
+    x, y, z = x / length, y / length, 1.0 / length
+    down = -(camera[0] * x + camera[3] * y + camera[6] * z)
+    if not (down > 0.0 and abs(miss_x) + abs(miss_y) < _UNDISTORTED):
+        origin[:] = np.nan
+        direction[:] = np.nan
+        return
+    across = camera[1] * x + camera[4] * y + camera[7] * z
+    along = camera[2] * x + camera[5] * y + camera[8] * z
+    reach = (camera[12] - camera[24]) / down
+    origin[0] = camera[24]
+    origin[1] = camera[13] + reach * across
+    origin[2] = camera[14] + reach * along
+    # Snell: the part along the surface shrinks by the index; unit length gives the rest.
+    direction[1], direction[2] = across / camera[25], along / camera[25]
+    direction[0] = -math.sqrt(1.0 - direction[1] * direction[1] - direction[2] * direction[2])
 
 
 @compiled

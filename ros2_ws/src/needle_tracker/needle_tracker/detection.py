@@ -13,12 +13,13 @@ of its own: which one is the needle, two views decide together.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_common.compiled import compiled, inlined
 from needle_tracker.search_grid import SearchGrid
 
 Array = NDArray[np.float64]
@@ -95,22 +96,33 @@ class Path:
 
 def cut_path(path: Path, grid: SearchGrid, length: float) -> Path:
     """Return the part of a path up to a length from the entry [m], measured in the plane x = 0."""
-    distance = grid.distances[path.rows]
-    angle = grid.angles[path.columns]
-    # Over a few rows at once: cells make steps.
-    places = np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=1)[::_CUT_ROWS]
-    steps = np.linalg.norm(np.diff(places, axis=0, prepend=np.zeros((1, 2))), axis=1)
-    run = np.interp(np.arange(len(distance)), np.arange(len(steps)) * _CUT_ROWS, np.cumsum(steps))
-    run[(len(steps) - 1) * _CUT_ROWS :] += (
-        distance[(len(steps) - 1) * _CUT_ROWS :] - distance[(len(steps) - 1) * _CUT_ROWS]
-    )
-    count = max(int(np.searchsorted(run, length)), 2)
+    count = max(_cells_within(grid.distances, grid.angles, path.rows, path.columns, length), 2)
     return dataclasses.replace(
         path,
         rows=path.rows[:count],
         columns=path.columns[:count],
         pixels=path.pixels[:count],
     )
+
+
+@compiled
+def _cells_within(distances: Array, angles: Array, rows: Rows, columns: Rows, length: float) -> int:
+    """Return how many cells of a path are no farther than a length along it."""
+    run = before = y = z = 0.0
+    # Over a few rows at once: cells make steps.
+    for first in range(0, len(rows), _CUT_ROWS):
+        distance, angle = distances[rows[first]], angles[columns[first]]
+        to_y, to_z = distance * math.sin(angle), distance * math.cos(angle)
+        before, run = run, run + math.hypot(to_y - y, to_z - z)
+        y, z = to_y, to_z
+        if run >= length:
+            share = (length - before) / (run - before)
+            return first - _CUT_ROWS + math.ceil(share * _CUT_ROWS)
+    last = (len(rows) - 1) // _CUT_ROWS * _CUT_ROWS
+    for i in range(last + 1, len(rows)):
+        if run + distances[rows[i]] - distances[rows[last]] >= length:
+            return i
+    return len(rows)
 
 
 def distinct(paths: list[Path]) -> list[Path]:
@@ -202,9 +214,7 @@ def find_paths(
                 continue
             path_rows = np.arange(end_row + 1)
             columns = path_columns[: end_row + 1]
-            values = sign * ridge[path_rows, columns]
-            coverage = float(np.mean(values > threshold))
-            contrast = float(np.median(values))
+            coverage, contrast = _appearance(ridge, columns, sign, np.float32(threshold))
             if coverage < settings.min_coverage or contrast < threshold:
                 continue
             pixels = grid.pixels[path_rows, columns].astype(np.float64)
@@ -251,25 +261,56 @@ def _sampled(
     return values
 
 
+@compiled
 def _noise(ridge: Ridge) -> float:
     """Return a standard deviation that lines and spots do not spoil."""
-    sample = ridge[::_NOISE_PITCH, ::_NOISE_PITCH].reshape(-1)
+    sample = ridge[::_NOISE_PITCH, ::_NOISE_PITCH].copy().reshape(-1)
     return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+
+
+@compiled
+def _appearance(
+    ridge: Ridge, columns: Rows, sign: np.float32, threshold: np.float32
+) -> tuple[float, float]:
+    """Return which share of a path looks like a needle, and its median contrast."""
+    values = np.empty(len(columns), np.float32)
+    over = 0
+    for i in range(len(columns)):
+        values[i] = sign * ridge[i, columns[i]]
+        over += values[i] > threshold
+    return over / len(columns), float(np.median(values))
 
 
 @compiled
 def _accumulate(evidence: Ridge, steps: Rows, total: Ridge, first: int) -> None:
     """Fill `total` from a row on with the largest sums of evidence of paths to each cell."""
     rows, columns = evidence.shape
+    widest = columns + 2 * steps.max()
+    one, other = np.empty(widest, np.float32), np.empty(widest, np.float32)
     for i in range(first, rows):
-        step = steps[i]
-        for j in range(columns):
-            best = np.float32(0.0)
-            if i:
-                best = _IMPOSSIBLE
-                for k in range(max(j - step, 0), min(j + step, columns - 1) + 1):
-                    best = max(best, total[i - 1, k])
-            total[i, j] = evidence[i, j] + best
+        if i == 0:
+            total[i] = evidence[i]
+            continue
+        # The largest of two spans is that of one twice as long; each written to a place of its
+        # own, so that many cells are done at once.
+        step, span = steps[i], 1
+        length = columns + 2 * step
+        one[:step] = _IMPOSSIBLE
+        one[step : step + columns] = total[i - 1]
+        one[step + columns : length] = _IMPOSSIBLE
+        while 2 * span <= 2 * step + 1:
+            length -= span
+            _larger(one, one[span:], other[:length])
+            one, other = other, one
+            span *= 2
+        _larger(one, one[2 * step + 1 - span :], total[i])
+        total[i] += evidence[i]
+
+
+@inlined
+def _larger(some: Ridge, others: Ridge, result: Ridge) -> None:
+    for j in range(len(result)):
+        result[j] = max(some[j], others[j])
 
 
 @compiled

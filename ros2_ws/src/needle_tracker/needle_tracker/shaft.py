@@ -4,14 +4,22 @@ A shadow on the floor, a cable above the surface or two different lines in the t
 a needle could; but on their way from the entry they lie too deep, too high, or nowhere.
 """
 
+# Compiled functions take plain numbers, one by one.
+# ruff: noqa: PLR0917
+
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_common.compiled import compiled
+from needle_tracker.compiled_projection import pixel_ray
 from needle_tracker.detection import Path
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach
+from needle_tracker.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
@@ -20,7 +28,7 @@ _OTHER_POINTS = 40
 _SMOOTH_CELLS = 7
 _LEAST_STATIONS = 4
 _TOLERANCE = 3e-3  # of a station, beyond what the needle can reach [m]
-_MISS = 1.5e-3  # of the two rays [m]
+_LEAST_ANGLE = 1e-4  # of two rays [rad]
 _LEAST_SINE = 0.02  # between the epipolar plane and the shaft
 
 
@@ -47,34 +55,80 @@ def shaft_points(
     pixels[1] = pixels[1][:: max(len(pixels[1]) // _OTHER_POINTS, 1)]
     alike = len(pixels[1]) / len(pixels[0])
     chosen = np.unique(np.linspace(0, len(pixels[0]) - 1, _STATIONS + 1).astype(int))[:-1]
-    origins, directions = views[0].rays(pixels[0][chosen])
-    other_origins, other_directions = views[1].rays(pixels[1])
-    # Signed distance of each station's ray from each of the other image's.
-    across = np.cross(directions[:, None], other_directions[None])
-    length = np.linalg.norm(across, axis=-1)
-    between = other_origins[None] - origins[:, None]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        miss = np.sum(between * across, axis=-1) / length
-    points = []
-    for k in range(len(chosen)):
-        row = miss[k]
-        crossings = np.flatnonzero(np.sign(row[1:]) * np.sign(row[:-1]) < 0.0)
-        if not len(crossings):
+    points = np.empty((len(chosen) + 1, 3))
+    count = _meeting_points(
+        (views[0].packed, views[1].packed),
+        pixels[0][chosen],
+        pixels[1],
+        alike * chosen,
+        _LEAST_SINE * 5e-4 / alike,
+        points,
+    )
+    points[count] = tip
+    return points[: count + 1]
+
+
+@compiled
+def _meeting_points(
+    cameras: tuple[Array, Array],
+    stations: Array,
+    others: Array,
+    along: Array,
+    least_step: float,
+    points: Array,
+) -> int:
+    """Write where the rays of one image's stations meet the surface of the other image's rays.
+
+    Parameters
+    ----------
+    cameras : pair of ndarray
+        From `pack_camera`.
+    stations, others : ndarray, shape (m, 2) and (n, 2)
+        Pixels of the one image, and of the other in the order of its path.
+    along : ndarray, shape (m,)
+        How far along the other path each station is about, in its points.
+    least_step : float
+        Least change of the rays' distance from one of the other points to the next [m].
+    points : ndarray, shape (m + 1, 3)
+        Takes the points, in `rig` [m].
+
+    Returns
+    -------
+    int
+        How many there are.
+    """
+    origins, directions = np.empty((len(others), 3)), np.empty((len(others), 3))
+    for i in range(len(others)):
+        pixel_ray(cameras[1], others[i], origins[i], directions[i])
+    origin, direction, between, across = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    miss = np.empty(len(others))
+    count = 0
+    for k in range(len(stations)):
+        pixel_ray(cameras[0], stations[k], origin, direction)
+        chosen, least = -1, math.inf
+        for i in range(len(others)):
+            # Signed distance of the station's ray from each of the other image's.
+            between[:] = origins[i] - origin
+            cross(direction, directions[i], across)
+            miss[i] = dot(between, across) / math.sqrt(dot(across, across))
+            # Of several crossings the one about as far along the path.
+            away = abs(i - 1 - along[k])
+            if i and miss[i] * miss[i - 1] < 0.0 and away < least:
+                chosen, least = i - 1, away
+        if chosen < 0 or abs(miss[chosen + 1] - miss[chosen]) < least_step:
             continue
-        # Of several the one about as far along the path.
-        i = int(crossings[np.argmin(np.abs(crossings - alike * chosen[k]))])
-        if abs(row[i + 1] - row[i]) < _LEAST_SINE * 5e-4 / alike:
+        share = miss[chosen] / (miss[chosen] - miss[chosen + 1])
+        other = (1.0 - share) * directions[chosen] + share * directions[chosen + 1]
+        between[:] = (1.0 - share) * origins[chosen] + share * origins[chosen + 1] - origin
+        cross(direction, other, across)
+        square = dot(across, across)
+        if square < _LEAST_ANGLE**2:
             continue
-        share = row[i] / (row[i] - row[i + 1])
-        origin = (1.0 - share) * other_origins[i] + share * other_origins[i + 1]
-        direction = (1.0 - share) * other_directions[i] + share * other_directions[i + 1]
-        normal = np.cross(directions[k], direction)
-        square = float(normal @ normal)
-        if square < 1e-8:
-            continue
-        along = float(np.cross(origin - origins[k], direction) @ normal) / square
-        points.append(origins[k] + along * directions[k])
-    return np.array([*points, tip])
+        moment = np.empty(3)
+        cross(between, other, moment)
+        points[count] = origin + dot(moment, across) / square * direction
+        count += 1
+    return count
 
 
 def shaft_problem(
@@ -125,9 +179,12 @@ def _length(points: Array, distance: Array) -> float:
     return float(np.linalg.norm(np.diff(curve, axis=0), axis=1).sum())
 
 
+@compiled
 def _smooth(pixels: Array) -> Array:
     """Return the path without its cells' steps."""
-    size = min(_SMOOTH_CELLS, 2 * ((len(pixels) - 1) // 2) + 1)
-    padded = np.pad(pixels, ((size // 2, size // 2), (0, 0)), mode="reflect", reflect_type="odd")
-    sums = np.cumsum(np.concatenate([np.zeros((1, 2)), padded]), axis=0)
-    return np.asarray((sums[size:] - sums[:-size]) / size)
+    smooth = np.empty((len(pixels), 2))
+    for i in range(len(pixels)):
+        half = min(_SMOOTH_CELLS // 2, i, len(pixels) - 1 - i)
+        smooth[i, 0] = np.mean(pixels[i - half : i + half + 1, 0])
+        smooth[i, 1] = np.mean(pixels[i - half : i + half + 1, 1])
+    return smooth

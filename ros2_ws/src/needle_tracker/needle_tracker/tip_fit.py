@@ -196,7 +196,10 @@ def _coarse_line(pixels: Array, length: float) -> tuple[Array, Array]:
     distance = np.linalg.norm(pixels - pixels[-1], axis=1)
     last = pixels[distance <= length]
     centre = last.mean(axis=0)
-    _, _, axes = np.linalg.svd(last - centre)
-    direction = axes[0] if axes[0] @ (last[-1] - last[0]) >= 0.0 else -axes[0]
+    # The principal axis, in closed form.
+    x, y = (last - centre).T
+    angle = 0.5 * math.atan2(2.0 * float(x @ y), float(x @ x - y @ y))
+    axis = np.array([math.cos(angle), math.sin(angle)])
+    direction = axis if axis @ (last[-1] - last[0]) >= 0.0 else -axis
     end = centre + direction * float((pixels[-1] - centre) @ direction)
     return end, direction

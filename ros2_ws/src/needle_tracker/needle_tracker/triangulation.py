@@ -13,13 +13,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.compiled_projection import solve_position
+from needle_common.compiled import compiled
+from needle_tracker.compiled_projection import pixel_ray, solve_position
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.tip_fit import ImageTip
+from needle_tracker.vectors import cross, dot
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
+_LEAST_SINE = 1e-3  # of the angle between the planes in which the two views see the shaft
 _ALONG_SIGMAS, _ALONG_DOUBT = 3.0, 0.6
 
 
@@ -66,8 +69,9 @@ def midpoint(views: tuple[RefractedCamera, RefractedCamera], tips: tuple[Array, 
     ndarray, shape (3,)
         NaN for parallel rays.
     """
-    rays = [view.rays(tip) for view, tip in zip(views, tips, strict=True)]
-    (p, a), (q, b) = rays
+    p, a, q, b = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    pixel_ray(views[0].packed, np.asarray(tips[0], dtype=np.float64), p, a)
+    pixel_ray(views[1].packed, np.asarray(tips[1], dtype=np.float64), q, b)
     cosine = float(a @ b)
     denominator = 1.0 - cosine * cosine
     if not denominator > 1e-9:
@@ -101,26 +105,25 @@ def triangulate(
     position = midpoint(views, (tips[0].point, tips[1].point))
     if not np.all(np.isfinite(position)):
         return None
-    axes = [
-        np.stack([[-tip.direction[1], tip.direction[0]], tip.direction]) for tip in tips
-    ]  # rows: across, along
+    axes = np.array(
+        [[[-tip.direction[1], tip.direction[0]], tip.direction] for tip in tips]
+    )  # rows: across, along
     sigmas = np.array([s for tip in tips for s in (tip.sigma_across, tip.sigma_along)])
     position = np.array(position)
-    converged, normal, residual, found = solve_position(
+    converged, normal, residual, jacobians = solve_position(
         np.stack([view.packed for view in views]),
         np.stack([tip.point for tip in tips]),
-        np.stack(axes),
+        axes,
         sigmas,
         position,
         _ITERATIONS,
     )
     if not converged:
         return None
-    jacobians = [found[0], found[1]]
-    heading = _shaft_direction(jacobians, axes, [tip.sigma_angle for tip in tips])
-    if heading is None:
+    direction, direction_covariance = np.empty(3), np.empty((3, 3))
+    sigma_angles = np.array([tip.sigma_angle for tip in tips])
+    if not _shaft_direction(jacobians, axes, sigma_angles, direction, direction_covariance):
         return None
-    direction, direction_covariance = heading
     if direction_covariance.trace() > 1.0:
         return None
     # Residual along the shaft in the images, as lengths along the shaft in space.
@@ -155,30 +158,42 @@ def _beyond(residual: float, sigma: float) -> float:
     return max(abs(float(residual)) - 3.0 * float(sigma), 0.0)
 
 
+@compiled
 def _shaft_direction(
-    jacobians: list[Array], axes: list[Array], sigma_angles: list[float]
-) -> tuple[Array, Array] | None:
-    """Return the shaft's direction in `rig`, and its covariance.
+    jacobians: Array, axes: Array, sigma_angles: Array, direction: Array, covariance: Array
+) -> bool:
+    """Write the shaft's direction in `rig`, and its covariance; return whether the views tell it.
 
     Seen through a camera's Jacobian J, the direction d runs along the image line: n . J d = 0 with
     n across the line. So d is across both J^T n: the intersection of two planes.
     """
-    normals = [j.T @ axis[0] for j, axis in zip(jacobians, axes, strict=True)]
-    cross = np.cross(normals[0], normals[1])
-    length = float(np.linalg.norm(cross))
-    sine = length / float(np.linalg.norm(normals[0]) * np.linalg.norm(normals[1]))
-    if not sine > 1e-3:
-        return None
-    direction = cross / length
-    if float(axes[0][1] @ jacobians[0] @ direction) < 0.0:
-        direction = -direction
-    if float(axes[1][1] @ jacobians[1] @ direction) <= 0.0:
-        return None
-    # Turning an image line by da moves its n by -da t (t along): dn = -da J^T t.
-    covariance = np.zeros((3, 3))
+    normals, alongs = np.empty((2, 3)), np.empty((2, 3))
     for i in range(2):
-        change = -jacobians[i].T @ axes[i][1]
-        turned = np.cross(change, normals[1]) if i == 0 else np.cross(normals[0], change)
-        across = (turned - direction * float(direction @ turned)) / length
-        covariance += sigma_angles[i] ** 2 * np.outer(across, across)
-    return direction, covariance
+        for k in range(3):
+            normals[i, k] = axes[i, 0, 0] * jacobians[i, 0, k] + axes[i, 0, 1] * jacobians[i, 1, k]
+            alongs[i, k] = axes[i, 1, 0] * jacobians[i, 0, k] + axes[i, 1, 1] * jacobians[i, 1, k]
+    cross(normals[0], normals[1], direction)
+    length = math.sqrt(dot(direction, direction))
+    product = math.sqrt(dot(normals[0], normals[0]) * dot(normals[1], normals[1]))
+    if not length > _LEAST_SINE * product:
+        return False
+    # Towards the tip in the left image; then it must be so in the right one.
+    sign = -1.0 if dot(alongs[0], direction) < 0.0 else 1.0
+    for k in range(3):
+        direction[k] *= sign / length
+    if dot(alongs[1], direction) <= 0.0:
+        return False
+    # Turning an image line by da moves its n by -da t (t along): dn = -da J^T t.
+    turned = np.empty(3)
+    covariance[:] = 0.0
+    for i in range(2):
+        cross(alongs[i], normals[1 - i], turned)
+        away = dot(direction, turned)
+        for a in range(3):
+            for b in range(3):
+                covariance[a, b] += (
+                    (sigma_angles[i] / length) ** 2
+                    * (turned[a] - away * direction[a])
+                    * (turned[b] - away * direction[b])
+                )
+    return True

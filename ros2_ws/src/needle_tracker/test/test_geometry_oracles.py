@@ -15,7 +15,7 @@ import pytest
 from scipy.optimize import root
 
 from needle_tracker.calibration import Camera, Phantom, StereoCalibration
-from needle_tracker.compiled_projection import project_point
+from needle_tracker.compiled_projection import pixel_ray, project_point
 from needle_tracker.refraction import RefractedCamera
 
 # aquacal's world has z down into the water: x = rig y, y = -rig z, z = -rig x.
@@ -109,6 +109,13 @@ def compiled_pixels(rig: Rig) -> np.ndarray:
     return pixels
 
 
+def compiled_rays(rig: Rig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
+    for pixel, origin, direction in zip(pixels, origins, directions, strict=True):
+        pixel_ray(rig.view.packed, pixel, origin, direction)
+    return origins, directions
+
+
 def test_pixels_are_those_of_aquacal(aquacal: Any, rig: Rig) -> None:
     camera, surface = aquacal_rig(aquacal, rig)
     expected = np.array(
@@ -128,9 +135,9 @@ def test_rays_are_those_of_aquacal(aquacal: Any, rig: Rig) -> None:
     camera, surface = aquacal_rig(aquacal, rig)
     pixels = rig.view.project(rig.points)
     expected = np.array([aquacal.refractive_back_project(camera, surface, p) for p in pixels])
-    origins, directions = rig.view.rays(pixels)
-    np.testing.assert_allclose(origins, expected[:, 0] @ R_AQUACAL_RIG, rtol=0.0, atol=1e-12)
-    np.testing.assert_allclose(directions, expected[:, 1] @ R_AQUACAL_RIG, rtol=0.0, atol=1e-12)
+    for origins, directions in (rig.view.rays(pixels), compiled_rays(rig, pixels)):
+        np.testing.assert_allclose(origins, expected[:, 0] @ R_AQUACAL_RIG, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(directions, expected[:, 1] @ R_AQUACAL_RIG, rtol=0.0, atol=1e-12)
 
 
 def test_light_takes_the_fastest_of_all_paths(rig: Rig) -> None:
@@ -161,8 +168,33 @@ def test_light_takes_the_fastest_of_all_paths(rig: Rig) -> None:
 
 def test_what_is_projected_is_found_again(rig: Rig) -> None:
     """There and back within 1e-9 mm: the ray of a point's pixel passes through the point."""
-    origins, directions = rig.view.rays(rig.view.project(rig.points))
-    offset = rig.points - origins
-    along = np.sum(offset * directions, axis=-1, keepdims=True)
-    assert np.linalg.norm(offset - along * directions, axis=-1).max() <= 1e-12
-    assert along.min() > 0.0
+    pixels = rig.view.project(rig.points)
+    for origins, directions in (rig.view.rays(pixels), compiled_rays(rig, pixels)):
+        offset = rig.points - origins
+        along = np.sum(offset * directions, axis=-1, keepdims=True)
+        assert np.linalg.norm(offset - along * directions, axis=-1).max() <= 1e-12
+        assert along.min() > 0.0
+
+
+def test_what_has_no_ray_has_none_compiled_either(rig: Rig) -> None:
+    pixel = np.array([np.nan, 100.0])
+    origins, directions = compiled_rays(rig, pixel[None])
+    assert np.all(np.isnan(origins))
+    assert np.all(np.isnan(directions))
+    # Strong barrel distortion: no ideal point is seen that far out.
+    barrel = dataclasses.replace(rig.view.camera, distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
+    matrix = barrel.camera_matrix
+    far = np.array([[matrix[0, 2] + 3.0 * matrix[0, 0], matrix[1, 2] + 3.0 * matrix[1, 1]]])
+    view = RefractedCamera(barrel, rig.view.phantom)
+    assert np.all(np.isnan(compiled_rays(Rig(view, rig.points), far)[1]))
+    assert np.all(np.isnan(view.rays(far)[1]))
+    # A camera turned round looks up, away from the surface.
+    flip = np.diag([-1.0, 1.0, -1.0])
+    pose = rig.view.camera.T_optical_rig.copy()
+    centre = rig.view.camera.centre
+    pose[:3, :3] = flip @ pose[:3, :3]
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    up = RefractedCamera(dataclasses.replace(rig.view.camera, T_optical_rig=pose), rig.view.phantom)
+    middle = up.camera.camera_matrix[:2, 2][None]
+    assert np.all(np.isnan(compiled_rays(Rig(up, rig.points), middle)[1]))
+    assert np.isnan(up.rays(middle)[1][0, 0])

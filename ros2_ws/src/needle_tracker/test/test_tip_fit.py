@@ -26,7 +26,7 @@ def coarse_path(
 
 
 @pytest.mark.parametrize("bright", [False, True])
-@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, -63.0])
+@pytest.mark.parametrize("angle_deg", [0.0, 17.0, 45.0, -63.0, 122.0, 206.0])
 def test_end_and_direction_to_a_fraction_of_a_pixel(
     make_line: Callable[..., np.ndarray], angle_deg: float, bright: bool
 ) -> None:

@@ -35,6 +35,24 @@ def test_exact_images_give_the_exact_tip(views: Views) -> None:
     np.testing.assert_allclose(midpoint(views, (left.point, right.point)), TIP, atol=1e-11)
 
 
+def test_it_does_not_matter_which_camera_comes_first(views: Views) -> None:
+    left, right = seen(views)
+    tip = triangulate((views[1], views[0]), (right, left))
+    assert tip is not None
+    np.testing.assert_allclose(tip.direction, HEADING, atol=1e-5)
+    np.testing.assert_allclose(tip.position, TIP, atol=1e-11)
+
+
+def test_shafts_that_run_opposite_ways_are_not_one_needle(views: Views) -> None:
+    left, right = seen(views)
+    for one, other in ((left, turned(right)), (turned(left), right)):
+        assert triangulate(views, (one, other)) is None
+
+
+def turned(tip: ImageTip) -> ImageTip:
+    return dataclasses.replace(tip, direction=-tip.direction)
+
+
 def moved(tip: ImageTip, along: float, across: float, turn: float) -> ImageTip:
     normal = np.array([-tip.direction[1], tip.direction[0]])
     direction = tip.direction + turn * normal
@@ -74,6 +92,29 @@ def test_covariances_fit_the_errors(views: Views) -> None:
     assert np.std(np.array(errors)[:, 0]) < 0.6 * np.std(np.array(plain)[:, 0])
 
 
+def test_the_directions_covariance_is_what_turning_the_lines_does(views: Views) -> None:
+    sigmas, turn = (1e-3, 6e-3), 1e-4
+    exact = [
+        dataclasses.replace(tip, sigma_angle=sigma)
+        for tip, sigma in zip(seen(views), sigmas, strict=True)
+    ]
+    expected = np.zeros((3, 3))
+    for i, sigma in enumerate(sigmas):
+        directions = []
+        for sign in (1.0, -1.0):
+            tips = [moved(tip, 0, 0, sign * turn if k == i else 0) for k, tip in enumerate(exact)]
+            tip = triangulate(views, (tips[0], tips[1]))
+            assert tip is not None
+            directions.append(tip.direction)
+        slope = (directions[0] - directions[1]) / (2.0 * turn)
+        expected += sigma**2 * np.outer(slope, slope)
+    tip = triangulate(views, (exact[0], exact[1]))
+    assert tip is not None
+    np.testing.assert_allclose(
+        tip.direction_covariance, expected, rtol=0.0, atol=1e-4 * np.trace(expected)
+    )
+
+
 def test_disagreement_along_the_needle_is_measured(views: Views) -> None:
     left, right = seen(views)
     tip = triangulate(views, (left, moved(right, -10.0, 0.0, 0.0)))
@@ -88,6 +129,10 @@ def test_a_needle_along_the_baseline_has_no_direction(views: Views) -> None:
     tips = seen(views, np.array([0.0, 0.0, 0.0625]), across)
     tip = triangulate(views, (tips[0], tips[1]))
     assert tip is None or tip.direction_covariance.trace() > 1e-3
+    # However well the lines are known: what calibration leaves would say where it points.
+    tips = seen(views, np.array([0.0, 0.0, 0.0625]), across + np.array([0.0, 0.0, 1e-3]))
+    left, right = (dataclasses.replace(tip, sigma_angle=1e-9) for tip in tips)
+    assert triangulate(views, (left, right)) is None
 
 
 @pytest.mark.parametrize("gap", [400.0, 3000.0])
