@@ -51,15 +51,15 @@ def shaft_points(
     ndarray, shape (n, 3)
         In `rig` [m]; few or none where the shaft runs along the cameras' baseline.
     """
-    pixels = [_smooth(path.pixels) for path in paths]
-    pixels[1] = pixels[1][:: max(len(pixels[1]) // _OTHER_POINTS, 1)]
-    alike = len(pixels[1]) / len(pixels[0])
-    chosen = np.unique(np.linspace(0, len(pixels[0]) - 1, _STATIONS + 1).astype(int))[:-1]
+    stations, others = (_smooth(path.pixels) for path in paths)
+    others = np.ascontiguousarray(others[:: max(len(others) // _OTHER_POINTS, 1)])
+    alike = len(others) / len(stations)
+    chosen = np.unique(np.linspace(0, len(stations) - 1, _STATIONS + 1).astype(int))[:-1]
     points = np.empty((len(chosen) + 1, 3))
     count = _meeting_points(
         (views[0].packed, views[1].packed),
-        pixels[0][chosen],
-        pixels[1],
+        stations[chosen],
+        others,
         alike * chosen,
         _LEAST_SINE * 5e-4 / alike,
         points,

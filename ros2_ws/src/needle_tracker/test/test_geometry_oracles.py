@@ -111,7 +111,8 @@ def compiled_pixels(rig: Rig) -> np.ndarray:
 
 def compiled_rays(rig: Rig, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     origins, directions = np.empty((len(pixels), 3)), np.empty((len(pixels), 3))
-    for pixel, origin, direction in zip(pixels, origins, directions, strict=True):
+    rows = np.ascontiguousarray(pixels)
+    for pixel, origin, direction in zip(rows, origins, directions, strict=True):
         pixel_ray(rig.view.packed, pixel, origin, direction)
     return origins, directions
 
