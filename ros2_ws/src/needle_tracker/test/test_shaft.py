@@ -56,7 +56,7 @@ def test_cells_make_steps_the_shaft_does_not(views: Views, roll: float) -> None:
         for p in (seen(view, points) for view in views)
     )
     found = shaft_points(views, (paths[0], paths[1]), points[-1])
-    # A pixel of 10 um/0.15 mm: 1.5 px each way, over seven cells.
+    # 1.5 px are 0.2 mm; seven cells together leave less of that, the cameras' depth makes it more.
     assert distance_to(found, arc(4.0, roll, count=20_001)).max() < 1e-3
 
 
