@@ -13,11 +13,9 @@ from needle_sim.stereo_rig import Camera, StereoRig, load_stereo_rig
 from needle_tracker.calibration import Phantom
 from needle_tracker.calibration_session import Place
 from needle_tracker.charuco import CharucoBoard
-from needle_tracker.refraction import RefractedCamera
 from needle_tracker.rig_calibration import calibrate
 from needle_tracker.rig_model import BoardView, Corners
-from needle_tracker.tip_error import phantom_points
-from needle_tracker.triangulation import midpoint
+from needle_tracker.tip_error import measured_points, phantom_points
 
 Array = NDArray[np.float64]
 
@@ -61,16 +59,14 @@ def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> 
         pose = _as_it_lies(place, rng) if place.under_surface else place.T_rig_board
         left, right = _corners(rig, pose, rng, corner_sigma)
         views.append(BoardView(name, place, left, right))
-    cameras = {"left": rig.left, "right": rig.right}
-    sizes = {side: (camera.image_width, camera.image_height) for side, camera in cameras.items()}
+    sizes = {
+        side: (camera.image_width, camera.image_height)
+        for side, camera in (("left", rig.left), ("right", rig.right))
+    }
     found = calibrate(views, sizes, Phantom(rig.surface_height, _TABLE_INDEX)).calibration
     points = phantom_points(rig.surface_height)
-    seen = [_pixels(rig, camera, points) for camera in cameras.values()]
-    measured = (
-        RefractedCamera(found.left, found.phantom),
-        RefractedCamera(found.right, found.phantom),
-    )
-    tips = np.array([midpoint(measured, pair) for pair in zip(*seen, strict=True)])
+    left_pixels, right_pixels = (_pixels(rig, camera, points) for camera in (rig.left, rig.right))
+    tips = measured_points(found, left_pixels, right_pixels)
     return np.asarray(np.linalg.norm(tips - points, axis=1))
 
 

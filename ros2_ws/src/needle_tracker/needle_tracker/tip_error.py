@@ -54,13 +54,27 @@ def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
         What the rig really is.
     """
     points = phantom_points(true.phantom.surface_height)
-    seen = [RefractedCamera(getattr(true, side), true.phantom).project(points) for side in SIDES]
+    left, right = (
+        RefractedCamera(getattr(true, side), true.phantom).project(points) for side in SIDES
+    )
+    return measured_points(assumed, left, right) - points
+
+
+def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Array:
+    """Return the points in `rig` [m], shape (n, 3), that a calibration takes pixels for.
+
+    Parameters
+    ----------
+    assumed : StereoCalibration
+        What they are triangulated with.
+    left, right : ndarray, shape (n, 2)
+        The pixels at which each camera sees them.
+    """
     views = (
         RefractedCamera(assumed.left, assumed.phantom),
         RefractedCamera(assumed.right, assumed.phantom),
     )
-    found = [midpoint(views, (left, right)) for left, right in zip(*seen, strict=True)]
-    return np.stack(found) - points
+    return np.stack([midpoint(views, pair) for pair in zip(left, right, strict=True)])
 
 
 def tip_error_p95(calibration: StereoCalibration, covariance: Array) -> float:

@@ -12,10 +12,9 @@ from needle_common.errors import UserError
 from needle_tracker.calibration import SIDES, Phantom, StereoCalibration, load_calibration
 from needle_tracker.calibration_file import save_calibration
 from needle_tracker.calibration_start import first_calibration
-from needle_tracker.refraction import RefractedCamera
 from needle_tracker.rig_calibration import RigCalibration, calibrate
 from needle_tracker.rig_model import BoardView, Corners, RigModel
-from needle_tracker.triangulation import midpoint
+from needle_tracker.tip_error import measured_points
 
 from .synthetic_rig import SIZE, TrueRig, free_pose, take
 
@@ -38,12 +37,8 @@ def tip_errors(rig: TrueRig, calibration: StereoCalibration) -> np.ndarray:
     axes = (0.0175 - np.linspace(0.002, 0.033, 5), np.linspace(-0.015, 0.015, 3))
     grid = np.meshgrid(*axes, np.linspace(0.005, 0.12, 7), indexing="ij")
     points = np.stack(grid, axis=-1).reshape(-1, 3)
-    seen = [rig.project(side, points, True) for side in SIDES]
-    views = (
-        RefractedCamera(calibration.left, calibration.phantom),
-        RefractedCamera(calibration.right, calibration.phantom),
-    )
-    found = np.stack([midpoint(views, pair) for pair in zip(*seen, strict=True)])
+    left, right = (rig.project(side, points, True) for side in SIDES)
+    found = measured_points(calibration, left, right)
     return np.asarray(np.linalg.norm(found - points, axis=-1))
 
 
