@@ -97,7 +97,8 @@ class StereoTracker:
             corners = np.round(np.nan_to_num(view.project(line))).astype(np.int32)
             cv2.polylines(image, [corners], False, needle, max(round(look.needle_width_px), 1))
             images.append(image)
-        for _ in range(2):
+        # Found, confirmed, followed.
+        for _ in range(3):
             self.process(images[0], images[1], length)
         self.reset()
 
