@@ -25,6 +25,7 @@ from needle_tracker.evidence import (
     UsualVisibility,
     is_half_sound,
     is_sound,
+    look_alike,
     shows_lines,
     sights_against,
     sights_for,
@@ -219,10 +220,13 @@ class Acquisition:
             first = first or measured
         if first is not None:
             return first
-        for i, side in enumerate(SIDES):
-            if not any(fitted[i].values()):
-                return Measurement(None, state, f"no clear tip in the {side} image")
-        return Measurement(None, state, "views do not meet")
+        # Either may lead to the other one's, where something crosses the needle.
+        alone = tuple(next(filter(None, tips.values()), None) for tips in fitted)
+        reason = "views do not meet"
+        for side, tip in zip(SIDES, alone, strict=True):
+            if tip is None:
+                reason = f"no clear tip in the {side} image"
+        return Measurement(None, state, reason, (alone[0], alone[1]))
 
     def _considered(
         self,
@@ -315,7 +319,10 @@ class Acquisition:
         tip = measured.tip
         if self._track.has_begun or insertion is None or insertion > _YOUNG or tip is None:
             return False
-        if not shows_lines(measured.image_tips):
+        left, right = measured.image_tips
+        if left is None or right is None or not shows_lines((left, right)):
+            return False
+        if not look_alike(left, right):
             return False
         return self._entry_surprise(tip, insertion) < _YOUNG_SURPRISE
 

@@ -20,7 +20,9 @@ Found = tuple[ImageTip | None, ImageTip | None]
 # and to be asked for again.
 _NEAR_PX, _NEAR_ALONG_PX = 0.6, 3.0
 CLEAR_PX, CLEAR_ALONG_PX = 0.8, 3.0
-_VISIBILITY_RATIO = 2.2  # of the two views
+# The needle stands out in one view by so much more than in the other; and by less where something
+# disturbs a line, which may then be the needle's and another one.
+_VISIBILITY_RATIO, _DISTURBED_RATIO = 2.2, 1.5
 # So many in a row that agree win against the track, or without one that is good.
 _SOUND_SIGHTS, _UNSOUND_SIGHTS = 2, 3
 _EXCLUDED_SIGHTS = 4  # of what is plain, where a needle cannot have got to by what was known
@@ -48,7 +50,7 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
     left, right = found
     if left is None or right is None or not (left.clear and right.clear):
         return False
-    return _look_alike(left, right) and all(
+    return look_alike(left, right) and all(
         tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
     )
 
@@ -61,15 +63,17 @@ def shows_lines(found: Found) -> bool:
 def is_half_sound(found: Found) -> bool:
     """Return whether one view shows the needle's end well, and the other at least its line."""
     left, right = found
-    if left is None or right is None or not _look_alike(left, right):
+    if left is None or right is None or not look_alike(left, right):
         return False
     lines = max(left.sigma_across, right.sigma_across) <= _NEAR_PX
     return lines and (shows_end_well(left) or shows_end_well(right))
 
 
-def _look_alike(left: ImageTip, right: ImageTip) -> bool:
+def look_alike(left: ImageTip, right: ImageTip) -> bool:
+    """Return whether the lines that both views show can be of one needle."""
+    disturbed = max(left.sigma_across, right.sigma_across) > SOUND_PX
     fainter, plainer = sorted((left.visibility, right.visibility))
-    return plainer <= _VISIBILITY_RATIO * fainter
+    return plainer <= (_DISTURBED_RATIO if disturbed else _VISIBILITY_RATIO) * fainter
 
 
 class UsualVisibility:
@@ -114,15 +118,16 @@ class UsualVisibility:
     def doubted(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
         """Return the tips, with the line of one that is unlike the needle hardly known."""
         left, right = (
-            tip if self.is_like_in(i, tip) else _hardly_known(tip)
-            for i, tip in enumerate(self.unmixed(tips))
+            tip if self.is_like_in(i, tip) and not self._is_mixed_in(i, tip) else _hardly_known(tip)
+            for i, tip in enumerate(tips)
         )
         return left, right
 
     def unmixed(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
-        """Return the tips, with a line hardly known that may lie between needle and shadow.
+        """Return the tips, with a line hardly known that may not be the needle's alone.
 
-        Such a one is fainter than the needle was, and something disturbs it.
+        Something disturbs it, and it is fainter than the needle was, as between needle and shadow,
+        or plainer, as where two lines run together.
         """
         left, right = (
             _hardly_known(tip) if self._is_mixed_in(i, tip) else tip for i, tip in enumerate(tips)
@@ -132,7 +137,7 @@ class UsualVisibility:
     def _is_mixed_in(self, i: int, tip: ImageTip) -> bool:
         if self._levels is None or tip.sigma_across <= SOUND_PX:
             return False
-        return tip.visibility < _MIXED * self._levels[i]
+        return not _MIXED < tip.visibility / self._levels[i] < _PLAINER
 
 
 def _hardly_known(tip: ImageTip) -> ImageTip:

@@ -27,6 +27,8 @@ STEP_PX = 0.5  # of the fine strip's columns
 LINE_WIDTHS = 8.7  # the middle line is fitted to so much of the shaft's end
 LEAST_ROWS = 10
 _SMOOTH_ROWS = 4  # either way, of the light beside the needle
+_UNEVEN = 0.12  # of the light: the needle's sides do not differ by so much by themselves
+_STREAK = 4.0  # of the noise: so much brighter than the darkness on both sides of it
 _NOISE_FLOOR = 0.7  # [grey levels]
 # So many of the rows, so close together, say how dark the needle is.
 _ALIKE_SHARE, _ALIKE_SPREAD, _ALIKE_MARGIN = 0.4, 1.6, 0.2
@@ -213,7 +215,8 @@ def fine_strip(
     Returns
     -------
     darkness : ndarray, shape (behind + ahead + 1, columns)
-        Columns are `STEP_PX` apart, about the middle [grey levels].
+        Columns are `STEP_PX` apart, about the middle [grey levels]. Neither a shadow along one side
+        of the needle nor a streak of light along its middle takes from it.
     noise : float
         Of a pixel [grey levels].
     light : float
@@ -245,37 +248,80 @@ def fine_strip(
             start = 0 if k == 0 else columns - side
             ordered[:] = darkness[i, start : start + side]
             ordered.sort()
-            # The mean of the middle half: nearly as little noise as the mean, and no glint.
-            quarter = side // 4
-            total = 0.0
-            for j in range(quarter, side - quarter):
-                total += ordered[j]
-            level[i, k] = total / (side - 2 * quarter)
+            level[i, k] = _middle_mean(ordered)
             for j in range(side):
                 flank[i] += abs(ordered[j] - level[i, k]) / (2 * side)
     noise = 1.25 * np.sort(flank)[rows // 2]
-    smooth = np.empty((rows, 2))
-    window = np.empty(2 * _SMOOTH_ROWS + 1)
-    for i in range(rows):
-        first, last = max(i - _SMOOTH_ROWS, 0), min(i + _SMOOTH_ROWS, rows - 1)
-        size = last - first + 1
-        for k in range(2):
-            for m in range(size):
-                window[m] = level[first + m, k]
-            part = np.sort(window[:size])
-            quarter = size // 4
-            total = 0.0
-            for m in range(quarter, size - quarter):
-                total += part[m]
-            smooth[i, k] = total / (size - 2 * quarter)
+    noise = max(noise, _NOISE_FLOOR)
+    beside = _undisturbed(_smoothed(level))
     for i in range(rows):
         for j in range(columns):
             across = (j - reach) * STEP_PX
             share = min(max((across + 1.7 * width) / (3.4 * width), 0.0), 1.0)
-            light = (1.0 - share) * smooth[i, 0] + share * smooth[i, 1]
-            darkness[i, j] = light - darkness[i, j]
-    light = sign * float(smooth[: behind + 1].mean())
-    return darkness, max(noise, _NOISE_FLOOR), light
+            darkness[i, j] = (1.0 - share) * beside[i, 0] + share * beside[i, 1] - darkness[i, j]
+    _fill_streaks(darkness, width, noise)
+    return darkness, noise, sign * float(beside[: behind + 1].mean())
+
+
+@compiled
+def _middle_mean(ordered: Array) -> float:
+    """Return the mean of the middle half: nearly as little noise as the mean, and no glint."""
+    quarter = len(ordered) // 4
+    total = 0.0
+    for m in range(quarter, len(ordered) - quarter):
+        total += ordered[m]
+    return total / (len(ordered) - 2 * quarter)
+
+
+@compiled
+def _smoothed(level: Array) -> Array:
+    """Return levels on both sides, shape (rows, 2), without what is short along the needle."""
+    rows = len(level)
+    smooth = np.empty((rows, 2))
+    for i in range(rows):
+        first, last = max(i - _SMOOTH_ROWS, 0), min(i + _SMOOTH_ROWS, rows - 1)
+        for k in range(2):
+            smooth[i, k] = _middle_mean(np.sort(level[first : last + 1, k]))
+    return smooth
+
+
+@compiled
+def _undisturbed(beside: Array) -> Array:
+    """Return the light on both sides, shape (rows, 2), as if nothing lay along one of them.
+
+    Where they differ something does, such as the needle's shadow, and says nothing of the light
+    about the needle; the other side is as bright as most of the strip.
+    """
+    usual = np.sort(beside.ravel())[len(beside)]
+    free: Array = beside.copy()
+    for i in range(len(beside)):
+        if abs(beside[i, 0] - beside[i, 1]) > _UNEVEN * abs(usual):
+            k = 0 if abs(beside[i, 0] - usual) < abs(beside[i, 1] - usual) else 1
+            free[i, 1 - k] = beside[i, k]
+    return free
+
+
+@compiled
+def _fill_streaks(darkness: Array, width: float, noise: float) -> None:
+    """Make what is brighter than the needle on both sides of it as dark as the brighter of them.
+
+    A round needle shines along its middle where the light falls so; its edges stay dark.
+    """
+    reach = darkness.shape[1] // 2
+    half = int(0.5 * width / STEP_PX) + 1
+    beyond = np.empty(2 * half + 1)
+    for i in range(len(darkness)):
+        row = darkness[i, reach - half : reach + half + 1]
+        darkest = -np.inf
+        for j in range(len(row) - 1, -1, -1):
+            darkest = max(darkest, row[j])
+            beyond[j] = darkest
+        darkest = -np.inf
+        for j in range(len(row)):
+            darkest = max(darkest, row[j])
+            edge = min(darkest, beyond[j])
+            if edge - max(row[j], 0.0) > _STREAK * noise:
+                row[j] = edge
 
 
 @compiled

@@ -37,6 +37,7 @@ _FLAT_TAIL, _FEIGNED_TAIL = 0.68, 0.4
 _UNKNOWN_EDGE = 1.6  # [px]
 _KNEE, _FEIGNED = 0.5, 8.0  # [px^2], of the end's standard deviation
 _EDGE_ROWS = 24
+_WIDENED = 2.5  # one edge's fall over the other's
 _WHOLE = 0.93
 # From the profile of a box under a Gaussian: quarter width of an edge over the full width at half.
 _BLUNT_FROM, _BLUNT, _BLUNTEST = 0.275, 3.2, 0.4
@@ -167,7 +168,8 @@ def edge_fall(darkness: Array, behind: int, end: float, line: float, slope: floa
     Returns
     -------
     float
-        Mean of both edges, as sharp as they would be if the needle were wide; 0: not known.
+        Mean of both edges, as sharp as they would be if the needle were wide; of the sharper one
+        where they differ much; 0: not known.
     """
     rows, columns = darkness.shape
     last = min(int(end) + behind - 5, rows - 1)
@@ -185,8 +187,9 @@ def edge_fall(darkness: Array, behind: int, end: float, line: float, slope: floa
     # A bright middle makes edges of its own.
     if not profile[middle] >= _WHOLE * largest > 0.0:
         return 0.0
-    fall = width = 0.0
-    for side in (-1, 1):
+    falls, halves = np.full(2, np.inf), np.zeros(2)
+    for n in range(2):
+        side = 2 * n - 1
         places = np.full(3, -1.0)
         for k in range(middle, 0, -1):
             here, beyond = profile[middle + side * (k - 1)], profile[middle + side * k]
@@ -194,12 +197,17 @@ def edge_fall(darkness: Array, behind: int, end: float, line: float, slope: floa
                 level = 0.25 * (m + 1) * largest
                 if places[m] < 0.0 and here >= level > beyond:
                     places[m] = STEP_PX * (k - 1 + (here - level) / (here - beyond))
-        if places.min() < 0.0:
-            return 0.0
-        fall += 0.5 * (places[0] - places[2])
-        width += places[1]
+        if places.min() >= 0.0:
+            falls[n], halves[n] = places[0] - places[2], places[1]
+    # A shadow beside one edge makes its fall a wide one, or none; blur does so to both.
+    for n in range(2):
+        if falls[n] > _WIDENED * falls[1 - n]:
+            falls[n], halves[n] = falls[1 - n], halves[1 - n]
+    fall, width = 0.5 * (falls[0] + falls[1]), halves[0] + halves[1]
+    if not fall < np.inf:
+        return 0.0
     # Where the blur is as wide as the needle the profile's top is lower than the needle is dark.
-    return fall * (1.0 + min(_BLUNT * max(fall / width - _BLUNT_FROM, 0.0), _BLUNTEST))
+    return float(fall * (1.0 + min(_BLUNT * max(fall / width - _BLUNT_FROM, 0.0), _BLUNTEST)))
 
 
 @compiled

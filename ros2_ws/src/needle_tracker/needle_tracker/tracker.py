@@ -287,7 +287,8 @@ class StereoTracker:
         else:
             measured = judged(self.views, self.track, found, insertion)
             sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
-            if measured.tip is None and (sound or measured.reason != UNCERTAIN):
+            uncertain = measured.reason == UNCERTAIN and self.track.is_unbroken
+            if measured.tip is None and (sound or not uncertain):
                 return None
         return dataclasses.replace(measured, regions=regions)
 

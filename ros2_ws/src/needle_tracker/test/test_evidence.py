@@ -109,18 +109,27 @@ def test_what_begins_at_the_entry_is_no_needle_that_has_begun(
     young = tip(z=0.01)
     measured = Measurement(young, TrackState.SEARCHING, "", (GOOD, GOOD))
     assert tracker._acquisition._begins_at_entry(measured, 0.01)
+    # Disturbed, and plainer in one view than in the other.
+    disturbed = dataclasses.replace(GOOD, sigma_across=0.4)
+    for plainer, believed in ((1.3, True), (1.7, False)):
+        other = dataclasses.replace(GOOD, visibility=plainer * GOOD.visibility)
+        for found in ((disturbed, other), (other, disturbed)):
+            unlike = dataclasses.replace(measured, image_tips=found)
+            assert tracker._acquisition._begins_at_entry(unlike, 0.01) is believed
     assert tracker.track.accept(young, 0.01) is not None
     assert not tracker._acquisition._begins_at_entry(measured, 0.01)
 
 
-def test_a_line_that_is_fainter_and_disturbed_may_be_half_a_shadow_s() -> None:
+@pytest.mark.parametrize("plainer", [0.8, 1.3])
+def test_a_line_that_is_unlike_and_disturbed_may_be_half_another_s(plainer: float) -> None:
+    """Half a shadow's where it is fainter than the needle, half a cable's where it is plainer."""
     usual = UsualVisibility()
-    faint = dataclasses.replace(GOOD, visibility=0.8 * GOOD.visibility)
-    mixed = dataclasses.replace(faint, sigma_across=0.4)
+    unlike = dataclasses.replace(GOOD, visibility=plainer * GOOD.visibility)
+    mixed = dataclasses.replace(unlike, sigma_across=0.4)
     assert usual.unmixed((mixed, GOOD)) == (mixed, GOOD)
     usual.see((GOOD, GOOD))
     disturbed = dataclasses.replace(GOOD, sigma_across=0.4)
-    assert usual.unmixed((faint, disturbed)) == (faint, disturbed)
+    assert usual.unmixed((unlike, disturbed)) == (unlike, disturbed)
     for shown in (usual.unmixed, usual.doubted):
         left, right = shown((mixed, GOOD))
         assert left.sigma_across == pytest.approx(math.hypot(0.4, 2.0))

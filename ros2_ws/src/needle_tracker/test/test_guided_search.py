@@ -71,7 +71,7 @@ def last_seen(tracker: StereoTracker, shown: list[tuple[Image, Image]], *, until
         assert tracker.process(covered, covered, mm * 1e-3).tip is None
 
 
-@pytest.mark.parametrize("crossing", [(0, 26.0, 10e-3), (0, 30.0, 8e-3)])
+@pytest.mark.parametrize("crossing", [(0, -14.0, 5e-3), (1, -20.0, 5e-3), (1, 35.0, 5e-3)])
 @pytest.mark.parametrize("guiding", [True, False])
 def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again(
     tracker: StereoTracker,
@@ -97,6 +97,23 @@ def test_a_cable_across_one_view_does_not_keep_the_needle_from_being_found_again
             assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
         elif mm == 61:
             assert measured.tip is None
+
+
+@pytest.mark.parametrize("crossing", [(1, 20.0, 5e-3), (1, 14.0, 5e-3), (0, 20.0, 3e-3)])
+def test_a_cable_along_the_needle_s_end_is_not_taken_for_it(
+    tracker: StereoTracker,
+    views: Views,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    shown: list[tuple[Image, Image]],
+    crossing: tuple[int, float, float],
+) -> None:
+    """Twice as dark as the needle was: two lines that run together."""
+    last_seen(tracker, shown)
+    for mm in range(61, 64):
+        path = make_arc(mm * 1e-3, 6.0, 1.0)
+        tip = tracker.process(*crossed(views, draw_pair(path), path, crossing), mm * 1e-3).tip
+        assert tip is None or np.linalg.norm(tip.position - path[-1]) < 1.5e-3
 
 
 @pytest.mark.parametrize("plainer", [1.0, 2.0])
@@ -165,7 +182,7 @@ def test_a_line_that_may_be_half_a_shadow_s_says_little_however_it_is_found(
     assert sigma(2.0) > 2.0 * sigma(None)
 
 
-@pytest.mark.parametrize("crossing", [(0, 30.0, 5.5e-3), (0, -25.0, 5.5e-3)])
+@pytest.mark.parametrize("crossing", [(0, 25.0, 4e-3), (0, -25.0, 5e-3), (1, 20.0, 5e-3)])
 def test_a_cable_across_a_short_needle_does_not_hide_it(
     tracker: StereoTracker,
     views: Views,
@@ -182,6 +199,17 @@ def test_a_cable_across_a_short_needle_does_not_hide_it(
         assert measured.state is (TrackState.CONFIRMING if mm == 9 else TrackState.TRACKING)
         if measured.tip is not None:
             assert np.linalg.norm(measured.tip.position - path[-1]) < 0.15e-3
+
+
+def test_a_cable_along_a_short_needle_s_end_is_not_taken_for_it(
+    tracker: StereoTracker, views: Views, draw_pair: Drawer, make_arc: Arc
+) -> None:
+    """It lies where a needle can be, but shows itself darker in one view than in the other."""
+    for mm in range(9, 13):
+        path = make_arc(mm * 1e-3, 6.0, 1.0, 0.06)
+        pair = crossed(views, draw_pair(path), path, (1, 15.0, 5.5e-3))
+        tip = tracker.process(*pair, mm * 1e-3).tip
+        assert tip is None or np.linalg.norm(tip.position - path[-1]) < 1.5e-3
 
 
 @pytest.fixture

@@ -91,6 +91,55 @@ def test_a_shadow_along_the_needle_does_not_draw_it_aside(
     assert abs(across) < 3.0 * tip.sigma_across
 
 
+@pytest.mark.parametrize("beside", [-8.0, -6.5, 6.5, 8.0])
+@pytest.mark.parametrize("short", [0.0, 4.0, 9.0])
+def test_a_shadow_that_ends_first_does_not_hide_the_needles_end(
+    make_line: Callable[..., np.ndarray], beside: float, short: float
+) -> None:
+    """Beside the shaft is a shadow, beside its end is none: the needle is as dark as before."""
+    start, end = np.array([40.0, 152.3]), np.array([150.0, 150.0])
+    shape, shift = (300, 300), np.array([0.0, beside])
+    line = np.stack([start, end]) + shift - [[0.0, 0.0], [short, 0.0]]
+    shadow = cv2.GaussianBlur(make_line(shape, line, 5.0, 1.0, 0.0), (0, 0), 1.2)
+    light = 165.0 * (1.0 - 0.42 * shadow)
+    needle = make_line(shape, np.stack([start, end]), 4.6, 1.0, 0.0)
+    image = light + (40.0 - light) * cv2.GaussianBlur(needle, (0, 0), 0.7)
+    image += np.random.default_rng(3).normal(0.0, 3.0, shape)
+    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
+    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS, 10.0)
+    assert tip is not None
+    assert tip.clear
+    direction = (end - start) / np.linalg.norm(end - start)
+    along = float((tip.point - end) @ direction)
+    assert abs(along) < min(0.4, 4.0 * tip.sigma_along)
+    assert tip.sigma_along < 0.8
+    assert tip.contrast == pytest.approx(125.0, rel=0.1)
+
+
+@pytest.mark.parametrize("aside", [-0.4, 0.0, 0.4])
+@pytest.mark.parametrize(("first", "last"), [(0.0, 0.88), (0.5, 0.9), (0.6, 1.0)])
+def test_a_streak_of_light_along_the_needle_hides_neither_its_line_nor_its_end(
+    make_line: Callable[..., np.ndarray], first: float, last: float, aside: float
+) -> None:
+    """It is as bright as the light beside the needle; the needle's edges stay dark."""
+    start, end = np.array([40.0, 152.3]), np.array([150.0, 150.0])
+    line, shape = np.stack([start, end]), (300, 300)
+    needle = cv2.GaussianBlur(make_line(shape, line, 4.6, 1.0, 0.0), (0, 0), 0.6)
+    streak = start + [[first], [last]] * (end - start) + [0.0, aside]
+    shine = cv2.GaussianBlur(make_line(shape, streak, 1.6, 1.0, 0.0), (0, 0), 0.6)
+    image = 165.0 - 125.0 * needle + 125.0 * shine
+    image += np.random.default_rng(5).normal(0.0, 3.0, shape)
+    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
+    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS, 10.0)
+    assert tip is not None
+    assert tip.clear
+    direction = (end - start) / np.linalg.norm(end - start)
+    error = tip.point - end
+    assert abs(error @ direction) < min(0.8, 4.0 * tip.sigma_along)
+    assert abs(error @ [-direction[1], direction[0]]) < min(0.3, 4.0 * tip.sigma_across)
+    assert tip.contrast > 0.66 * 125.0
+
+
 @pytest.mark.parametrize("bright", [False, True])
 def test_how_plainly_it_shows_does_not_depend_on_the_light(
     make_line: Callable[..., np.ndarray], bright: bool
