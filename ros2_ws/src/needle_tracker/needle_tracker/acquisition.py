@@ -222,10 +222,12 @@ class Acquisition:
             return first
         # Either may lead to the other one's, where something crosses the needle.
         alone = tuple(next(filter(None, tips.values()), None) for tips in fitted)
-        reason = "views do not meet"
-        for side, tip in zip(SIDES, alone, strict=True):
-            if tip is None:
-                reason = f"no clear tip in the {side} image"
+        missing = [
+            f"no clear tip in the {side} image"
+            for side, tip in zip(SIDES, alone, strict=True)
+            if tip is None
+        ]
+        reason = missing[0] if missing else "views do not meet"
         return Measurement(None, state, reason, (alone[0], alone[1]))
 
     def _considered(

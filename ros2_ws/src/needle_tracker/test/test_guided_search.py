@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 
 from needle_tracker import acquisition
+from needle_tracker import tracker as following_tracker
 from needle_tracker.calibration import StereoCalibration
 from needle_tracker.evidence import UsualVisibility
 from needle_tracker.following import Follower
+from needle_tracker.gates import UNCERTAIN
 from needle_tracker.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.measurement import Measurement
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import Reach
-from needle_tracker.tip_fit import ImageTip, hidden
+from needle_tracker.tip_fit import ImageTip, fit_tip, hidden
 from needle_tracker.tip_motion import TipMotion
 from needle_tracker.track import Anchor, TrackState
 from needle_tracker.tracker import StereoTracker
@@ -180,6 +182,61 @@ def test_a_line_that_may_be_half_a_shadow_s_says_little_however_it_is_found(
         return float(np.sqrt(np.linalg.eigvalsh(measured.tip.covariance)[-1]))
 
     assert sigma(2.0) > 2.0 * sigma(None)
+
+
+@pytest.mark.parametrize("blind", [0, 1])
+def test_one_view_leads_to_the_other_though_the_search_finds_nothing_there(
+    tracker: StereoTracker,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    shown: list[tuple[Image, Image]],
+    monkeypatch: pytest.MonkeyPatch,
+    blind: int,
+) -> None:
+    last_seen(tracker, shown)
+    for mm in (61, 62):
+        path = make_arc(mm * 1e-3, 6.0, 1.0)
+        pair = draw_pair(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                acquisition,
+                "fit_tip",
+                lambda image, *rest, spoilt=pair[blind]: (
+                    None if np.array_equal(image, spoilt) else fit_tip(image, *rest)
+                ),
+            )
+            patch.setattr(StereoTracker, "_follow", lambda *_: None)
+            patch.setattr(acquisition.Acquisition, "_where_expected", lambda *_: None)
+            measured = tracker.process(*pair, mm * 1e-3)
+    assert measured.tip is not None
+    assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
+
+
+@pytest.mark.parametrize("until", [52, 54])
+def test_after_a_gap_what_following_leaves_uncertain_is_searched_for(
+    tracker: StereoTracker,
+    draw_pair: Drawer,
+    make_arc: Arc,
+    shown: list[tuple[Image, Image]],
+    monkeypatch: pytest.MonkeyPatch,
+    until: int,
+) -> None:
+    last_seen(tracker, shown, until=until)
+    monkeypatch.setattr(
+        following_tracker,
+        "judged",
+        lambda _views, track, found, _: Measurement(None, track.state, UNCERTAIN, found),
+    )
+    monkeypatch.setattr(following_tracker, "is_sound", lambda *_: False)
+    mm = until + 1
+    path = make_arc(mm * 1e-3, 6.0, 1.0)
+    measured = tracker.process(*draw_pair(path), mm * 1e-3)
+    if until == 52:
+        assert measured.reason.endswith(UNCERTAIN)
+    else:
+        assert measured.reason == ""
+        assert measured.tip is not None
+        assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
 
 
 @pytest.mark.parametrize("crossing", [(0, 25.0, 4e-3), (0, -25.0, 5e-3), (1, 20.0, 5e-3)])
