@@ -33,7 +33,7 @@ from needle_tracker.evidence import (
 )
 from needle_tracker.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
 from needle_tracker.gates import DISAGREE_ALONG, UNCERTAIN
-from needle_tracker.guided_search import guided_pairs, predicted_from_entry
+from needle_tracker.guided_search import guided_pairs, leads, predicted_from_entry
 from needle_tracker.measurement import Measurement, judged
 from needle_tracker.refraction import RefractedCamera
 from needle_tracker.search_grid import SearchGrid, make_search_grid
@@ -220,8 +220,8 @@ class Acquisition:
             first = first or measured
         if first is not None:
             return first
-        # Either may lead to the other one's, where something crosses the needle.
-        alone = tuple(next(filter(None, tips.values()), None) for tips in fitted)
+        # Where something crosses the needle in one view, the other's end may lead to it.
+        alone = tuple(max(filter(None, tips.values()), key=leads, default=None) for tips in fitted)
         missing = [
             f"no clear tip in the {side} image"
             for side, tip in zip(SIDES, alone, strict=True)

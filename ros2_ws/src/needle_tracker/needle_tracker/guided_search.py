@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from needle_tracker.detection import Image
-from needle_tracker.following import Follower, is_sound
+from needle_tracker.following import SOUND_PX, Follower
 from needle_tracker.gates import tip_at_entry
 from needle_tracker.search_grid import Reach
 from needle_tracker.single_view import Seen, taken_in
@@ -23,6 +23,8 @@ from needle_tracker.tip_motion import TipMotion
 from needle_tracker.track import Anchor
 
 _SPACING = 1e-3  # of the places along the line of sight: about half a needle apart in the image [m]
+# The needle's way, and where the other view's end is found, say better than a view how far it goes.
+_LEADS_ALONG_PX = 4.0
 _SIGMAS, _FARTHEST = 2.5, 5e-3  # so far from the likeliest [-, m]
 
 
@@ -45,6 +47,11 @@ def predicted_from_entry(reach: Reach, insertion: float) -> Anchor:
     return Anchor(TipMotion.start(tip), insertion, known=True)
 
 
+def leads(tip: ImageTip) -> bool:
+    """Return whether a view shows the needle's end well enough to look for it in the other."""
+    return tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= _LEADS_ALONG_PX
+
+
 def guided_pairs(
     follower: Follower,
     images: tuple[Image, Image],
@@ -63,7 +70,7 @@ def guided_pairs(
     predicted : Anchor
         Where the tip should be now.
     seen : pair of (ImageTip or None)
-        What a search found in the left and the right image; what is not sound leads nowhere.
+        What a search found in the left and the right image; not every end leads to the other.
     last : pair of ImageTip or None
         How the needle was seen last.
 
@@ -73,7 +80,7 @@ def guided_pairs(
         The likeliest place first.
     """
     for i, tip in enumerate(seen):
-        if tip is None or not is_sound(tip):
+        if tip is None or not leads(tip):
             continue
         other = 1 - i
         motion = taken_in(follower.views[i], tip, predicted.motion)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import cv2
 import numpy as np
@@ -193,21 +194,32 @@ def test_one_view_leads_to_the_other_though_the_search_finds_nothing_there(
     monkeypatch: pytest.MonkeyPatch,
     blind: int,
 ) -> None:
+    """Of what it finds in the view that leads, the end that is seen well counts."""
     last_seen(tracker, shown)
+    paths = acquisition.Acquisition._paths
+    monkeypatch.setattr(acquisition.Acquisition, "_paths", lambda *rest: 2 * paths(*rest))
+    monkeypatch.setattr(acquisition.Acquisition, "_where_expected", lambda *_: None)
+    monkeypatch.setattr(StereoTracker, "_follow", lambda *_: None)
     for mm in (61, 62):
         path = make_arc(mm * 1e-3, 6.0, 1.0)
         pair = draw_pair(path)
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                acquisition,
-                "fit_tip",
-                lambda image, *rest, spoilt=pair[blind]: (
-                    None if np.array_equal(image, spoilt) else fit_tip(image, *rest)
-                ),
-            )
-            patch.setattr(StereoTracker, "_follow", lambda *_: None)
-            patch.setattr(acquisition.Acquisition, "_where_expected", lambda *_: None)
-            measured = tracker.process(*pair, mm * 1e-3)
+        fitted: list[ImageTip] = []
+
+        def fit(
+            image: Image,
+            *rest: Any,
+            spoilt: Image = pair[blind],
+            fitted: list[ImageTip] = fitted,
+        ) -> ImageTip | None:
+            tip = fit_tip(image, *rest)
+            if tip is None or np.array_equal(image, spoilt):
+                return None
+            fitted.append(tip)
+            return hidden(tip) if len(fitted) == 1 else tip
+
+        monkeypatch.setattr(acquisition, "fit_tip", fit)
+        measured = tracker.process(*pair, mm * 1e-3)
+        assert len(fitted) == 2
     assert measured.tip is not None
     assert np.linalg.norm(measured.tip.position - path[-1]) < 0.1e-3
 
@@ -378,8 +390,12 @@ def test_what_is_not_sound_leads_nowhere(
         TipMotion(path[-1], np.array([0.0, 0.0, 1.0]), 1e-6 * np.eye(6)), 0.02, known=True
     )
     images = draw_pair(path)
-    for seen in (None, hidden(tip), dataclasses.replace(tip, sigma_across=0.4)):
+    spoilt = (dataclasses.replace(tip, sigma_across=0.4), dataclasses.replace(tip, sigma_along=4.5))
+    for seen in (None, hidden(tip), *spoilt):
         assert not list(guided_pairs(follower, images, predicted, (seen, None), None))
+    # How far along it the end is the other view may say.
+    loose = dataclasses.replace(tip, sigma_along=3.5)
+    assert list(guided_pairs(follower, images, predicted, (loose, None), None))
 
 
 @pytest.mark.parametrize("length", [5e-3, 15e-3, 25e-3])
