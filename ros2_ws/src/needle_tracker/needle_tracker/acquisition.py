@@ -222,12 +222,9 @@ class Acquisition:
             return first
         # Where something crosses the needle in one view, the other's end may lead to it.
         alone = tuple(max(filter(None, tips.values()), key=leads, default=None) for tips in fitted)
-        missing = [
-            f"no clear tip in the {side} image"
-            for side, tip in zip(SIDES, alone, strict=True)
-            if tip is None
-        ]
-        reason = missing[0] if missing else "views do not meet"
+        reason = "views do not meet"
+        if None in alone:
+            reason = f"no clear tip in the {SIDES[alone.index(None)]} image"
         return Measurement(None, state, reason, (alone[0], alone[1]))
 
     def _considered(
@@ -322,9 +319,9 @@ class Acquisition:
         if self._track.has_begun or insertion is None or insertion > _YOUNG or tip is None:
             return False
         left, right = measured.image_tips
-        if left is None or right is None or not shows_lines((left, right)):
+        if left is None or right is None:
             return False
-        if not look_alike(left, right):
+        if not (shows_lines((left, right)) and look_alike(left, right)):
             return False
         return self._entry_surprise(tip, insertion) < _YOUNG_SURPRISE
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, SOUND_ALONG_PX, SOUND_PX
+from needle_tracker.following import PLAIN_ALONG_PX, PLAIN_PX, SOUND_ALONG_PX, SOUND_PX, shows_end
 from needle_tracker.following import is_sound as shows_end_well
 from needle_tracker.tip_fit import ImageTip
 from needle_tracker.track import TrackState
@@ -48,11 +48,9 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
         Largest standard deviations of the end [px].
     """
     left, right = found
-    if left is None or right is None or not (left.clear and right.clear):
+    if left is None or right is None or not look_alike(left, right):
         return False
-    return look_alike(left, right) and all(
-        tip.sigma_across <= across_px and tip.sigma_along <= along_px for tip in (left, right)
-    )
+    return all(shows_end(tip, across_px, along_px) for tip in (left, right))
 
 
 def shows_lines(found: Found) -> bool:

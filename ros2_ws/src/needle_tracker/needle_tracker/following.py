@@ -224,14 +224,19 @@ def weighed(
     return Sights(_one_end(tips, misfits), False)
 
 
+def shows_end(tip: ImageTip, across_px: float, along_px: float) -> bool:
+    """Return whether a view shows the needle's end to these standard deviations [px]."""
+    return tip.clear and tip.sigma_across <= across_px and tip.sigma_along <= along_px
+
+
 def is_sound(tip: ImageTip) -> bool:
     """Return whether a view shows the needle's end well."""
-    return tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= SOUND_ALONG_PX
+    return shows_end(tip, SOUND_PX, SOUND_ALONG_PX)
 
 
 def is_plain(tip: ImageTip) -> bool:
     """Return whether a view shows the needle's end beyond doubt."""
-    return tip.clear and tip.sigma_across <= PLAIN_PX and tip.sigma_along <= PLAIN_ALONG_PX
+    return shows_end(tip, PLAIN_PX, PLAIN_ALONG_PX)
 
 
 def _softened(tip: ImageTip, misfit: Misfit) -> ImageTip:

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from needle_tracker.detection import Image
-from needle_tracker.following import SOUND_PX, Follower
+from needle_tracker.following import SOUND_PX, Follower, shows_end
 from needle_tracker.gates import tip_at_entry
 from needle_tracker.search_grid import Reach
 from needle_tracker.single_view import Seen, taken_in
@@ -49,7 +49,7 @@ def predicted_from_entry(reach: Reach, insertion: float) -> Anchor:
 
 def leads(tip: ImageTip) -> bool:
     """Return whether a view shows the needle's end well enough to look for it in the other."""
-    return tip.clear and tip.sigma_across <= SOUND_PX and tip.sigma_along <= _LEADS_ALONG_PX
+    return shows_end(tip, SOUND_PX, _LEADS_ALONG_PX)
 
 
 def guided_pairs(

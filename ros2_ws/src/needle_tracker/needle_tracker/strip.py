@@ -251,8 +251,7 @@ def fine_strip(
             level[i, k] = _middle_mean(ordered)
             for j in range(side):
                 flank[i] += abs(ordered[j] - level[i, k]) / (2 * side)
-    noise = 1.25 * np.sort(flank)[rows // 2]
-    noise = max(noise, _NOISE_FLOOR)
+    noise = max(1.25 * np.sort(flank)[rows // 2], _NOISE_FLOOR)
     beside = _undisturbed(_smoothed(level))
     for i in range(rows):
         for j in range(columns):

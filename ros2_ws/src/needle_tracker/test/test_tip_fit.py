@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from needle_tracker.detection import DetectionSettings, Path
-from needle_tracker.tip_fit import fit_tip
+from needle_tracker.tip_fit import ImageTip, fit_tip
 
 SETTINGS = DetectionSettings()
 
@@ -23,6 +23,19 @@ def coarse_path(
     pixels = start + steps[:, None] * direction + offset
     cells = np.arange(len(steps))
     return Path(cells, cells, pixels, 50.0, bright)
+
+
+def fitted(
+    image: np.ndarray, seed: int, start: np.ndarray, end: np.ndarray, sigma_along: float = 0.0
+) -> tuple[ImageTip, float, float]:
+    """Return the tip fitted to a noisy image, and how far it is from the end, along and across."""
+    noisy = image + np.random.default_rng(seed).normal(0.0, 3.0, image.shape)
+    pixels = np.clip(np.round(noisy), 0, 255).astype(np.uint8)
+    tip = fit_tip(pixels, coarse_path(start, end, np.zeros(2)), SETTINGS, sigma_along)
+    assert tip is not None
+    direction = (end - start) / np.linalg.norm(end - start)
+    error = tip.point - end
+    return tip, float(error @ direction), float(error @ [-direction[1], direction[0]])
 
 
 @pytest.mark.parametrize("bright", [False, True])
@@ -81,12 +94,7 @@ def test_a_shadow_along_the_needle_does_not_draw_it_aside(
     image = light + (35.0 - light) * cv2.GaussianBlur(needle, (0, 0), 0.7)
     if glint:
         image += 120.0 * make_line(shape, line[0] + [[0.55], [0.8]] * (end - start), 1.6, 1.0, 0.0)
-    image += np.random.default_rng(2).normal(0.0, 3.0, shape)
-    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
-    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS)
-    assert tip is not None
-    direction = (end - start) / np.linalg.norm(end - start)
-    across = float((tip.point - end) @ [-direction[1], direction[0]])
+    tip, _, across = fitted(image, 2, start, end)
     assert abs(across) < 0.35
     assert abs(across) < 3.0 * tip.sigma_across
 
@@ -104,13 +112,8 @@ def test_a_shadow_that_ends_first_does_not_hide_the_needles_end(
     light = 165.0 * (1.0 - 0.42 * shadow)
     needle = make_line(shape, np.stack([start, end]), 4.6, 1.0, 0.0)
     image = light + (40.0 - light) * cv2.GaussianBlur(needle, (0, 0), 0.7)
-    image += np.random.default_rng(3).normal(0.0, 3.0, shape)
-    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
-    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS, 10.0)
-    assert tip is not None
+    tip, along, _ = fitted(image, 3, start, end, 10.0)
     assert tip.clear
-    direction = (end - start) / np.linalg.norm(end - start)
-    along = float((tip.point - end) @ direction)
     assert abs(along) < min(0.4, 4.0 * tip.sigma_along)
     assert tip.sigma_along < 0.8
     assert tip.contrast == pytest.approx(125.0, rel=0.1)
@@ -128,15 +131,10 @@ def test_a_streak_of_light_along_the_needle_hides_neither_its_line_nor_its_end(
     streak = start + [[first], [last]] * (end - start) + [0.0, aside]
     shine = cv2.GaussianBlur(make_line(shape, streak, 1.6, 1.0, 0.0), (0, 0), 0.6)
     image = 165.0 - 125.0 * needle + 125.0 * shine
-    image += np.random.default_rng(5).normal(0.0, 3.0, shape)
-    noisy = np.clip(np.round(image), 0, 255).astype(np.uint8)
-    tip = fit_tip(noisy, coarse_path(start, end, np.zeros(2)), SETTINGS, 10.0)
-    assert tip is not None
+    tip, along, across = fitted(image, 5, start, end, 10.0)
     assert tip.clear
-    direction = (end - start) / np.linalg.norm(end - start)
-    error = tip.point - end
-    assert abs(error @ direction) < min(0.8, 4.0 * tip.sigma_along)
-    assert abs(error @ [-direction[1], direction[0]]) < min(0.3, 4.0 * tip.sigma_across)
+    assert abs(along) < min(0.8, 4.0 * tip.sigma_along)
+    assert abs(across) < min(0.3, 4.0 * tip.sigma_across)
     assert tip.contrast > 0.66 * 125.0
 
 
