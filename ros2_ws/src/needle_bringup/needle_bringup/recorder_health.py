@@ -10,8 +10,8 @@ from needle_bringup.free_space import megabytes
 from needle_bringup.recording import Recording
 from needle_common.diagnostics import Level
 
-# Bytes that wait for the disk: two seconds of stereo images.
-WARN_WAITING: Final = 100_000_000
+# Bytes that wait for the disk: a second of stereo images.
+WARN_WAITING: Final = 50_000_000
 # The disk is nearly full when it lasts less than this at the present rate [s], or when what is
 # left is less than so many times the reserve.
 WARN_BEFORE: Final = 120.0

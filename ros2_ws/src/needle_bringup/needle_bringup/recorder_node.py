@@ -2,34 +2,32 @@
 
 from __future__ import annotations
 
-import collections
-import importlib
 import json
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
 
 import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
-from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from needle_bringup.allocator import keep_freed_memory
 from needle_bringup.bag_files import recover_hint
 from needle_bringup.bag_metadata import BagTopic
-from needle_bringup.conversions import IMAGE_TYPES, offered_qos, strictest_request
-from needle_bringup.message_definitions import full_definition
-from needle_bringup.message_loss import SequenceGaps
+from needle_bringup.graph_topics_node import GraphTopics
+from needle_bringup.not_understood import NotUnderstood
 from needle_bringup.parameters import ParameterSnapshots
 from needle_bringup.provenance import commit, distribution, versions
 from needle_bringup.recorder_health import RecorderHealth
 from needle_bringup.recorder_parameters import PARAMETERS_OF, RecorderParameters
-from needle_bringup.recording import Recording
+from needle_bringup.recording import Received, Recording
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
@@ -40,52 +38,37 @@ from needle_common.parameters import NodeParameters
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
 
-Topics that appear later are recorded too, images included. The bag also carries the message
-definitions, all nodes' parameters and their changes, the calibration file, versions and commit.
-Ctrl-C ends the recording and completes the bag. Written out ten times a second: what a
-crash or kill -9 leaves is made whole by `ros2 run needle_bringup recover BAG`.
+Topics that appear later are recorded too, images included, but for pictures that were drawn for a
+person to look at (`exclude_regex`). The bag also carries the message definitions, all nodes'
+parameters and their changes, versions and commit. Ctrl-C ends the recording and completes the
+bag. Written out ten times a second: what a crash or kill -9 leaves is made whole by
+`ros2 run needle_bringup recover BAG`.
 
   ros2 run needle_bringup recorder --ros-args -p bag:=bags/my_run
+  ros2 run needle_bringup recorder --ros-args -p topics:='[/needle/tip, /joint_states]'
+  ros2 run needle_bringup recorder --ros-args -p snapshot_seconds:=20.0
 
-Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost or
-the disk is nearly full. Down to `reserve` the recording ends, the bag is completed, and the node
-stays to say so; the rest of the graph goes on.
+With `snapshot_seconds` the last seconds are kept in memory, and written only when somebody asks
+(service ~/snapshot, std_srvs/Trigger) or a second after a device/status says FAULT or ESTOPPED.
+Each snapshot goes into the same bag; what was written is not kept for the next.
+
+Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost,
+what came cannot be understood (it is recorded all the same) or the disk is nearly full. Down to
+`reserve` the recording ends, the bag is completed, and the node stays to say so; the rest of the
+graph goes on.
 Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters.
 """
 
 GRAPH_PERIOD = 0.1
-GRAPH_TIME = 0.05
-# All that Fast DDS keeps for a reader by default: a burst while the graph is looked at must fit.
-DEPTH = 5000
-IMAGE_DEPTH = 60
 # What the graph still sends when all nodes end together is waited for this long.
 LAST_WORDS = 0.3
 LAST_WORDS_LIMIT = 1.0
 REPORT_PERIOD = 0.5
+# What is said of a fault comes a little after it [s].
+AFTERMATH = 1.0
 PARAMETER_EVENTS = "/parameter_events"
-
-
-class _Topic:
-    """One topic being recorded."""
-
-    def __init__(self, name: str, type_name: str, message_class: type) -> None:
-        self.name = name
-        self.type_name = type_name
-        self.message_class = message_class
-        self.subscription: Subscription | None = None
-        self.publishers = -1
-        self.described = False
-        self.lost_events = 0
-        self.gaps = SequenceGaps()
-        # Source stamps of the last messages: a subscription that replaces another may get some
-        # of them again.
-        self.recent: collections.deque[int] = collections.deque(maxlen=64)
-        self.check_repeats_until = 0.0
-
-    @property
-    def lost(self) -> int:
-        """Messages that did not arrive: as DDS tells, or as the numbers of the others show."""
-        return max(self.lost_events, self.gaps.missing)
+DEVICE_STATUS = "/device/status"
+FAULTS = ("FAULT", "ESTOPPED")
 
 
 class Recorder(Node):
@@ -97,8 +80,11 @@ class Recorder(Node):
         bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")
         calibration = _read_calibration(self._settings.calibration_file)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._topics: dict[str, _Topic] = {}
-        self._refused: dict[str, str] = {}
+        self._topics = GraphTopics(self, self._settings.choice, self._take_topic, self._take)
+        self._not_understood = NotUnderstood()
+        self._recent = self._settings.recent
+        self._states: dict[str, str] = {}
+        self._snapshot_due: tuple[float, str] | None = None
         self._nodes: list[str] = []
         self._told: str = ""
         self.bag = Path(bag)
@@ -113,6 +99,8 @@ class Recorder(Node):
         try:
             self._write_provenance(calibration)
             self._snapshots = ParameterSnapshots(self, self._take_parameters)
+            if self._recent is not None:
+                self.create_service(Trigger, "~/snapshot", self._on_snapshot)
             self._poll_graph()
             self.create_timer(GRAPH_PERIOD, self._poll_graph, clock=STEADY_CLOCK)
             self.create_timer(REPORT_PERIOD, self.report, clock=STEADY_CLOCK)
@@ -142,136 +130,78 @@ class Recorder(Node):
         self._nodes.append(node)
         self._diagnostics.set(PARAMETERS_OF, Diagnostic(Level.OK, ", ".join(self._nodes)))
 
-    def _take_parameter_event(self, data: bytes) -> None:
-        changes = self._snapshots.take_event(deserialize_message(data, ParameterEvent))
+    def _take_parameter_event(self, message: Received) -> None:
+        changes = self._snapshots.take_event(deserialize_message(message.data, ParameterEvent))
         for change in changes:
             record = {key: yaml.safe_dump(value).split("\n")[0] for key, value in change.items()}
             self.recording.add_record("parameter_change", record)
-        if changes:
-            text = yaml.safe_dump(self._snapshots.changes)
-            self.recording.set_custom_data("parameter_changes", text)
 
     def _poll_graph(self) -> None:
         if self.recording.error is not None:
-            self._leave()
-            return
-        until = time.monotonic() + GRAPH_TIME
-        for name, types in self.get_topic_names_and_types():
-            # What waits on the topics that are recorded comes first; the rest at the next poll.
-            if time.monotonic() > until:
-                return
-            topic = self._topics.get(name)
-            if topic is None:
-                topic = self._new_topic(name, types)
-            if topic is not None:
-                self._subscribe(topic)
-        self._snapshots.poll()
+            self._topics.leave()
+        elif self._topics.poll():
+            self._snapshots.poll()
 
-    def _new_topic(self, name: str, types: list[str]) -> _Topic | None:
-        if len(types) > 1:
-            self._refuse(name, f"{name} has several types: {', '.join(types)}")
-        if name in self._refused:
-            return None
+    def _take_topic(self, topic: BagTopic) -> None:
+        self.recording.add_topic(topic)
+        latched = any(offer.durability == "transient_local" for offer in topic.offered_qos)
+        if self._recent is not None and latched:
+            self._recent.latch(topic.name)
+
+    def _take(self, message: Received) -> None:
+        if self._recent is None:
+            self.recording.append(message)
+        else:
+            self._recent.put(message)
+            if message.topic.endswith(DEVICE_STATUS):
+                self._understand(message, self._take_device_status)
+        if message.topic == PARAMETER_EVENTS:
+            self._understand(message, self._take_parameter_event)
+
+    def _understand(self, message: Received, take: Callable[[Received], None]) -> None:
+        """Look into a message that is recorded, whatever is in it."""
         try:
-            full_definition(types[0])
-            package, kind, short = types[0].split("/")
-            message_class = getattr(importlib.import_module(f"{package}.{kind}"), short)
-        except (UserError, ImportError, AttributeError) as error:
-            self._refuse(name, f"{name} is not recorded: {error}")
-            return None
-        topic = _Topic(name, types[0], message_class)
-        self._topics[name] = topic
-        return topic
+            take(message)
+        except Exception as error:  # noqa: BLE001
+            self.note_not_understood(message.topic, error)
 
-    def _refuse(self, name: str, why: str) -> None:
-        if name not in self._refused:
-            self._refused[name] = why
-            self.get_logger().warning(why)
+    def note_not_understood(self, where: str, error: Exception) -> None:
+        """Count and tell what came from outside and could not be handled."""
+        if self._not_understood.add(where, error):
+            self.get_logger().warning(f"not understood: {where}: {error}")
+        self._diagnostics.set("input", self._not_understood.diagnostic())
 
-    def _subscribe(self, topic: _Topic) -> None:
-        publishers = self.count_publishers(topic.name)
-        if publishers == topic.publishers:
-            return
-        offers = self.get_publishers_info_by_topic(topic.name)
-        if len(offers) != publishers:
-            return  # the graph is changing under us: look again at the next poll
-        topic.publishers = publishers
-        topic.gaps.forget()
-        if topic.subscription is not None and not offers:
-            return
-        qos = strictest_request(offers, IMAGE_DEPTH if topic.type_name in IMAGE_TYPES else DEPTH)
-        before = topic.subscription
-        if before is not None:
-            now = before.qos_profile
-            if (now.reliability, now.durability) == (qos.reliability, qos.durability):
-                return
-            topic.check_repeats_until = time.monotonic() + 2.0
+    def _take_device_status(self, message: Received) -> None:
+        status = deserialize_message(message.data, DiagnosticStatus)
+        state = next((pair.value for pair in status.values if pair.key == "state"), "")
+        if state in FAULTS and self._states.get(message.topic) != state:
+            why = f"{message.topic} says {state}"
+            self._snapshot_due = (time.monotonic() + AFTERMATH, why)
+        self._states[message.topic] = state
 
-        def count_lost(event: Any) -> None:
-            topic.lost_events = event.total_count
+    def _on_snapshot(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = self._write_snapshot("asked for")
+        response.success = self.recording.error is None
+        return response
 
-        topic.subscription = self.create_subscription(
-            topic.message_class,
-            topic.name,
-            lambda data, info: self._record_all(topic, data, info),
-            qos,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=count_lost),
-            raw=True,
-        )
-        if before is not None:
-            self.destroy_subscription(before)
-
-    def _record_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
-        """Take a message and all that wait behind it: the executor's round costs more than they."""
-        self._record(topic, data, info)
-        if topic.subscription is None:
-            return
-        handle = topic.subscription.handle
-        with handle:
-            for _ in range(DEPTH):
-                taken = handle.take_message(topic.message_class, True)
-                if taken is None:
-                    return
-                self._record(topic, *taken)
-
-    def _record(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
-        sent = info["source_timestamp"]
-        if sent in topic.recent and time.monotonic() < topic.check_repeats_until:
-            return
-        topic.recent.append(sent)
-        if not topic.described:
-            self._describe(topic)
-        number = info["publication_sequence_number"] or 0
-        if number and topic.publishers == 1:
-            topic.gaps.take(number)
-        received = info["received_timestamp"] or time.time_ns()
-        self.recording.append(topic.name, data, received, sent or received, number)
-        if topic.name == PARAMETER_EVENTS:
-            self._take_parameter_event(data)
-
-    def _describe(self, topic: _Topic) -> None:
-        topic.described = True
-        offers = self.get_publishers_info_by_topic(topic.name)
-        known = offers or self.get_subscriptions_info_by_topic(topic.name)
-        self.recording.add_topic(
-            BagTopic(
-                name=topic.name,
-                type_name=topic.type_name,
-                definition=full_definition(topic.type_name),
-                type_hash=str(known[0].topic_type_hash) if known else "",
-                offered_qos=tuple(offered_qos(offer) for offer in offers),
-            )
-        )
-
-    def _leave(self) -> None:
-        """Stop listening, once the recording has ended before its time."""
-        for topic in self._topics.values():
-            if topic.subscription is not None:
-                self.destroy_subscription(topic.subscription)
-                topic.subscription = None
+    def _write_snapshot(self, why: str) -> str:
+        """Hand over what is in memory; return what is said of it."""
+        if self._recent is None:
+            return ""
+        self._snapshot_due = None
+        seconds = self._recent.seconds
+        messages = self._recent.take()
+        self.recording.append_all(messages)
+        said = f"{len(messages)} messages of the last {seconds:.1f} s into {self.bag}: {why}"
+        record = {"why": why, "messages": str(len(messages)), "time_ns": str(time.time_ns())}
+        self.recording.add_record("snapshot", record)
+        self.get_logger().info(f"snapshot: {said}")
+        return said
 
     def report(self) -> None:
-        """Publish the recording's health."""
+        """Publish the recording's health; write a snapshot that is due."""
+        if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due[0]:
+            self._write_snapshot(self._snapshot_due[1])
         recording = self.recording
         lost = self._lost()
         values = {
@@ -282,7 +212,11 @@ class Recorder(Node):
             "messages_lost": str(sum(lost.values())),
             "size_bytes": str(recording.bytes_received),
         }
-        level, message = self._health.look(REPORT_PERIOD, lost, list(self._refused.values()))
+        if self._recent is not None:
+            values["in_memory_s"] = f"{self._recent.seconds:.1f}"
+            values["in_memory_bytes"] = str(self._recent.memory)
+        refused = list(self._topics.refused.values())
+        level, message = self._health.look(REPORT_PERIOD, lost, refused)
         self._diagnostics.set("bag", Diagnostic(level, message, values))
         # Once for each kind of trouble: the figures at the end of a message change.
         kind = message.partition(":")[0]
@@ -296,16 +230,19 @@ class Recorder(Node):
 
     def _lost(self) -> dict[str, int]:
         """Return how many messages of which topic are not in the bag."""
-        lost = {name: topic.lost for name, topic in self._topics.items() if topic.lost}
+        lost = self._topics.lost
         for name, count in list(self.recording.dropped.items()):
             lost[name] = lost.get(name, 0) + count
         return lost
 
     def finish(self) -> int:
         """Complete the bag; return the exit code and say one line about it."""
-        for topic in self._topics.values():
-            if not topic.described:
-                self._describe(topic)
+        self._topics.describe_all()
+        if self._snapshot_due is not None:
+            self._write_snapshot(self._snapshot_due[1])
+        if self._snapshots.changes:
+            changes = yaml.safe_dump(self._snapshots.changes)
+            self.recording.set_custom_data("parameter_changes", changes)
         parameters = yaml.safe_dump(self._snapshots.document())
         self.recording.set_custom_data("parameters", parameters)
         self.recording.add_file(
@@ -340,6 +277,16 @@ def _read_calibration(path: str) -> str:
         raise UserError(f"calibration_file: cannot read {path}: {error}") from error
 
 
+def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
+    """Let the executor do one thing; what others sent that it cannot do does not end the node."""
+    try:
+        executor.spin_once(timeout_sec=timeout)
+    except ExternalShutdownException:
+        raise
+    except Exception as error:  # noqa: BLE001
+        recorder.note_not_understood("a service or the graph", error)
+
+
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
     stop = EndRequest()
@@ -351,12 +298,12 @@ def main(args: list[str] | None = None) -> int:
         executor.add_node(recorder)
         try:
             while not stop.wanted:
-                executor.spin_once(timeout_sec=0.1)
+                _spin_once(executor, recorder, 0.1)
             limit = time.monotonic() + LAST_WORDS_LIMIT
             end = time.monotonic() + LAST_WORDS
             while time.monotonic() < min(end, limit):
                 before = recorder.recording.messages_received
-                executor.spin_once(timeout_sec=0.05)
+                _spin_once(executor, recorder, 0.05)
                 if recorder.recording.messages_received > before:
                     end = time.monotonic() + LAST_WORDS
             return recorder.finish()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import queue
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -21,13 +22,46 @@ from needle_bringup.free_space import FreeSpace, megabytes
 from needle_common.errors import UserError
 
 FLUSH_PERIOD: Final = 0.1
-# What waits for a slow disk at most, in bytes; more is dropped, and counted.
-WAITING_LIMIT: Final = 2**30
+# What waits for a slow disk at most, in bytes; more is dropped, and counted. Nearly three seconds
+# of stereo images. Where images fill it, there is still room for what is small.
+WAITING_LIMIT: Final = 128_000_000
+ROOM_FOR_SMALL: Final = 16_000_000
+SMALL: Final = 65_536
+# What a message takes in memory beside its data.
+OVERHEAD: Final = 800
 RESERVE: Final = 64_000_000
 # Key of the custom data that says why a recording ended before it was told to.
 ENDED_EARLY: Final = "recording_ended"
 # The disk is looked at after so many bytes, and with every flush.
 _LOOK_EVERY: Final = 2**20
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Received:
+    """One message as it came.
+
+    Attributes
+    ----------
+    topic : str
+        Absolute name.
+    data : bytes
+        The message as CDR with its header.
+    log_time, publish_time : int
+        When it was received and sent, system clock [ns].
+    sequence : int
+        The publisher's own number of the message, 0 where it has none.
+    """
+
+    topic: str
+    data: bytes
+    log_time: int
+    publish_time: int
+    sequence: int = 0
+
+    @property
+    def memory(self) -> int:
+        """What it takes [B]."""
+        return len(self.data) + OVERHEAD
 
 
 class Recording:
@@ -96,23 +130,30 @@ class Recording:
 
     @property
     def bytes_waiting(self) -> int:
-        """Their size [B]."""
-        return self.bytes_received - self._bytes_done
+        """What they take in memory [B]."""
+        return self.bytes_received - self._bytes_done + OVERHEAD * self.messages_waiting
 
     def add_topic(self, topic: BagTopic) -> None:
         """Announce a topic; before the first `append` with its name."""
         self._put(lambda: self._add_topic(topic))
 
-    def append(
-        self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int = 0
-    ) -> None:
-        """Queue one serialised message; times are the system clock's [ns]."""
-        if self.error is not None or self.bytes_waiting > WAITING_LIMIT:
-            self._drop(topic)
-            return
-        self.bytes_received += len(data)
-        self.messages_received += 1
-        self._jobs.put(lambda: self._write(topic, data, log_time, publish_time, sequence))
+    def append(self, message: Received) -> None:
+        """Queue one message; it is dropped, and counted, where too much waits already."""
+        room = ROOM_FOR_SMALL if len(message.data) <= SMALL else 0
+        if self.bytes_waiting > WAITING_LIMIT + room:
+            self._drop(message.topic)
+        else:
+            self.append_all((message,))
+
+    def append_all(self, messages: Sequence[Received]) -> None:
+        """Queue messages that are in memory anyhow, however many."""
+        for message in messages:
+            if self.error is not None:
+                self._drop(message.topic)
+                continue
+            self.bytes_received += len(message.data)
+            self.messages_received += 1
+            self._jobs.put(lambda message=message: self._write(message))  # type: ignore[misc]
 
     def add_record(self, name: str, values: dict[str, str]) -> None:
         """Queue a metadata record, kept in the MCAP file as soon as it is known."""
@@ -139,18 +180,23 @@ class Recording:
     def _add_topic(self, topic: BagTopic) -> None:
         self._numbers[topic.name] = self._bag.add_topic(topic)
 
-    def _write(
-        self, topic: str, data: bytes, log_time: int, publish_time: int, sequence: int
-    ) -> None:
+    def _write(self, message: Received) -> None:
+        topic = message.topic
         if self.error is not None:
             self._drop(topic)
             return
         try:
-            self._bag.write(self._numbers[topic], data, log_time, publish_time, sequence)
-        except BagWriteError:
+            self._bag.write(
+                self._numbers[topic],
+                message.data,
+                message.log_time,
+                message.publish_time,
+                message.sequence,
+            )
+        except Exception:
             self._drop(topic)
             raise
-        self._bytes_done += len(data)
+        self._bytes_done += len(message.data)
 
     def _drop(self, topic: str) -> None:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
@@ -186,6 +232,12 @@ class Recording:
                 job()
             except queue.Empty:
                 pass
+            except (BagWriteError, OSError):
+                raise
+            # A thread that ended in silence would leave all that comes after it waiting.
+            except Exception as error:  # noqa: BLE001
+                self.error = f"{type(error).__name__}: {error}"
+                return
             is_due = time.monotonic() >= next_flush
             if is_due or self._bytes_done - looked_at >= _LOOK_EVERY:
                 looked_at = self._bytes_done

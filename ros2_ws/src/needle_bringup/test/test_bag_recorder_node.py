@@ -13,7 +13,8 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.context import Context
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
@@ -26,6 +27,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Int32, String
+from std_srvs.srv import Trigger
 
 from needle_common.ros_domain import own_domain
 
@@ -81,7 +83,7 @@ def source(domain: int) -> Iterator[Source]:
 def start(domain: int, *parameters: str, largest_file: int = 0) -> subprocess.Popen[str]:
     arguments = ["--ros-args"]
     for parameter in parameters:
-        arguments += ["-p", parameter]
+        arguments += ["-r" if parameter.startswith("__") else "-p", parameter]
     limit = ["prlimit", f"--fsize={largest_file}:unlimited"] if largest_file else []
     return subprocess.Popen(
         [*limit, *RECORDER, *arguments],
@@ -109,6 +111,7 @@ def numbers(bag: Path, topic: str) -> list[int]:
         return [
             int(reader.deserialize(data, c.msgtype).data)  # type: ignore[attr-defined]
             for c, _, data in reader.messages(connections=connections)
+            if c.topic == topic  # no connections stand for all
         ]
 
 
@@ -278,6 +281,124 @@ def test_a_latched_publisher_is_served_although_the_topic_was_volatile_before(
     assert numbers(bag, "/plane") == [7, 8]
 
 
+class Health:
+    """What the recorder says of itself in /diagnostics."""
+
+    def __init__(self, source: Source) -> None:
+        self.parts: dict[str, DiagnosticStatus] = {}
+        source.node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+
+    def _take(self, message: DiagnosticArray) -> None:
+        self.parts.update({status.name: status for status in message.status})
+
+    def value(self, part: str, key: str) -> str:
+        status = self.parts.get(f"recorder: {part}", DiagnosticStatus())
+        return next((pair.value for pair in status.values if pair.key == key), "")
+
+
+def test_what_cannot_be_understood_is_told_and_recorded_and_ends_nothing(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    health = Health(source)
+    events = source.publisher(ParameterEvent, "/parameter_events")
+    process = start(domain, f"bag:={bag}")
+    source.wait_matched(events)
+    # CDR that says to be longer than it is, and what is no CDR (DDS sends multiples of four).
+    malformed = (b"\0\1\0\0" + bytes(8) + b"\xff\xff\xff\x7fmore", b"\xff" * 8)
+    for data in malformed:
+        events.publish(data)
+    source.wait(lambda: health.value("input", "/parameter_events") == "2", "both to be counted")
+    said = health.parts["recorder: input"]
+    assert said.level == DiagnosticStatus.WARN
+    assert said.message.startswith("not understood: /parameter_events (")
+    # It still listens to what is right.
+    source.wait(lambda: b"gain: 1.5" in (bag / "bag_0.mcap").read_bytes(), "the parameters")
+    source.node.set_parameters([Parameter("gain", value=2.5)])
+    source.wait(lambda: b"parameter_change" in (bag / "bag_0.mcap").read_bytes(), "the change")
+    code, _, errors = end(process)
+    assert code == 0
+    assert "Traceback" not in errors
+    with AnyReader([bag]) as reader:
+        recorded = [d for c, _, d in reader.messages() if c.topic == "/parameter_events"]
+    assert set(malformed) <= set(recorded)
+
+
+def test_pictures_are_left_out_and_topics_chosen(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    topics = ("tracker/annotated_image", "rig/one", "rig/two", "other")
+    publishers = [source.publisher(Int32, name) for name in topics]
+    every = start(domain, f"bag:={tmp_path}/every")
+    some = start(
+        domain,
+        f"bag:={tmp_path}/some",
+        "topics:=[tracker/annotated_image]",
+        "regex:=^/rig/",
+        "exclude_regex:=two",
+        "__node:=second",
+    )
+    source.wait(
+        lambda: [p.get_subscription_count() for p in publishers] == [1, 2, 1, 1], "both recorders"
+    )
+    for publisher in publishers:
+        publisher.publish(Int32(data=1))
+        assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
+    assert [end(process)[0] for process in (every, some)] == [0, 0]
+    recorded = [
+        {name for name in topics if numbers(tmp_path / bag, f"/{name}")}
+        for bag in ("every", "some")
+    ]
+    assert recorded == [set(topics[1:]), {"tracker/annotated_image", "rig/one"}]
+
+
+def test_snapshots_when_asked_and_on_a_fault(domain: int, source: Source, tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    health = Health(source)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    plane, numbered = source.publisher(Int32, "plane", latched), source.publisher(Int32, "numbered")
+    status = source.publisher(DiagnosticStatus, "bench/device/status", latched)
+    process = start(domain, f"bag:={bag}", "snapshot_seconds:=600.0", "snapshot_size:=1000000")
+    source.wait_matched(plane, numbered, status)
+    asked = source.node.create_client(Trigger, "/recorder/snapshot")
+    source.wait(asked.service_is_ready, "the service")
+
+    def messages() -> int:
+        return int(health.value("bag", "messages") or 0)
+
+    def say(state: str) -> None:
+        status.publish(DiagnosticStatus(values=[KeyValue(key="state", value=state)]))
+
+    plane.publish(Int32(data=7))
+    say("HOLDING")
+    # More than fits: the first go, the latched ones stay.
+    for number in range(3000):
+        numbered.publish(Int32(data=number))
+    assert numbered.wait_for_all_acked(Duration(seconds=PATIENCE))
+    source.wait(lambda: float(health.value("bag", "in_memory_bytes") or 0) > 9e5, "all to be there")
+    assert messages() == 0
+    answer = asked.call_async(Trigger.Request())
+    source.wait(answer.done, "the answer")
+    assert answer.result().success
+    assert "asked for" in answer.result().message
+    source.wait(messages, "the snapshot")
+    before = messages()
+    assert before < 1300
+    numbered.publish(Int32(data=-1))
+    status.publish(b"\xff\xff\xff")
+    say("FAULT")
+    source.wait(lambda: messages() > before, "the snapshot of the fault")
+    numbered.publish(Int32(data=-2))
+    assert end(process)[0] == 0
+    kept = numbers(bag, "/numbered")
+    assert kept[-2:] == [2999, -1]
+    assert kept[0] > 1000
+    assert kept[:-1] == list(range(kept[0], 3000))
+    assert numbers(bag, "/plane") == [7]
+    with Reader(bag) as reader:
+        assert {c.topic: c.msgcount for c in reader.connections}["/bench/device/status"] == 3
+
+
 def test_a_signal_during_start_up_leaves_a_whole_bag_or_none(domain: int, tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     process = start(domain, f"bag:={bag}")
@@ -296,6 +417,9 @@ def test_a_signal_during_start_up_leaves_a_whole_bag_or_none(domain: int, tmp_pa
         ("bag:={here}", "holds a bag already"),
         ("bagg:=x", "did you mean 'bag'"),
         ("calibration_file:={here}/none.yaml", "cannot read"),
+        ("regex:='('", "is not a regular expression"),
+        ("topics:=[1, 2]", "are not names"),
+        ("topics:=5", "topics = 5"),
     ],
 )
 def test_bad_parameters_are_one_line_and_exit_2(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from needle_bringup.bag_metadata import BagTopic, OfferedQos
 from needle_bringup.bag_writer import BagWriter
 from needle_bringup.message_definitions import full_definition
-from needle_bringup.recording import Recording
+from needle_bringup.recording import WAITING_LIMIT, Received, Recording
 from needle_common.errors import UserError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -170,7 +171,69 @@ def test_a_full_disk_ends_the_recording_with_its_reason(
     recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
     monkeypatch.setattr("mcap.writer.Writer.add_message", full)
     for number in range(10):
-        recording.append("/t", pose(number), TIME, TIME)
+        recording.append(Received("/t", pose(number), TIME, TIME))
     recording.close()
     assert recording.error is not None
     assert recording.error.endswith("bag_0.mcap: No space left on device")
+
+
+def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A disk that stands still: images fill the memory that there is, commands still get in."""
+    moves = threading.Event()
+    write = BagWriter.write
+
+    def slow(*given: Any) -> None:
+        assert moves.wait(20.0)
+        write(*given)
+
+    monkeypatch.setattr(BagWriter, "write", slow)
+    recording = Recording(tmp_path / "bag")
+    for name in ("/image", "/command"):
+        recording.add_topic(BagTopic(name, TYPE, full_definition(TYPE)))
+    image = bytes(WAITING_LIMIT // 8)
+    for _ in range(12):
+        recording.append(Received("/image", image, TIME, TIME))
+    for _ in range(100):
+        recording.append(Received("/command", pose(1), TIME, TIME))
+    assert recording.bytes_waiting < 1.2 * WAITING_LIMIT
+    assert recording.dropped.keys() == {"/image"}
+    dropped = recording.dropped["/image"]
+    moves.set()
+    recording.close()
+    assert recording.is_whole
+    with Reader(tmp_path / "bag") as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+    assert counts == {"/image": 12 - dropped, "/command": 100}
+
+
+def test_a_flood_of_tiny_messages_is_bounded_by_what_they_take_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    moves = threading.Event()
+    monkeypatch.setattr(BagWriter, "write", lambda *_: moves.wait(20.0))
+    monkeypatch.setattr("needle_bringup.recording.WAITING_LIMIT", 1_000_000)
+    monkeypatch.setattr("needle_bringup.recording.ROOM_FOR_SMALL", 100_000)
+    recording = Recording(tmp_path / "bag")
+    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
+    for _ in range(5000):
+        recording.append(Received("/t", b"", TIME, TIME))
+    assert 1000 < recording.messages_waiting < 1400
+    assert recording.dropped["/t"] + recording.messages_received == 5000
+    moves.set()
+    recording.close()
+
+
+def test_a_message_that_cannot_be_written_ends_the_recording_in_order(tmp_path: Path) -> None:
+    """The thread that writes may not end in silence: all that comes after would wait for ever."""
+    recording = Recording(tmp_path / "bag")
+    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
+    recording.append(Received("/t", pose(1), TIME, TIME))
+    recording.append(Received("/nobody_described_it", pose(2), TIME, TIME))
+    recording.append(Received("/t", pose(3), TIME, TIME))
+    recording.close()
+    assert recording.error == "KeyError: '/nobody_described_it'"
+    assert recording.is_whole
+    with Reader(tmp_path / "bag") as reader:
+        assert reader.message_count == 1

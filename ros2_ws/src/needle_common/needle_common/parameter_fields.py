@@ -28,6 +28,8 @@ class ParameterSpec:
         The allowed texts; empty: any text.
     read_only : bool
         Whether the value is fixed once the node runs.
+    texts : bool
+        Whether the elements of a list are texts; numbers otherwise.
     """
 
     unit: str
@@ -36,6 +38,7 @@ class ParameterSpec:
     upper: float = math.inf
     choices: tuple[str, ...] = ()
     read_only: bool = False
+    texts: bool = False
 
 
 def parameter(
@@ -47,9 +50,10 @@ def parameter(
     upper: float = math.inf,
     choices: tuple[str, ...] = (),
     read_only: bool = False,
+    texts: bool = False,
 ) -> Any:
     """Declare a field of a parameter dataclass; the arguments are those of `ParameterSpec`."""
-    spec = ParameterSpec(unit, description, lower, upper, choices, read_only)
+    spec = ParameterSpec(unit, description, lower, upper, choices, read_only, texts)
     return dataclasses.field(default=default, metadata={_METADATA_KEY: spec})
 
 
@@ -61,6 +65,7 @@ def fixed_parameter(
     upper: float = math.inf,
     *,
     choices: tuple[str, ...] = (),
+    texts: bool = False,
 ) -> Any:
     """Declare a field whose value is fixed once the node runs; otherwise as `parameter`."""
     return parameter(
@@ -71,6 +76,7 @@ def fixed_parameter(
         upper=upper,
         choices=choices,
         read_only=True,
+        texts=texts,
     )
 
 

@@ -50,8 +50,8 @@ class NodeParameters(Generic[P]):
         values: dict[str, Any] = {}
         for name, (spec, default) in known.items():
             value = list(default) if isinstance(default, tuple) else default
-            # An empty list has no type of its own in ROS; every list of ours holds numbers.
-            empty = value == []
+            # An empty list has no type of its own in ROS: one of texts takes what is given.
+            empty = value == [] and not spec.texts
             if empty:
                 value = Parameter.Type.DOUBLE_ARRAY
             try:
@@ -120,6 +120,7 @@ def _descriptor(spec: ParameterSpec, default: Any) -> ParameterDescriptor:
         additional_constraints=f"unit: {spec.unit}"
         + (f"; one of {', '.join(spec.choices)}" if spec.choices else ""),
         read_only=spec.read_only,
+        dynamic_typing=spec.texts,
     )
     bounded = math.isfinite(spec.lower) and math.isfinite(spec.upper)
     if isinstance(default, bool) or not bounded:
