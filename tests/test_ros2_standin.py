@@ -81,6 +81,24 @@ def test_lists_executables(prefix: Path) -> None:
     assert ros2(prefix, "pkg", "executables", "needle_sim").stdout == expected
 
 
+def test_hides_the_generators_of_message_code(prefix: Path) -> None:
+    add(prefix, "sim_rig", "")
+    environment = Path(sys.executable).parents[1]
+    env = dict(os.environ, AMENT_PREFIX_PATH=f"{prefix}:{environment}")
+    listed = [
+        subprocess.run(
+            [sys.executable, "-I", "-S", str(STAND_IN), "pkg", "executables", *package],
+            check=True,
+            env=env,
+            text=True,
+            capture_output=True,
+        ).stdout
+        for package in ([], ["rosidl_adapter"])
+    ]
+    assert listed[0] == "needle_sim sim_rig\n"
+    assert "rosidl_adapter msg2idl.py" in listed[1]
+
+
 @pytest.mark.parametrize(
     ("arguments", "code", "hint"),
     [
@@ -89,7 +107,7 @@ def test_lists_executables(prefix: Path) -> None:
         (["run", "needle_sim", "zzz"], 1, "there is sim_rig"),
         (["pkg", "executables", "zzz"], 1, "there is needle_sim"),
         (["run", "needle_sim"], 2, "usage: ros2 run PACKAGE EXECUTABLE"),
-        (["topic", "list"], 2, "`ros2 topic` needs an installed ROS 2 Jazzy"),
+        (["bag", "info"], 2, "`ros2 bag` needs an installed ROS 2 Jazzy"),
         (["pkg", "create"], 2, "stand-in knows only"),
     ],
 )

@@ -1,7 +1,8 @@
 """A small `ros2` for environments without ROS 2's own command line (there is none on PyPI).
 
-It knows `ros2 run PKG EXE [args]` and `ros2 pkg executables [PKG]`, with the exit codes of the real
-one. scripts/setup puts it into the virtual environment; it uses the standard library only.
+It knows what the documents of this project use, with the syntax, the output and the exit codes of
+the real one. scripts/setup puts it into the virtual environment. This file uses the standard
+library only, so that `ros2 run` costs no time; ros2_graph.py speaks to a running graph.
 """
 
 from __future__ import annotations
@@ -16,11 +17,17 @@ from typing import NoReturn
 HELP = """\
 usage: ros2 run PACKAGE EXECUTABLE [arguments]
        ros2 pkg executables [PACKAGE]
+       ros2 node list
+       ros2 topic list | echo TOPIC | hz TOPIC | pub TOPIC TYPE [YAML]
+       ros2 service list | call SERVICE TYPE [YAML]
+       ros2 param list [NODE] | get NODE NAME | set NODE NAME VALUE
 
 This is a small stand-in that scripts/setup installed: PyPI has no ros2 command line. It runs the
-nodes and tools of this workspace. For everything else (topic, bag, launch, ...) install ROS 2
-Jazzy, source it and run scripts/setup again.
+nodes and tools of this workspace and speaks to a running graph; `ros2 topic pub --help` and the
+like say more. For everything else (bag, launch, ...) install ROS 2 Jazzy, source it and run
+scripts/setup again.
 """
+GRAPH_COMMANDS = ("topic", "service", "param", "node")
 
 
 def fail(code: int, text: str) -> NoReturn:
@@ -62,12 +69,24 @@ def suggest(name: str, known: list[str]) -> str:
     return f"; there is {', '.join(sorted(known))}" if known else ""
 
 
+def for_users(found: dict[str, Path]) -> dict[str, Path]:
+    """Return the packages with executables that a person runs.
+
+    Those of the virtual environment itself are ROS 2's generators of message code.
+    """
+    environment = Path(sys.executable).parents[1]
+    return {
+        name: prefix
+        for name, prefix in found.items()
+        if prefix != environment and executables(name, prefix)
+    }
+
+
 def find_package(package: str) -> Path:
     """Return where a package is installed; ends with a hint where it is not."""
     found = prefixes()
     if package not in found:
-        ours = [name for name, prefix in found.items() if executables(name, prefix)]
-        fail(1, f"package '{package}' not found{suggest(package, ours)}")
+        fail(1, f"package '{package}' not found{suggest(package, list(for_users(found)))}")
     return found[package]
 
 
@@ -92,9 +111,18 @@ def run(package: str, executable: str, arguments: list[str]) -> NoReturn:
         fail(1, f"cannot run {path}: {error.strerror}")
 
 
+def speak_to_graph(arguments: list[str]) -> NoReturn:
+    """Become ros2_graph.py, with the packages that this interpreter was started without."""
+    if not os.environ.get("AMENT_PREFIX_PATH"):
+        fail(1, "no packages found: source scripts/env.sh first")
+    script = str(Path(__file__).with_name("ros2_graph.py"))
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, script, *arguments])
+
+
 def list_executables(package: str | None) -> int:
     """Print `package executable` lines, of all packages or of one."""
-    found = prefixes() if package is None else {package: find_package(package)}
+    found = for_users(prefixes()) if package is None else {package: find_package(package)}
     for name, prefix in sorted(found.items()):
         for executable in executables(name, prefix):
             print(f"{name} {executable}")
@@ -118,10 +146,12 @@ def main(arguments: list[str]) -> int:
             return list_executables(None)
         case ["pkg", "executables", package]:
             return list_executables(package)
+        case [command, *_] if command in GRAPH_COMMANDS:
+            speak_to_graph(arguments)
         case [command, *_]:
             fail(
                 2,
-                "this stand-in knows only `ros2 run` and `ros2 pkg executables`; "
+                f"this stand-in knows only run, pkg executables, {', '.join(GRAPH_COMMANDS)}; "
                 f"`ros2 {command}` needs an installed ROS 2 Jazzy (ros2 --help)",
             )
     return 2

@@ -1,0 +1,28 @@
+"""What the parts of the small `ros2` share: waiting for the graph, and giving up in one line."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.node import Node
+
+# How long nodes may take to be found [s]: those of a list, and one that is asked for by name.
+SPIN_TIME = 0.5
+PATIENCE = 5.0
+
+
+class GraphError(Exception):
+    """What cannot be done, in one line."""
+
+
+def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:
+    """Spin until the condition holds; return whether it does after `timeout` [s]."""
+    end = time.monotonic() + timeout
+    while not condition():
+        if time.monotonic() >= end:
+            return False
+        rclpy.spin_once(node, timeout_sec=0.02)
+    return True
