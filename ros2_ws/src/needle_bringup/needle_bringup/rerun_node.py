@@ -56,7 +56,8 @@ examples:
 tolerances: a value may differ by absolute + relative x recorded
 {tolerance_table()}
 
-exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 130 interrupted.
+exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 3 today's code
+broke, 130 interrupted.
 """
 FILE = "calibration_file"
 TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"

@@ -90,6 +90,17 @@ def test_a_sign_in_the_projection_is_seen(
     assert "needle/tip: 6 recorded but not today (at 30.0 mm" in capsys.readouterr().out
 
 
+def test_code_that_breaks_is_told_from_code_that_changed(
+    monkeypatch: pytest.MonkeyPatch, capsys: Capture
+) -> None:
+    def mistaken(*_: object) -> None:
+        raise ValueError("behind the camera")
+
+    monkeypatch.setattr("needle_bringup.tracker_rerun_node.TrackerStage.take", mistaken)
+    assert rerun(BAG) == 3
+    assert "internal error, please report it: ValueError: behind" in capsys.readouterr().err
+
+
 def test_another_preset_is_a_run_of_its_own(
     paper_bag: Path, tmp_path: Path, capsys: Capture
 ) -> None:

@@ -14,7 +14,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, run_command
+from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, internal_error, run_command
 from needle_common.conversions import RELIABLE, to_diagnostic_status
 from needle_common.diagnostics import Diagnostic
 from needle_common.errors import UserError
@@ -91,7 +91,8 @@ def run_node(
     Returns
     -------
     int
-        0 after a clean end (also by SIGINT or SIGTERM), 2 after bad parameters or arguments.
+        0 after a clean end (also by SIGINT or SIGTERM), 2 after bad parameters or arguments, 3
+        after an internal error.
     """
     argv = list(sys.argv if args is None else args)
     try:
@@ -112,6 +113,8 @@ def run_node(
         return EXIT_DONE
     except (UserError, ParameterException) as error:
         return _refuse(error)
+    except Exception as error:  # noqa: BLE001
+        return internal_error(error)
     finally:
         if node is not None:
             node.destroy_node()

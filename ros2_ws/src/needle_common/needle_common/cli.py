@@ -6,6 +6,7 @@ import json
 import math
 import os
 import sys
+import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from needle_common.errors import UserError
 EXIT_DONE = 0
 EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
+EXIT_INTERNAL_ERROR = 3
 EXIT_INTERRUPTED = 130
 
 JsonValue = str | int | float | bool | None
@@ -30,7 +32,8 @@ def run_command(command: Callable[[], int]) -> int:
     Returns
     -------
     int
-        The command's own code, 2 after a `UserError`, 130 after an interrupt.
+        The command's own code, 2 after a `UserError`, 3 after any other exception, 130 after an
+        interrupt.
     """
     try:
         code = command()
@@ -47,6 +50,25 @@ def run_command(command: Callable[[], int]) -> int:
         # The reader of our output left (`| head`): not an error, but nothing more can be printed.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_DONE
+    except Exception as error:  # noqa: BLE001
+        return internal_error(error)
+
+
+def internal_error(error: Exception) -> int:
+    """Say in one line what this software did wrong and where; return the exit code for it.
+
+    In Python's development mode (PYTHONDEVMODE=1) the traceback comes before it.
+    """
+    if sys.flags.dev_mode:
+        traceback.print_exception(error)
+    frames = traceback.extract_tb(error.__traceback__)
+    where = f" ({Path(frames[-1].filename).name}:{frames[-1].lineno})" if frames else ""
+    words = " ".join(f"{type(error).__name__}: {error}".split())
+    print(
+        f"error: internal error, please report it: {words}{where}; PYTHONDEVMODE=1 shows more",
+        file=sys.stderr,
+    )
+    return EXIT_INTERNAL_ERROR
 
 
 def finite_or_none(value: JsonValue) -> JsonValue:

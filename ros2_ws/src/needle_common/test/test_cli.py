@@ -5,7 +5,13 @@ import sys
 
 import pytest
 
-from needle_common.cli import EXIT_BAD_INPUT, EXIT_INTERRUPTED, EXIT_MISSED, run_command
+from needle_common.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_INTERNAL_ERROR,
+    EXIT_INTERRUPTED,
+    EXIT_MISSED,
+    run_command,
+)
 from needle_common.errors import UserError
 
 
@@ -27,9 +33,27 @@ def test_the_commands_own_code_comes_through() -> None:
     assert run_command(lambda: EXIT_MISSED) == EXIT_MISSED
 
 
-def test_a_programming_error_keeps_its_traceback() -> None:
-    with pytest.raises(ZeroDivisionError):
-        run_command(lambda: 1 // 0)
+def test_an_internal_error_is_one_line_with_a_code_of_its_own(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run_command(lambda: raise_(ValueError("two\nlines"))) == EXIT_INTERNAL_ERROR == 3
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "error: internal error, please report it: ValueError: two lines (test_cl"
+    )
+    assert said.count("\n") == 1
+
+
+def test_development_mode_shows_the_traceback() -> None:
+    code = (
+        "import sys; from needle_common.cli import run_command; sys.exit(run_command(lambda: 1/0))"
+    )
+    process = subprocess.run(
+        [sys.executable, "-X", "dev", "-c", code], capture_output=True, text=True, check=False
+    )
+    assert process.returncode == EXIT_INTERNAL_ERROR
+    assert "Traceback" in process.stderr
+    assert process.stderr.splitlines()[-1].startswith("error: internal error")
 
 
 @pytest.mark.parametrize("lines", [1, 100_000])
