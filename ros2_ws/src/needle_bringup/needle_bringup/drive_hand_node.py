@@ -63,6 +63,7 @@ class DriveHand(Node):
         self.joint_stamps: list[int] = []
         self.results: dict[int, str] = {}
         self.status: dict[str, str] = {}
+        self.real_states: set[str] = set()
         self.pressed = False
         self.scale = 1.0
         # What commands are stamped with.
@@ -209,3 +210,5 @@ class DriveHand(Node):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)
+        if self.status.get("simulated") == "false":
+            self.real_states.add(self.status.get("state", ""))

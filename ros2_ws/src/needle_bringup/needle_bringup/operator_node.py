@@ -32,14 +32,15 @@ from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import RECORDER, full_name
+from needle_common.partners_node import RECORDER, full_name, publishers_of
 
 HELP = """\
 operator: stands in for the person who holds the needle's switch, in simulation.
 
 Confirms that the needle is out, homes, enables, starts the controller, then keeps the hold until
 the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Draws the
-progress. Never use it on a rig that moves a real needle: there a person holds.
+progress. It acts only on a device that is alone and says in device/status that it is simulated: on
+a rig that moves a real needle a person holds.
 
 Publishes   device/hold
 Subscribes  needle/controller_status, device/status
@@ -119,6 +120,7 @@ class OperatorNode(Node):
         return EXIT_DONE if outcome.done else EXIT_MISSED
 
     def _on_timer(self) -> None:
+        self._sequence.see_devices(publishers_of(self, "device/status"))
         if self._sequence.steering:
             self._send_hold(pressed=self._sequence.hold(time.monotonic()))
         else:
@@ -144,12 +146,13 @@ class OperatorNode(Node):
             self._progress.show(self._sequence.insertion, self._sequence.depth)
 
     def _on_device_status(self, message: DiagnosticStatus) -> None:
-        self._sequence.see_device(values_of(message), time.monotonic())
+        speaker = f"/{message.hardware_id}"
+        self._sequence.see_device(values_of(message), speaker, time.monotonic())
         self._advance()
 
     def _on_health(self, message: DiagnosticArray) -> None:
         for status in message.status:
-            if status.name == f"{RECORDER}: {PARAMETERS_OF}":
+            if status.name.rpartition("/")[2] == f"{RECORDER}: {PARAMETERS_OF}":
                 self._recorded_nodes = set(status.message.split(", "))
 
     def _unrecorded_nodes(self) -> list[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 
+from needle_common.claim import WAY_OUT
+
 
 @dataclasses.dataclass(frozen=True)
 class ServiceCall:
@@ -88,6 +90,9 @@ class OperatorSequence:
         self._refusal = ""
         self._refused_since: float | None = None
         self._homed = False
+        self._simulated = False
+        self._speaker = ""
+        self._devices: Sequence[str] = ()
         self._steered = False
         self._said_since_start: Mapping[str, str] | None = None
         self._progress: tuple[str, ...] = ()
@@ -107,7 +112,7 @@ class OperatorSequence:
 
     def hold(self, now: float) -> bool:
         """Return whether the hold is pressed."""
-        return self.steering and now >= self._released_until
+        return self.steering and now >= self._released_until and self._may_act
 
     @property
     def touched(self) -> bool:
@@ -121,6 +126,7 @@ class OperatorSequence:
     def next_call(self, now: float) -> ServiceCall | None:
         """Return the service to call now; its answer goes to `take_answer`."""
         waits = self._pending or bool(self._missing) or now < self._retry_at
+        waits = waits or not self._may_act
         if waits or self.outcome is not None or self._prepared == len(PREPARATION):
             return None
         call = PREPARATION[self._prepared]
@@ -156,8 +162,22 @@ class OperatorSequence:
         elif now >= self._refused_since + REFUSAL_PATIENCE:
             self._end(f"{call.service} was refused: {message}")
 
-    def see_device(self, values: Mapping[str, str], now: float) -> None:
-        """Take the key-values of device/status."""
+    def see_devices(self, names: Sequence[str]) -> None:
+        """Take who publishes device/status: with more than one, nobody knows what would move."""
+        self._devices = names
+        if len(names) > 1 and (self._prepared or self._pending):
+            self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
+
+    def see_device(self, values: Mapping[str, str], speaker: str, now: float) -> None:
+        """Take the key-values of device/status, and the full name of the node that says them."""
+        self._simulated = values.get("simulated") == "true"
+        self._speaker = speaker
+        if values.get("simulated") == "false":
+            self._end(
+                f"{speaker} is a real device, or not in simulated time (it says simulated = "
+                "false): there a person holds, no stand-in"
+            )
+            return
         self._homed = values.get("homed") == "true"
         counts = bool(values.get("hold_owner"))
         if self._hold_counts and not counts:
@@ -213,12 +233,20 @@ class OperatorSequence:
                 f"(plane_controller is {state})"
             )
 
+    @property
+    def _may_act(self) -> bool:
+        """Whether the only device that is there has said that it is simulated."""
+        return self._simulated and list(self._devices) == [self._speaker]
+
     def _hangs(self) -> str:
         call = PREPARATION[self._prepared].service
         if self._missing:
             return "missing " + ", ".join(self._missing)
         if self._pending:
             return f"no answer from {call}"
+        if not self._may_act:
+            names = ", ".join(self._devices)
+            return f"device/status of one simulated device is wanted, of {names} it is there"
         return self._refusal or f"device/status does not say homed, {call} has to wait"
 
     def _end(self, reason: str) -> None:

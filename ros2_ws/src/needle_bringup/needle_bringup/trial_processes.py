@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from needle_bringup.installed import find_executable
@@ -37,16 +37,25 @@ class TrialProcesses:
     domain : int
         ROS_DOMAIN_ID.
     parameters : dict
-        Node -> parameter -> value; these nodes are started.
+        Node -> parameter -> value.
+    started : iterable of str, optional
+        Nodes that are started at once; all of them by default.
     """
 
-    def __init__(self, folder: Path, domain: int, parameters: Parameters) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        domain: int,
+        parameters: Parameters,
+        *,
+        started: Iterable[str] | None = None,
+    ) -> None:
         self._folder = folder
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
         self._file = folder / "parameters.yaml"
         write_parameters(self._file, parameters)
         self._processes: dict[str, NodeProcess] = {}
-        for name in parameters:
+        for name in parameters if started is None else started:
             self.start(name)
 
     def start(self, name: str) -> None:
@@ -77,6 +86,10 @@ class TrialProcesses:
         """Give the emulator a fault on command."""
         self._processes[_TAKES_COMMANDS].say(fault)
 
+    def exit_code(self, name: str) -> int | None:
+        """Return how a node ended; None while it runs."""
+        return self._processes[name].exit_code
+
     def check(self) -> None:
         """Raise `UserError` if a node has ended."""
         for process in self._processes.values():
@@ -97,7 +110,7 @@ class TrialProcesses:
 
     def stop(self) -> None:
         """End the driver, then the rest."""
-        stop([self._processes["device_driver"]])
+        stop(process for name, process in self._processes.items() if name == "device_driver")
         stop(self._processes.values())
 
 

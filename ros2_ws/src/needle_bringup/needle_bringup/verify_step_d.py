@@ -158,7 +158,31 @@ def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
         )
 
 
-CHECKS: tuple[Check, ...] = (drive_level, same_joints, many_steps, faults, killed_nodes)
+def two_rigs(_: Workbench, starts: int = MOMENTS) -> Iterator[Finding]:
+    """Move nothing real when a simulation is started beside it, in any order."""
+    outcomes = _trials("two_rigs", starts)
+    moved = [
+        one["order"] for one in outcomes if one["moved_mm"] or one["turned_rad"] or one["enabled"]
+    ]
+    unnamed = [one for one in outcomes if not one["named"]]
+    yield Finding(
+        "two_rigs",
+        f"a real driver beside a simulation in one domain, {len(outcomes)} starts in any order",
+        "the real one is never enabled and never moves; who gives way names the other",
+        f"enabled or moved in {len(moved)}{''.join(f' ({order})' for order in moved)}, "
+        f"nobody named in {len(unnamed)}",
+        len(outcomes) == starts and not moved and not unnamed,
+    )
+
+
+CHECKS: tuple[Check, ...] = (
+    drive_level,
+    same_joints,
+    many_steps,
+    faults,
+    killed_nodes,
+    two_rigs,
+)
 
 
 def judge(kind: str, outcomes: Sequence[dict[str, Any]]) -> Iterator[Finding]:

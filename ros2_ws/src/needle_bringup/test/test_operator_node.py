@@ -25,8 +25,9 @@ LIMIT = 20.0
 class PlayedRig(Node):
     """Answers like sim_rig and plane_controller; remembers what was asked and held."""
 
-    def __init__(self, context: Context) -> None:
+    def __init__(self, context: Context, *, simulated: str = "true") -> None:
         super().__init__("played_rig", context=context)
+        self.simulated = simulated
         self.asked: list[str] = []
         self.holds: list[Joy] = []
         self.refusal = ""
@@ -43,7 +44,9 @@ class PlayedRig(Node):
         self.tell_controller("IDLE", 0)
 
     def tell_device(self, **values: str) -> None:
-        self._device.publish(_status(values))
+        message = _status({"simulated": self.simulated, **values})
+        message.hardware_id = self.get_name()
+        self._device.publish(message)
 
     def tell_controller(self, state: str, step: int, reason: str = "") -> None:
         values = {"state": state, "step": str(step), "reason": reason}
@@ -68,10 +71,10 @@ def _status(values: dict[str, str]) -> DiagnosticStatus:
 class Scene:
     """A played rig and the operator process before it."""
 
-    def __init__(self, domain: int) -> None:
+    def __init__(self, domain: int, *, simulated: str = "true") -> None:
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain)
-        self.rig = PlayedRig(self.context)
+        self.rig = PlayedRig(self.context, simulated=simulated)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.rig)
         self.operator = subprocess.Popen(
@@ -103,9 +106,9 @@ class Scene:
 
 
 @pytest.fixture
-def scene() -> Iterator[Scene]:
+def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
     with own_domain() as domain:
-        one = Scene(domain)
+        one = Scene(domain, simulated=getattr(request, "param", "true"))
         yield one
         one.close()
 
@@ -165,3 +168,27 @@ def test_a_refusal_ends_it_without_a_hold(scene: Scene) -> None:
     assert code == 2
     assert "the door is open" in said
     assert not any(hold.buttons[0] for hold in scene.rig.holds)
+
+
+@pytest.mark.parametrize("scene", ["false"], indirect=True)
+def test_a_real_device_is_asked_for_nothing(scene: Scene) -> None:
+    code, said = scene.end()
+    assert code == 2
+    assert "/played_rig is a real device" in said
+    assert scene.rig.asked == []
+    assert not scene.rig.holds
+
+
+def test_a_second_device_ends_it_by_name(scene: Scene) -> None:
+    rig = scene.rig
+    scene.until(lambda: rig.asked == STARTED)
+    rig.tell_controller("STEERING", 1)
+    scene.until(lambda: rig.holds)
+    second = rclpy.create_node("device_driver", context=scene.context, namespace="")
+    second.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+    code, said = scene.end()
+    second.destroy_node()
+    assert code == 1
+    assert "more than one device" in said
+    assert "/device_driver" in said
+    assert rig.holds[-1].buttons[0] == 0

@@ -1,8 +1,18 @@
+import pytest
+
 from needle_bringup.operator_sequence import PREPARATION, OperatorSequence, Outcome, ServiceCall
 
 
 def fresh() -> OperatorSequence:
-    return OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    """Return a sequence before a simulated device that is alone."""
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, {}, 0.0)
+    return sequence
+
+
+def see(sequence: OperatorSequence, values: dict[str, str], now: float) -> None:
+    sequence.see_device({"simulated": "true"} | values, "/sim_rig", now)
 
 
 def outcome(sequence: OperatorSequence) -> Outcome | None:
@@ -12,7 +22,7 @@ def outcome(sequence: OperatorSequence) -> Outcome | None:
 
 def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
     sequence.see_missing([])
-    sequence.see_device({"homed": "true", "state": "DISABLED"}, 1.0)
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
     calls = []
     while (call := sequence.next_call(now)) is not None:
         calls.append(call)
@@ -27,7 +37,7 @@ def steering(**values: str) -> dict[str, str]:
 def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    sequence.see_device({"homed": "true"}, 1.0)
+    see(sequence, {"homed": "true"}, 1.0)
     for expected in PREPARATION:
         assert not sequence.hold(1.0)
         assert sequence.next_call(1.0) == expected
@@ -84,7 +94,7 @@ def test_waits_for_homing_before_it_enables() -> None:
         assert sequence.next_call(1.0) is not None
         sequence.take_answer(True, "", 1.0)
     assert sequence.next_call(1.0) is None
-    sequence.see_device({"homed": "true"}, 1.0)
+    see(sequence, {"homed": "true"}, 1.0)
     assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
 
 
@@ -119,7 +129,7 @@ def test_fault_release_and_stop_end_the_run_with_their_reason() -> None:
     for state in ("FAULT", "ESTOPPED"):
         sequence = fresh()
         prepare(sequence)
-        sequence.see_device({"homed": "true", "state": state, "reason": "button"}, 1.0)
+        see(sequence, {"homed": "true", "state": state, "reason": "button"}, 1.0)
         assert sequence.outcome is not None
         assert "button" in sequence.outcome.reason
 
@@ -147,10 +157,10 @@ def test_no_progress_releases_the_hold() -> None:
 def test_a_press_that_does_not_count_any_more_is_released_and_pressed_again() -> None:
     sequence = fresh()
     prepare(sequence, 1.0)
-    sequence.see_device({"homed": "true", "state": "HOLDING", "hold_owner": "operator"}, 1.1)
+    see(sequence, {"homed": "true", "state": "HOLDING", "hold_owner": "operator"}, 1.1)
     sequence.check_time(9.0)
     assert sequence.hold(9.0), "a hold that counts stays pressed"
-    sequence.see_device({"homed": "true", "state": "HOLDING", "hold_owner": ""}, 9.0)
+    see(sequence, {"homed": "true", "state": "HOLDING", "hold_owner": ""}, 9.0)
     sequence.check_time(10.9)
     assert sequence.hold(10.9), "news may be under way"
     sequence.check_time(11.0)
@@ -159,7 +169,7 @@ def test_a_press_that_does_not_count_any_more_is_released_and_pressed_again() ->
     assert sequence.hold(11.25)
     sequence.check_time(13.2)
     assert sequence.presses_again == 1
-    sequence.see_device({"homed": "true", "state": "MOVING", "hold_owner": "operator"}, 13.2)
+    see(sequence, {"homed": "true", "state": "MOVING", "hold_owner": "operator"}, 13.2)
     sequence.check_time(20.0)
     assert sequence.hold(20.0)
     assert sequence.presses_again == 1
@@ -191,7 +201,7 @@ def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
 def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    sequence.see_device({"homed": "true", "state": "DISABLED"}, 1.0)
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
     for _ in PREPARATION[:-1]:
         sequence.next_call(1.0)
         sequence.take_answer(True, "", 1.0)
@@ -201,3 +211,44 @@ def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
     sequence.take_answer(True, "", 1.0)
     assert sequence.outcome is not None
     assert "the needle is gone" in sequence.outcome.reason
+
+
+@pytest.mark.parametrize("prepared", range(len(PREPARATION) + 1))
+def test_a_device_that_is_real_ends_it_whenever_it_is_heard(prepared: int) -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, {"homed": "true"}, 1.0)
+    for _ in range(prepared):
+        sequence.next_call(1.0)
+        sequence.take_answer(True, "", 1.0)
+    sequence.see_device({"homed": "true", "simulated": "false"}, "/device_driver", 1.0)
+    assert sequence.outcome is not None
+    assert "/device_driver is a real device" in sequence.outcome.reason
+    assert sequence.next_call(2.0) is None
+    assert not sequence.hold(2.0)
+
+
+def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulated() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/device_driver"])
+    assert sequence.next_call(1.0) is None, "nothing is known of it yet"
+    see(sequence, {}, 1.0)
+    assert sequence.next_call(1.0) is None, "another said that"
+    sequence.see_devices(["/sim_rig", "/device_driver"])
+    assert sequence.next_call(1.0) is None
+    assert outcome(sequence) is None, "one that was killed counts for a while"
+    sequence.check_time(30.0)
+    assert sequence.outcome is not None
+    assert "/sim_rig, /device_driver" in sequence.outcome.reason
+
+
+def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    assert sequence.hold(2.0)
+    sequence.see_devices(["/device_driver"])
+    assert not sequence.hold(2.0), "it has not said what it is"
+    sequence.see_devices(["/device_driver", "/sim_rig"])
+    assert sequence.outcome is not None
+    assert "more than one device: /device_driver, /sim_rig" in sequence.outcome.reason

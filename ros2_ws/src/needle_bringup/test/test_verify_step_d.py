@@ -44,6 +44,11 @@ def test_faults_are_named_and_need_a_command_to_go_on() -> None:
         assert [finding for finding in findings if not finding.passed] == []
 
 
+def test_nothing_real_moves_beside_a_simulation(tmp_path: Path) -> None:
+    findings = list(verify_step_d.two_rigs(Workbench(["simulate"], tmp_path), 3))
+    assert [finding for finding in findings if not finding.passed] == []
+
+
 @pytest.mark.parametrize(
     ("change", "missed"),
     [

@@ -19,6 +19,7 @@ from needle_common.conversions import RELIABLE, to_diagnostic_status
 from needle_common.diagnostics import Diagnostic
 from needle_common.errors import UserError
 from needle_common.parameter_fields import describe
+from needle_common.partners_node import signature
 
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -53,7 +54,7 @@ class DiagnosticsPublisher:
         self._publish(list(self._parts))
 
     def _publish(self, parts: list[str]) -> None:
-        name = self._node.get_name()
+        name = signature(self._node)
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [

@@ -62,6 +62,30 @@ def full_name(namespace: str, name: str) -> str:
     return f"{namespace.rstrip('/')}/{name}"
 
 
+def signature(node: Node) -> str:
+    """Return how a node signs what it says of its health: its full name without the first slash."""
+    return str(node.get_fully_qualified_name()).lstrip("/")
+
+
+def publishers_of(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that publish a topic, one for each publisher.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks.
+    topic : str
+        Its name as the node would give it.
+    """
+    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    return [
+        "a node of yet unknown name"
+        if info.node_name == _UNKNOWN
+        else full_name(info.node_namespace, info.node_name)
+        for info in infos
+    ]
+
+
 def _listeners(node: Node, topic: str) -> set[str]:
     infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     return {info.node_name for info in infos}

@@ -34,7 +34,7 @@ from needle_common.conversions import (
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
+from needle_common.partners_node import AnsweringNodes, signature, unheard, unrecorded
 from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep
@@ -238,7 +238,7 @@ class PlaneControllerNode(Node):
         self._diagnostics.set("steering", diagnostic)
         if diagnostic != self._published:
             self._published = diagnostic
-            name = self.get_name()
+            name = signature(self)
             self._status.publish(to_diagnostic_status(f"{name}: steering", name, diagnostic))
 
 

@@ -87,10 +87,11 @@ def to_diagnostic(status: DeviceStatus) -> Diagnostic:
             "watchdog_trips": str(status.watchdog_trips),
             "commands_refused": str(status.commands_refused),
             "needs_time": "true" if status.needs_time else "false",
+            "simulated": "" if status.simulated is None else str(status.simulated).lower(),
         },
     )
 
 
-def to_status(status: DeviceStatus, node_name: str) -> DiagnosticStatus:
+def to_status(status: DeviceStatus, signature: str) -> DiagnosticStatus:
     """Return the device's status as the message of device/status."""
-    return to_diagnostic_status(f"{node_name}: device", node_name, to_diagnostic(status))
+    return to_diagnostic_status(f"{signature}: device", signature, to_diagnostic(status))

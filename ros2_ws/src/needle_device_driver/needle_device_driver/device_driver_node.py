@@ -23,10 +23,11 @@ from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
-from needle_device_driver.can_link import CanLink
+from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
 from needle_device_driver.device_interface_node import DeviceInterface
 from needle_device_driver.drive_cycle import DriveCycle
+from needle_device_driver.drive_identity import are_emulated
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.states import State
 from needle_device_driver.supervisor import MotionSupervisor
@@ -104,6 +105,7 @@ class DeviceDriverNode(LifecycleNode):
             self,
             self._supervisor,
             self._diagnostics,
+            simulated=None,
             refuse=self._why_not_ready,
         )
         # rclpy's first line takes a tenth of a second: not once the drives wait for a heartbeat.
@@ -207,6 +209,8 @@ class DeviceDriverNode(LifecycleNode):
         if not self._autostart or now < self._retry_at:
             return
         self._retry_at = now + _RETRY
+        if self._device.others:
+            raise UserError(f"{self.get_fully_qualified_name()}: {self._device.others}")
         why_not = self._drives.probe()
         if not why_not:
             # Once: afterwards the lifecycle is in somebody's hands.
@@ -232,6 +236,8 @@ class DeviceDriverNode(LifecycleNode):
         if not why_not:
             reply = self._supervisor.configure(time.monotonic())
             why_not = "" if reply.success else reply.message
+        if not why_not:
+            self._device.simulated = self._is_simulated()
         self._device.report()
         if why_not:
             self._refusal = why_not
@@ -241,6 +247,14 @@ class DeviceDriverNode(LifecycleNode):
             self.get_logger().warning(text)
         self._tell_health()
         return TransitionCallbackReturn.SUCCESS
+
+    def _is_simulated(self) -> bool:
+        """Return whether this is part of a simulation: its time, and drives without motors."""
+        nodes = [self._settings.drive(name).node_id for name in ("insertion", "rotation")]
+        try:
+            return self._sim_time and are_emulated(self._link, nodes)
+        except LinkError:
+            return False
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Answer to services from now on."""
@@ -285,10 +299,12 @@ class DeviceDriverNode(LifecycleNode):
         """Stop both axes, switch them off, let go of the link."""
         self._active = False
         self._let_go()
+        self._device.close()
 
     def _let_go(self) -> None:
         self._active = False
         self._supervisor.deconfigure()
+        self._device.simulated = None
         self._device.report()
         self._link.close()
 

@@ -14,8 +14,11 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.base_node import DiagnosticsPublisher
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher
+from needle_common.claim import WAY_OUT, Claim
 from needle_common.conversions import HOLD, JOINT_STATES, LATCHED, RELIABLE, to_stamp
+from needle_common.errors import UserError
+from needle_common.partners_node import publishers_of, signature
 from needle_device_driver.conversions import (
     to_command,
     to_diagnostic,
@@ -29,6 +32,8 @@ from needle_device_driver.supervisor import MotionSupervisor
 
 # Positions alone change device/status so often at most [s]; joint_states has them all.
 _STATUS_PERIOD = 0.5
+# How often to look for another device when nothing else is heard [s].
+_LOOK_PERIOD = 0.1
 
 
 class DeviceInterface:
@@ -42,11 +47,18 @@ class DeviceInterface:
         What they speak for.
     diagnostics : DiagnosticsPublisher
         Where the device's health goes.
+    simulated : bool or None
+        Whether no real needle can move; None until that is known.
     refuse : callable, optional
         Returns why services are not ready yet, empty when they are; a stop, a disabling and an
         emergency stop are never refused.
     on_result : callable, optional
         Called with each result after it was published.
+
+    Raises
+    ------
+    UserError
+        If another process of this machine is a device on the same topics.
     """
 
     def __init__(
@@ -55,6 +67,7 @@ class DeviceInterface:
         supervisor: MotionSupervisor,
         diagnostics: DiagnosticsPublisher,
         *,
+        simulated: bool | None,
         refuse: Callable[[], str] = lambda: "",
         on_result: Callable[[StepResult], None] = lambda _: None,
     ) -> None:
@@ -65,6 +78,16 @@ class DeviceInterface:
         self._on_result = on_result
         self._told: DeviceStatus | None = None
         self._told_at = 0.0
+        self.simulated = simulated
+        self._topic = node.resolve_topic_name("device/status")
+        domain = node.context.get_domain_id()
+        try:
+            self._claim = Claim(
+                f"{self._topic} of ROS_DOMAIN_ID {domain}", node.get_fully_qualified_name()
+            )
+        except UserError as error:
+            raise UserError(f"another device is there: {error}; {WAY_OUT}") from None
+        node.create_timer(_LOOK_PERIOD, self._look_around, clock=STEADY_CLOCK)
         self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
         self.results = node.create_publisher(Header, "device/result", RELIABLE)
         self.statuses = node.create_publisher(DiagnosticStatus, "device/status", LATCHED)
@@ -92,7 +115,7 @@ class DeviceInterface:
                 rule = "" if event.rule is None else f" [{event.rule.value}]"
                 self._node.get_logger().warning(event.text + rule)
         now = time.monotonic()
-        status = self._supervisor.status(now)
+        status = dataclasses.replace(self._supervisor.status(now), simulated=self.simulated)
         told = self._told
         if told == status:
             return
@@ -103,6 +126,25 @@ class DeviceInterface:
         ):
             self._tell(status, now)
 
+    @property
+    def others(self) -> str:
+        """Who else is a device on the same topics, as far as discovery tells; empty: nobody."""
+        if self._node.count_publishers(self._topic) <= 1:
+            return ""
+        names = publishers_of(self._node, self._topic)
+        own = self._node.get_fully_qualified_name()
+        if own in names:
+            names.remove(own)
+        return f"another device is there: {', '.join(names)} publishes {self._topic}; {WAY_OUT}"
+
+    def close(self) -> None:
+        """Let another process be the device on these topics."""
+        self._claim.release()
+
+    def _look_around(self) -> None:
+        self._supervisor.see_others(self.others)
+        self.report()
+
     def publish_joint_states(self, stamp_ns: int) -> None:
         """Publish the measured joints, sampled at `stamp_ns`, unless they are stale."""
         joints = self._supervisor.joints(time.monotonic())
@@ -112,19 +154,21 @@ class DeviceInterface:
     def _tell(self, status: DeviceStatus, now: float) -> None:
         told = self._told
         self._told, self._told_at = status, now
-        self.statuses.publish(to_status(status, self._node.get_name()))
+        self.statuses.publish(to_status(status, signature(self._node)))
         self._diagnostics.set("device", to_diagnostic(status))
         if told is None or told.state is not status.state:
             why = f" ({status.reason})" if status.reason else ""
             self._node.get_logger().debug(f"device: {status.state.value}{why}")
 
     def _on_command(self, message: JointTrajectory) -> None:
+        self._supervisor.see_others(self.others)
         self._supervisor.submit(
             to_command(message), time.monotonic(), self.commands.get_publisher_count()
         )
         self.report()
 
     def _on_hold(self, message: Joy) -> None:
+        self._supervisor.see_others(self.others)
         self._supervisor.receive_hold(to_hold_message(message), time.monotonic())
         self.report()
 
@@ -146,6 +190,7 @@ class DeviceInterface:
         self._node.create_service(SetBool, f"device/{name}", answer)
 
     def _answer(self, response: Any, call: Callable[[], Reply], *, always: bool) -> Any:
+        self._supervisor.see_others(self.others)
         why_not = "" if always else self._refuse()
         reply = Reply(False, why_not) if why_not else call()
         response.success, response.message = reply.success, reply.message

@@ -92,6 +92,8 @@ class DeviceStatus:
         How many commands were refused.
     needs_time : bool
         Whether something goes on when time does: a simulated clock may stand still otherwise.
+    simulated : bool or None
+        Whether no real needle can move; None while that is not known.
     """
 
     state: State
@@ -107,6 +109,7 @@ class DeviceStatus:
     watchdog_trips: int
     commands_refused: int
     needs_time: bool
+    simulated: bool | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ class Rule(enum.Enum):
     HOLD_ONE_OWNER = "hold_one_owner"
     HOLD_STAMP_INCREASES = "hold_stamp_increases"
     SPEED_SCALE = "speed_scale"
+    ONE_DEVICE = "one_device"
     NO_MOTION_BY_ITSELF = "no_motion_by_itself"
     COMMAND_STATE = "command_state"
     COMMAND_ONE_PUBLISHER = "command_one_publisher"

@@ -60,6 +60,7 @@ class MotionSupervisor:
         self._ages = StampAges(2.0 * limits.tip_age_limit)
         self._estop_pressed = False
         self._needle_out = False
+        self._others = ""
         self._last_stamp_ns: int | None = None
         self._commands_refused = 0
         self._core = DeviceCore(
@@ -185,6 +186,16 @@ class MotionSupervisor:
         if pressed:
             self._core.emergency_stop()
 
+    def see_others(self, others: str) -> None:
+        """Take who else is a device on these topics; empty: nobody, as it must be."""
+        if others == self._others:
+            return
+        self._others = others
+        if others:
+            # Whoever said that a needle is out may have meant the other's.
+            self._needle_out = False
+            self._core.fail(others, Rule.ONE_DEVICE)
+
     def fail(self, reason: str, rule: Rule | None = None) -> None:
         """Stop both axes for a fault; it takes a reset to go on."""
         self._core.fail(reason, rule)
@@ -251,6 +262,8 @@ class MotionSupervisor:
         """Take a person's word that the needle is out of the tissue; a step ends its validity."""
         if self._core.activity is not Activity.NONE:
             return Reply(False, f"a {self._core.activity.value} is under way")
+        if confirmed and self._others:
+            return Reply(False, self._others)
         self._needle_out = confirmed
         return Reply(True, "needle out" if confirmed else "needle not out")
 
@@ -305,6 +318,8 @@ class MotionSupervisor:
         self._hold.require_new_press()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
             return Reply(True, "nothing to reset")
+        if self._others:
+            return Reply(False, self._others)
         if self._estop_pressed:
             return Reply(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):

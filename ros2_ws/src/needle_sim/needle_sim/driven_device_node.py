@@ -13,6 +13,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Header
 
 from needle_common.base_node import DiagnosticsPublisher
+from needle_common.claim import WAY_OUT
 from needle_common.conversions import (
     JOINT_STATES,
     LATCHED,
@@ -21,6 +22,7 @@ from needle_common.conversions import (
     values_of,
 )
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
 from needle_common.partners_node import unheard
 from needle_sim.bench import SimulatedBench
 from needle_sim.driven_tick import DrivenTick
@@ -158,6 +160,11 @@ class DrivenDevice:
     def _on_status(self, message: DiagnosticStatus) -> None:
         self._tick.heard()
         self._status = values_of(message)
+        if self._status.get("simulated") == "false":
+            raise UserError(
+                f"{self._node.get_fully_qualified_name()}: the device is real, or not in simulated "
+                f"time ({message.name} says simulated = false): no part of a simulation; {WAY_OUT}"
+            )
 
     def _on_joint_states(self, message: JointState) -> None:
         self._tick.heard()

@@ -10,6 +10,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from needle_common.base_node import DiagnosticsPublisher
+from needle_common.errors import UserError
 from needle_device_driver.device_interface_node import DeviceInterface
 from needle_device_driver.limits import SafetyLimits
 from needle_device_driver.reports import StepResult
@@ -66,7 +67,12 @@ class OwnDevice:
             on_step_end()
 
         self._interface = DeviceInterface(
-            node, self._supervisor, diagnostics, refuse=refuse, on_result=on_result
+            node,
+            self._supervisor,
+            diagnostics,
+            simulated=True,
+            refuse=refuse,
+            on_result=on_result,
         )
 
     @property
@@ -81,7 +87,15 @@ class OwnDevice:
         return [self._interface.commands, self._interface.holds]
 
     def missing(self) -> list[str]:
-        """Return what else is not there yet: nothing."""
+        """Return what else is not there yet: nothing.
+
+        Raises
+        ------
+        UserError
+            If there is another device.
+        """
+        if self._interface.others:
+            raise UserError(self._interface.others)
         return []
 
     def observe(self, now: float) -> None:
@@ -149,3 +163,4 @@ class OwnDevice:
         """Stop the simulated axes and say so."""
         self._supervisor.close()
         self._interface.report()
+        self._interface.close()

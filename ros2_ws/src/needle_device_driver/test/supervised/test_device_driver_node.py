@@ -11,14 +11,17 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.conversions import RELIABLE, to_nanoseconds
+from needle_common.conversions import LATCHED, RELIABLE, to_nanoseconds
 from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 from needle_common.ros_domain import own_domain
+from needle_device_driver import device_driver_node
 
 from .node_bench import Rig
 
@@ -120,6 +123,59 @@ def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:
     assert rig.send(rig.message()).frame_id == "succeeded"
 
 
+def test_a_second_driver_beside_a_first_is_refused_by_name(make_rig: Make) -> None:
+    make_rig()
+    with pytest.raises(UserError, match=r"/device_driver \(process \d+\) has /device/status"):
+        make_rig()
+
+
+def test_another_device_stops_everything_until_it_is_gone_and_reset(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.ready()
+    at = rig.positions
+    other = rclpy.create_node("other_rig", context=rig.partner.context)
+    other.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+    rig.until(lambda: rig.partner.status["state"] == "FAULT", "a fault")
+    assert "/other_rig publishes /device/status" in rig.partner.status["fault"]
+    rig.hold(False)
+    for name, data in (("home", None), ("enable", True), ("confirm_needle_out", True)):
+        assert not rig.call(name, data).success
+    assert "/other_rig" in rig.call("reset").message
+    assert rig.send(rig.message()).frame_id.startswith("aborted: ")
+    other.destroy_node()
+    rig.until(lambda: rig.call("reset").success, "alone again")
+    assert rig.positions == at
+
+
+def test_a_driver_that_finds_another_device_does_not_start(make_rig: Make) -> None:
+    rig = make_rig()
+    other = rclpy.create_node("other_rig", context=rig.partner.context)
+    other.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+    with pytest.raises(UserError, match="/other_rig publishes /device/status"):
+        rig.until(lambda: False, "the refusal")
+    other.destroy_node()
+
+
+@pytest.mark.parametrize(
+    ("emulated", "use_sim_time", "simulated"),
+    [(True, True, "true"), (True, False, "false"), (False, True, "false")],
+)
+def test_simulated_is_what_has_emulated_drives_and_simulated_time(
+    make_rig: Make,
+    monkeypatch: pytest.MonkeyPatch,
+    emulated: bool,
+    use_sim_time: bool,
+    simulated: str,
+) -> None:
+    if emulated:
+        monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: True)
+    rig = make_rig(autostart=False, use_sim_time=use_sim_time)
+    rig.until(rig.partner.change.service_is_ready, "the driver")
+    assert rig.partner.status.get("simulated", "") == ""
+    assert rig.transition(Transition.TRANSITION_CONFIGURE)
+    rig.until(lambda: rig.partner.status.get("simulated") == simulated, "what it is")
+
+
 def test_the_emergency_stop_stops_both_drives_and_its_reset_moves_nothing(make_rig: Make) -> None:
     rig = make_rig()
     rig.ready()
@@ -202,17 +258,20 @@ def test_without_autostart_nothing_is_configured_until_it_is_asked_for(make_rig:
     assert rig.label == "inactive"
 
 
-def test_drives_that_come_later_are_waited_for_and_missing_ones_named(make_rig: Make) -> None:
+def test_drives_that_come_later_are_waited_for(make_rig: Make) -> None:
     rig = make_rig()
     rig.peer.drives[1].silent = True
     rig.matched()
     rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
     rig.peer.drives[1].silent = False
     rig.until(lambda: rig.partner.status.get("state") == "DISABLED", "configured")
-    late = make_rig(connect_timeout=0.0)
-    late.peer.drives[0].silent = True
+
+
+def test_drives_that_do_not_come_are_named(make_rig: Make) -> None:
+    rig = make_rig(connect_timeout=0.0)
+    rig.peer.drives[0].silent = True
     with pytest.raises(UserError, match="insertion axis: node 1 does not answer"):
-        late.until(lambda: False, "the end of patience")
+        rig.until(lambda: False, "the end of patience")
 
 
 def test_on_a_steady_clock_the_driver_sends_its_own_cycles(make_rig: Make) -> None:

@@ -52,6 +52,45 @@ def test_estop_latches_from_every_state(bench: Bench, state: str) -> None:
     assert in_state(bench, wanted)
 
 
+def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset(
+    bench: Bench,
+) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(3, holding=True)
+    at = bench.positions
+    bench.supervisor.see_others("another device is there: /sim_rig")
+    assert in_state(bench, State.FAULT)
+    assert bench.last_rule is Rule.ONE_DEVICE
+    assert bench.results[-1].outcome == "aborted: another device is there: /sim_rig"
+    bench.cycle(20, holding=True)
+    bench.command()
+    bench.hold(False)
+    supervisor = bench.supervisor
+    for reply in (
+        supervisor.enable(True, bench.now),
+        supervisor.home(bench.now),
+        supervisor.retract(bench.now),
+        supervisor.confirm_needle_out(True),
+        supervisor.reset(bench.now),
+    ):
+        assert not reply.success
+    assert "/sim_rig" in supervisor.reset(bench.now).message
+    supervisor.see_others("")
+    assert in_state(bench, State.FAULT)
+    assert supervisor.reset(bench.now).success
+    assert bench.positions == at
+
+
+def test_one_device_takes_back_the_word_that_the_needle_is_out(bench: Bench) -> None:
+    bench.supervisor.configure(bench.now)
+    bench.supervisor.confirm_needle_out(True)
+    bench.supervisor.see_others("another device is there: /sim_rig")
+    bench.supervisor.see_others("")
+    assert bench.supervisor.reset(bench.now).success
+    assert "confirm first" in bench.supervisor.home(bench.now).message
+
+
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
 @pytest.mark.parametrize("how", ["fault", "power", "home", "unplugged"])
 def test_one_fault_stops_both(bench: Bench, which: str, how: str) -> None:

@@ -25,6 +25,7 @@ from needle_common.conversions import (
     to_nanoseconds,
     to_stamp,
 )
+from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 
 from .bench import SimRigBench
@@ -176,6 +177,14 @@ def test_needle_is_moved_by_the_drives_in_step_with_the_driver() -> None:
         # 25 ticks a step, one until the motor is known to stand, one for the exposure; then none.
         assert [(t - began) // TICK_NS for t in others.ticks if t > began] == list(range(1, 55))
         assert others.warnings == [] or all("waiting for" in w for w in others.warnings)
+
+
+def test_a_device_that_is_real_ends_it() -> None:
+    with running() as rig:
+        rig.start()
+        rig.others.say(rig.others._status, state="HOLDING", simulated="false")
+        with pytest.raises(UserError, match="simulated = false"):
+            rig.until(lambda: False, "its end")
 
 
 def test_nothing_is_exposed_during_a_step_that_stands_still() -> None:

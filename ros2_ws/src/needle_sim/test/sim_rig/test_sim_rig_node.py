@@ -10,13 +10,14 @@ from typing import Any
 
 import cv2
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.conversions import RELIABLE, to_nanoseconds
+from needle_common.conversions import LATCHED, RELIABLE, to_nanoseconds
 from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 from needle_sim.sim_rig_node import SimRigNode
@@ -56,6 +57,17 @@ def test_five_steps_repeat_bit_for_bit_with_one_seed_and_differ_with_another() -
         assert tip.header.frame_id == "rig"
         assert abs(tip.point.x - truth.pose.position.x) <= 1e-3
     assert truths[-1].pose.position.z == pytest.approx(0.005, abs=1e-5)
+
+
+def test_it_does_not_begin_beside_another_device() -> None:
+    with own_context() as context:
+        rig = Rig(context)
+        rig.partner.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+        try:
+            with pytest.raises(UserError, match="/partner publishes /device/status"):
+                rig.until(lambda: False, "its refusal")
+        finally:
+            rig.close()
 
 
 def test_services_refuse_while_partners_are_missing_and_say_which() -> None:
