@@ -2,7 +2,8 @@
 #
 #     source scripts/env.sh
 #
-# A ROS_DOMAIN_ID or ROS_AUTOMATIC_DISCOVERY_RANGE that is already set stays as it is.
+# A ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE or FASTRTPS_DEFAULT_PROFILES_FILE that is already set
+# stays as it is.
 # shellcheck shell=bash
 
 # Print list $2 (colons between its items) with item $1 first, and only once.
@@ -18,7 +19,7 @@ _needle_prepend() {
 
 _needle_env() {
     [ -z "${ZSH_VERSION:-}" ] || emulate -L sh
-    local root="$1" mode="" rest="" package="" paths="${PYTHONPATH:-}" prefixes="${AMENT_PREFIX_PATH:-}"
+    local root="$1" mode="" rest="" package="" profiles="" paths="${PYTHONPATH:-}" prefixes="${AMENT_PREFIX_PATH:-}"
     if [ -r "$root/.venv/.needle-setup" ]; then
         read -r mode rest <"$root/.venv/.needle-setup" || true
     fi
@@ -54,11 +55,20 @@ _needle_env() {
     export PATH
     # Without it, an int in a float field is sent as garbage, silently.
     export ROS_PYTHON_CHECK_FIELDS=1
-    # No packet leaves this machine unless asked for.
+    # No packet leaves this machine, and none comes in, unless asked for.
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
     export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
-    # Shared memory that holds camera images.
-    export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_bringup/config/fastdds.xml"
+    # Shared memory that holds camera images; who may ask. Every node of ours chooses in the same way.
+    case "$ROS_AUTOMATIC_DISCOVERY_RANGE" in
+        LOCALHOST | OFF) profiles=needle_fastdds.xml ;;
+        *) profiles=needle_fastdds_network.xml ;;
+    esac
+    case "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" in
+        */needle_fastdds.xml | */needle_fastdds_network.xml) unset FASTRTPS_DEFAULT_PROFILES_FILE ;;
+    esac
+    if [ ! -f "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ]; then
+        export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_common/needle_common/$profiles"
+    fi
 }
 
 if [ -n "${BASH_VERSION:-}" ]; then

@@ -65,7 +65,7 @@ def test_sets_the_environment_under_strict_options_from_any_folder(name: str, se
     assert env["ROS_PYTHON_CHECK_FIELDS"] == "1"
     assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "LOCALHOST"
     assert env["RMW_IMPLEMENTATION"] == "rmw_fastrtps_cpp"
-    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("needle_bringup/config/fastdds.xml")
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds.xml")
     assert "LD_LIBRARY_PATH" not in env
     assert "_ROS_WHEELS_BOOTSTRAP_COMPLETE" not in env
     assert "ROS_DOMAIN_ID" not in env
@@ -90,7 +90,18 @@ def test_keeps_what_the_user_has_set(name: str, set_up: Path) -> None:
     )
     assert env["ROS_DOMAIN_ID"] == "42"
     assert env["ROS_AUTOMATIC_DISCOVERY_RANGE"] == "SUBNET"
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds_network.xml")
     assert env["PYTHONPATH"].endswith(":/mine:/too")
+
+
+@pytest.mark.parametrize("name", SHELLS)
+def test_profiles_of_the_users_own_stay_and_missing_ones_do_not(name: str, set_up: Path) -> None:
+    own = set_up / "profiles.xml"
+    own.touch()
+    env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE=str(own))
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"] == str(own)
+    env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE="/not/there.xml")
+    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds.xml")
 
 
 @pytest.mark.parametrize("name", SHELLS)

@@ -33,6 +33,7 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import RECORDER, full_name, publishers_of
+from needle_common.reach import DISCOVERY, is_open
 
 HELP = """\
 operator: stands in for the person who holds the needle's switch, in simulation.
@@ -61,7 +62,10 @@ class OperatorNode(Node):
         self._settings = NodeParameters(self, OperatorParameters)
         values = self._settings.values
         self._sequence = OperatorSequence(
-            time.monotonic(), wait_timeout=values.wait_timeout, stall_timeout=values.stall_timeout
+            time.monotonic(),
+            wait_timeout=values.wait_timeout,
+            stall_timeout=values.stall_timeout,
+            look_around=DISCOVERY if is_open() else 0.0,
         )
         self._progress = Progress(_progress_stream())
         self._diagnostics = DiagnosticsPublisher(self)

@@ -77,16 +77,20 @@ class OperatorSequence:
         How long the rig may take to get ready (partners, each service call's answer) [s].
     stall_timeout : float
         How long steering may show no progress [s].
+    look_around : float
+        How long another device has to show itself before anything is called [s].
     """
 
-    def __init__(self, now: float, *, wait_timeout: float, stall_timeout: float) -> None:
+    def __init__(
+        self, now: float, *, wait_timeout: float, stall_timeout: float, look_around: float = 0.0
+    ) -> None:
         self._wait_timeout = wait_timeout
         self._stall_timeout = stall_timeout
         self._deadline = now + wait_timeout
         self._missing: Sequence[str] = ("everything",)
         self._prepared = 0
         self._pending = False
-        self._retry_at = now
+        self._retry_at = now + look_around
         self._refusal = ""
         self._refused_since: float | None = None
         self._homed = False

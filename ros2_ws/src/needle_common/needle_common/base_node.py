@@ -20,6 +20,8 @@ from needle_common.diagnostics import Diagnostic
 from needle_common.errors import UserError
 from needle_common.parameter_fields import describe
 from needle_common.partners_node import signature
+from needle_common.reach import keep_to_this_machine
+from needle_common.shared_memory import make_private
 
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
@@ -102,6 +104,7 @@ def run_node(
             return run_command(lambda: _explain(help_text, parameters))
         if own:
             raise UserError(f"unknown argument {own[0]!r}; see --help")
+        keep_to_this_machine()
         rclpy.init(args=argv, signal_handler_options=signal_handlers)
     # rclpy raises its own private types for a bad command line
     except Exception as error:  # noqa: BLE001
@@ -109,6 +112,7 @@ def run_node(
     node: Node | None = None
     try:
         node = create()
+        make_private()
         return _spin(node) if spin is None else spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         return EXIT_DONE

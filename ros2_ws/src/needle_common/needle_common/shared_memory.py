@@ -1,4 +1,4 @@
-"""What Fast DDS leaves in shared memory where a process was killed, and how to take it away.
+"""Fast DDS's shared memory: kept from other users, and taken away where a process was killed.
 
 A port is a file that every process of a domain opens. Who is killed never closes it: the count of
 its users stays wrong for good, and the next run in that domain inherits the file.
@@ -12,6 +12,30 @@ from collections.abc import Iterable
 from pathlib import Path
 
 SHARED_MEMORY = Path("/dev/shm")
+_PREFIX = "fastrtps_"
+
+
+def make_private(folder: Path = SHARED_MEMORY, maps: Path = Path("/proc/self/maps")) -> None:
+    """Keep other users from reading the shared memory that this process has open.
+
+    It holds every image. Fast DDS opens it to all readers, whatever the umask (mode 0644).
+
+    Parameters
+    ----------
+    folder : Path
+        Where shared memory is mounted.
+    maps : Path
+        What the process has mapped.
+    """
+    open_here = {
+        line.split()[-1]
+        for line in maps.read_text(encoding="utf-8", errors="replace").splitlines()
+        if f" {folder}/{_PREFIX}" in line
+    }
+    for path in open_here:
+        # Another user's, or gone.
+        with contextlib.suppress(OSError):
+            Path(path).chmod(0o600)
 
 
 def ports_left(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
@@ -47,7 +71,7 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
 
 
 def _name(port: int) -> str:
-    return f"fastrtps_port{port}"
+    return f"{_PREFIX}port{port}"
 
 
 def _is_held(lock: Path) -> bool:

@@ -23,6 +23,7 @@ from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
+from needle_common.reach import DISCOVERY, is_open
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
 from needle_device_driver.device_interface_node import DeviceInterface
@@ -95,7 +96,7 @@ class DeviceDriverNode(LifecycleNode):
         self._waiting_for = "the driver to be activated"
         self._refusal = ""
         self._give_up_at = time.monotonic() + values.connect_timeout
-        self._retry_at = 0.0
+        self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_ns: int | None = None
         self._cycled_at: float | None = None
         self._timed_at: float | None = None

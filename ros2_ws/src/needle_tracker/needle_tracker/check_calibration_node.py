@@ -18,6 +18,7 @@ from sensor_msgs.msg import Image
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.conversions import IMAGES_BEST_EFFORT, to_nanoseconds
 from needle_common.errors import UserError
+from needle_common.reach import keep_to_this_machine
 from needle_tracker.board_views import averaged_view, views_in_folders
 from needle_tracker.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.calibration_check import check
@@ -66,6 +67,7 @@ def _live_view(
     if session.place_of(name) is None:
         raise UserError(f"--live {name} is none of the session's places")
     context = Context()
+    keep_to_this_machine()
     rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
         pairs = _Capture(context, calibration, options).take()
