@@ -26,7 +26,7 @@ from needle_bringup.operator_sequence import (
 )
 from needle_bringup.progress import PROGRESS_FD, Progress
 from needle_bringup.recorder_parameters import PARAMETERS_OF
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
 from needle_common.diagnostics import Diagnostic, Level
@@ -223,8 +223,7 @@ def main() -> int:
 
     def spin(node: Node) -> int:
         assert isinstance(node, OperatorNode)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = executor_of(node)
         try:
             while not node.ended:
                 if end.wanted:

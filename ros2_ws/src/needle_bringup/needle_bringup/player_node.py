@@ -12,7 +12,6 @@ from functools import partial
 from typing import Any, Final, cast
 
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.signals import SignalHandlerOptions
@@ -28,7 +27,7 @@ from needle_bringup.playback import PlaybackClock, ReadAhead
 from needle_bringup.player_options import PlayerOptions, parse_options, require_fits
 from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
 from needle_bringup.terminal_keys import Keys
-from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.conversions import RELIABLE, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
@@ -270,8 +269,7 @@ def _message_class(type_name: str) -> Any:
 
 
 def _play(player: Player, loop: bool, end: EndRequest) -> int:
-    executor = SingleThreadedExecutor()
-    executor.add_node(player)
+    executor = executor_of(player)
     bar = tqdm(
         total=round((player.end - player.start) / _NANOSECONDS, 1),
         unit="s",

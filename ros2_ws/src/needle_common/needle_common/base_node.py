@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import sys
+import weakref
+from collections import Counter
 from collections.abc import Callable
+from typing import ClassVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -16,13 +19,15 @@ from rclpy.utilities import remove_ros_args
 
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, internal_error, run_command
 from needle_common.conversions import RELIABLE, to_diagnostic_status
-from needle_common.diagnostics import Diagnostic
+from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
+from needle_common.executor_node import NodeExecutor
 from needle_common.parameter_fields import describe
 from needle_common.partners_node import signature
 from needle_common.reach import keep_to_this_machine
 from needle_common.shared_memory import make_private
 
+_LONGEST_TEXT = 200
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 
 
@@ -35,12 +40,24 @@ class DiagnosticsPublisher:
         The node whose health it is.
     """
 
+    _of: ClassVar[weakref.WeakKeyDictionary[Node, DiagnosticsPublisher]] = (
+        weakref.WeakKeyDictionary()
+    )
+
     def __init__(self, node: Node) -> None:
+        self._of[node] = self
         self._node = node
+        self._refused: Counter[str] = Counter()
+        self._complaints: set[tuple[str, str]] = set()
         self._parts: dict[str, Diagnostic] = {}
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         # Health is told also while simulated time stands still, hence the steady clock.
         node.create_timer(1.0, self._publish_all, clock=STEADY_CLOCK)
+
+    @classmethod
+    def of(cls, node: Node) -> DiagnosticsPublisher:
+        """Return the node's own, made where it has none."""
+        return cls._of.get(node) or cls(node)
 
     def set(self, part: str, diagnostic: Diagnostic) -> None:
         """Take the health of one part; published at once where level or message changed."""
@@ -51,6 +68,27 @@ class DiagnosticsPublisher:
             diagnostic.message,
         ):
             self._publish([part])
+
+    def refuse(self, source: str, kind: str, why: str) -> None:
+        """Count and tell, as part `input`, what the node was sent and cannot use.
+
+        Parameters
+        ----------
+        source : str
+            Topic or service.
+        kind : str
+            What sort of trouble; the first of each is logged.
+        why : str
+            What is wrong with it.
+        """
+        text = f"{source}: refused: {why}"[:_LONGEST_TEXT]
+        self._refused[source] += 1
+        if (source, kind) not in self._complaints:
+            self._complaints.add((source, kind))
+            self._node.get_logger().warning(text)
+        values = {f"refused {name}": str(count) for name, count in self._refused.items()}
+        message = f"{source}: refused: {kind}"
+        self.set("input", Diagnostic(Level.WARN, message, {"last": text, **values}))
 
     def _publish_all(self) -> None:
         self._publish(list(self._parts))
@@ -132,9 +170,23 @@ def _explain(help_text: str, parameters: type) -> int:
     return EXIT_DONE
 
 
+def executor_of(
+    node: Node, on_failure: Callable[[str], None] = lambda _: None
+) -> SingleThreadedExecutor:
+    """Return what runs a node's callbacks, so that nothing which it is sent ends it.
+
+    Parameters
+    ----------
+    node : Node
+        The node.
+    on_failure : callable, optional
+        Called when a callback of the node's own failed, for one that must not go on as if not.
+    """
+    return NodeExecutor(node, DiagnosticsPublisher.of(node).refuse, on_failure)
+
+
 def _spin(node: Node) -> int:
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    executor = executor_of(node)
     try:
         executor.spin()
     except RuntimeError:

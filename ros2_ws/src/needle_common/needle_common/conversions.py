@@ -9,6 +9,8 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from needle_common.diagnostics import Diagnostic
 
 NANOSECONDS = 1_000_000_000
+# A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
+_FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
 
 RELIABLE = QoSProfile(
     history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE
@@ -40,8 +42,12 @@ def to_nanoseconds(stamp: Time) -> int:
 
 
 def to_stamp(nanoseconds: int) -> Time:
-    """Return the message stamp of a time in ns since the clock's epoch."""
-    sec, nanosec = divmod(nanoseconds, NANOSECONDS)
+    """Return the message stamp of a time in ns since the clock's epoch.
+
+    Whatever `to_nanoseconds` returned has one. A time beyond is the nearest that a stamp can tell.
+    """
+    sec = min(max(nanoseconds // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
+    nanosec = min(max(nanoseconds - sec * NANOSECONDS, 0), _LAST_NANOSEC)
     return Time(sec=sec, nanosec=nanosec)
 
 

@@ -6,10 +6,12 @@ import dataclasses
 import difflib
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rcl_interfaces.msg import SetParametersResult as Result
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -19,7 +21,10 @@ from needle_common.parameter_fields import ParameterSpec, specs
 
 P = TypeVar("P")
 
-OF_EVERY_NODE = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+_SIM_TIME = "use_sim_time"
+_TYPES = frozenset(kind.value for kind in Parameter.Type)
+_LONGEST_NAME = 100
+OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
 """How the names of parameters begin that every rclpy node declares for itself."""
 
 
@@ -76,8 +81,12 @@ class NodeParameters(Generic[P]):
             self.values: P = parameters(**values)
         except UserError as error:
             raise UserError(f"{node.get_fully_qualified_name()}: {error}") from error
+        self._sim_time = bool(node.get_parameter(_SIM_TIME).value)
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._apply)
+        for service in node.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = partial(_answer_if_typed, service.callback)
 
     def _changed(self, changes: list[Parameter]) -> P:
         own = {field.name for field in dataclasses.fields(self.values)}  # type: ignore[arg-type]
@@ -85,6 +94,9 @@ class NodeParameters(Generic[P]):
         return dataclasses.replace(self.values, **update)  # type: ignore[type-var]
 
     def _check(self, changes: list[Parameter]) -> Result:
+        for change in changes:
+            if change.name == _SIM_TIME and change.value is not self._sim_time:
+                return Result(successful=False, reason=f"{_SIM_TIME} is fixed at start")
         try:
             self._changed(changes)
         except UserError as error:
@@ -97,6 +109,22 @@ class NodeParameters(Generic[P]):
             self.values = changed
             if self._on_change is not None:
                 self._on_change(changed)
+
+
+def _answer_if_typed(answer: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+    """Refuse a request whole that holds a value of no type; rclpy would end the node."""
+    for given in request.parameters:
+        if given.value.type not in _TYPES:
+            name = given.name[:_LONGEST_NAME]
+            refusal = Result(
+                successful=False, reason=f"{name}: there is no parameter type {given.value.type}"
+            )
+            if isinstance(response, SetParametersAtomically.Response):
+                response.result = refusal
+            else:
+                response.results = [refusal] * len(request.parameters)
+            return response
+    return answer(request, response)
 
 
 def _plain(value: Any) -> Any:

@@ -9,13 +9,12 @@ import time
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_common.diagnostics import Diagnostic, Level
@@ -296,6 +295,11 @@ class DeviceDriverNode(LifecycleNode):
             self.get_logger().warning(f"transition refused: {error}")
             return TransitionCallbackReturn.FAILURE
 
+    def fail(self, why: str) -> None:
+        """Stop both axes: a callback ended half-way, and nobody knows what it left."""
+        self._supervisor.fail(f"internal error: {why}")
+        self._device.report()
+
     def close(self) -> None:
         """Stop both axes, switch them off, let go of the link."""
         self._active = False
@@ -320,8 +324,7 @@ def main() -> int:
 
     def spin(node: Node) -> int:
         assert isinstance(node, DeviceDriverNode)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = executor_of(node, node.fail)
         # What is there stays: no collection need look through it while the drives wait.
         gc.freeze()
         try:

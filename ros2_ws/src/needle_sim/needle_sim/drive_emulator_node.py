@@ -10,13 +10,12 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
@@ -179,8 +178,7 @@ def main() -> int:
 
     def spin(node: Node) -> int:
         assert isinstance(node, DriveEmulatorNode)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = executor_of(node)
         commands = _CommandInput()
         looked_at = 0.0
         try:

@@ -9,13 +9,12 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from needle_common.base_node import DiagnosticsPublisher, run_node
+from needle_common.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import (
     LATCHED,
@@ -357,8 +356,7 @@ def main() -> int:
 
     def spin(node: Node) -> int:
         assert isinstance(node, SimRigNode)
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
+        executor = executor_of(node)
         try:
             while not end.wanted:
                 executor.spin_once(timeout_sec=node.turns())

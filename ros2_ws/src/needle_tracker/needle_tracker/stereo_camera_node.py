@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from ament_index_python.packages import get_package_share_directory
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import IMAGES, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
@@ -225,8 +224,7 @@ def _image(pixels: GreyImage, info: CameraInfo) -> Image:
 def _spin(node: Node) -> int:
     if not isinstance(node, StereoCameraNode):
         raise UserError("not a stereo_camera")
-    executor = SingleThreadedExecutor(context=node.context)
-    executor.add_node(node)
+    executor = executor_of(node)
     try:
         while not node.finished:
             executor.spin_once()

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import rclpy
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from std_msgs.msg import Bool
@@ -108,6 +109,16 @@ def test_bad_commands_are_refused_whole_and_disturb_nothing(make_rig: Make) -> N
         "succeeded"
     )
     assert rig.positions[0] == at[0] + 20_000
+
+
+def test_the_last_stamp_that_there_is_is_refused_and_answered(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.ready()
+    message = rig.message()
+    message.header.stamp = Time(sec=2**31 - 1, nanosec=2**32 - 1)
+    answer = rig.send(message)
+    assert "from the future" in answer.frame_id
+    assert answer.stamp == message.header.stamp
 
 
 def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:
