@@ -24,12 +24,12 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "recorder = needle_bringup.recorder_node:main",
-            "operator = needle_bringup.operator_node:main",
-            "player = needle_bringup.player_node:main",
-            "recover = needle_bringup.recover:main",
-            "report = needle_bringup.report:main",
-            "rerun = needle_bringup.rerun_node:main",
+            "recorder = needle_bringup.executables:recorder",
+            "operator = needle_bringup.executables:operator",
+            "player = needle_bringup.executables:player",
+            "recover = needle_bringup.executables:recover",
+            "report = needle_bringup.executables:report",
+            "rerun = needle_bringup.executables:rerun",
         ]
     },
 )

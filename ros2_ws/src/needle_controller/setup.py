@@ -24,8 +24,8 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "identify_curvature = needle_controller.identify_curvature:main",
-            "plane_controller = needle_controller.plane_controller_node:main",
+            "identify_curvature = needle_controller.executables:identify_curvature",
+            "plane_controller = needle_controller.executables:plane_controller",
         ]
     },
 )

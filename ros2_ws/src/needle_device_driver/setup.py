@@ -23,6 +23,6 @@ setup(
     description="Motion supervisor of the insertion and rotation axes: states, limits, hold, stop.",
     license="Apache-2.0",
     entry_points={
-        "console_scripts": ["device_driver = needle_device_driver.device_driver_node:main"]
+        "console_scripts": ["device_driver = needle_device_driver.executables:device_driver"]
     },
 )

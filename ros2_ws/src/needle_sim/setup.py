@@ -24,10 +24,10 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "sim_rig = needle_sim.sim_rig_node:main",
-            "drive_emulator = needle_sim.drive_emulator_node:main",
-            "monte_carlo = needle_sim.monte_carlo:main",
-            "render_images = needle_sim.render_images:main",
+            "sim_rig = needle_sim.executables:sim_rig",
+            "drive_emulator = needle_sim.executables:drive_emulator",
+            "monte_carlo = needle_sim.executables:monte_carlo",
+            "render_images = needle_sim.executables:render_images",
         ]
     },
 )

@@ -24,11 +24,11 @@ setup(
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "stereo_tracker = needle_tracker.stereo_tracker_node:main",
-            "track_images = needle_tracker.track_images:main",
-            "calibrate_stereo = needle_tracker.calibrate_stereo:main",
-            "check_calibration = needle_tracker.check_calibration_node:main",
-            "stereo_camera = needle_tracker.stereo_camera_node:main",
+            "stereo_tracker = needle_tracker.executables:stereo_tracker",
+            "track_images = needle_tracker.executables:track_images",
+            "calibrate_stereo = needle_tracker.executables:calibrate_stereo",
+            "check_calibration = needle_tracker.executables:check_calibration",
+            "stereo_camera = needle_tracker.executables:stereo_camera",
         ]
     },
 )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import time
 from typing import Any, TextIO
@@ -12,7 +11,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
@@ -51,6 +49,8 @@ Exit code   0 when the depth was reached, 1 when it was not, 2 when the rig did 
 """
 
 DISABLE_TIMEOUT = 1.0
+# After a signal the driver may be gone, too.
+DISABLE_TIMEOUT_INTERRUPTED = 0.3
 RELEASES = 3
 
 
@@ -110,7 +110,8 @@ class OperatorNode(Node):
             for _ in range(RELEASES - 1):
                 executor.spin_once(timeout_sec=0.02)
                 self._send_hold(pressed=False)
-        deadline = time.monotonic() + DISABLE_TIMEOUT
+        timeout = DISABLE_TIMEOUT_INTERRUPTED if outcome.interrupted else DISABLE_TIMEOUT
+        deadline = time.monotonic() + timeout
         while disabled is not None and not disabled.done() and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
         line = f"operator: {outcome.reason}"
@@ -218,10 +219,8 @@ def _progress_stream() -> TextIO:
 
 def main() -> int:
     """Run the operator; returns its exit code."""
-    # rclpy's own handlers would shut the context down before the release could go out.
-    end = EndRequest(signal.SIGHUP)
 
-    def spin(node: Node) -> int:
+    def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, OperatorNode)
         executor = executor_of(node)
         try:
@@ -238,5 +237,5 @@ def main() -> int:
         help_text=HELP,
         parameters=OperatorParameters,
         spin=spin,
-        signal_handlers=SignalHandlerOptions.NO,
+        interrupted=EXIT_INTERRUPTED,
     )

@@ -14,7 +14,6 @@ from typing import Any, Final, cast
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 from tqdm import tqdm
@@ -100,8 +99,13 @@ class Player(Node):
             raise UserError(f"{options.bag}: none of its topics can be played here")
         return playable
 
-    def prepare(self, spin: partial[None]) -> None:
+    def prepare(self, spin: partial[None], end: EndRequest) -> bool:
         """Look for a rig, make the publishers, and wait for who listens already.
+
+        Returns
+        -------
+        bool
+            False where `end` was wanted meanwhile: then nothing is to be played.
 
         Raises
         ------
@@ -110,7 +114,7 @@ class Player(Node):
         """
         self._make_publishers()
         begin = time.monotonic()
-        while time.monotonic() < begin + DISCOVERY and not self.beside_rig:
+        while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.wanted):
             spin()
             if self._rig() is not None:
                 self.get_logger().warning(f"a rig is on this graph: all is played under {REPLAY}")
@@ -118,13 +122,16 @@ class Player(Node):
                 self._make_publishers()
                 begin = time.monotonic()
         answering = AnsweringNodes(self)
-        while time.monotonic() < begin + DISCOVERY + MATCHING:
+        while time.monotonic() < begin + DISCOVERY + MATCHING and not end.wanted:
             if self._all_matched() and answering.all_of(self._listeners()):
                 break
             spin()
         answering.close()
+        if end.wanted:
+            return False
         self._publish_latched()
         self.clock.restart(self.start, time.monotonic())
+        return True
 
     def _make_publishers(self) -> None:
         for sender in self._senders.values():
@@ -278,7 +285,8 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
         bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar pauses",
     )
     with bar, Keys() as keys:
-        player.prepare(partial(executor.spin_once, 0.05))
+        if not player.prepare(partial(executor.spin_once, 0.05), end):
+            return EXIT_DONE
         while True:
             with contextlib.closing(ReadAhead(player.read)) as source:
                 message = source.next()
@@ -315,9 +323,8 @@ def main(args: list[str] | None = None) -> int:
         options = parse_options(own)
         contents = read_contents(options.bag)
         require_fits(options, contents)
-        end = EndRequest()
 
-        def spin(node: Node) -> int:
+        def spin(node: Node, end: EndRequest) -> int:
             player = cast(Player, node)
             try:
                 code = _play(player, options.loop, end)
@@ -337,7 +344,6 @@ def main(args: list[str] | None = None) -> int:
             parameters=PlayerParameters,
             args=[argv[0], *ros],
             spin=spin,
-            signal_handlers=SignalHandlerOptions.NO,
         )
 
     return run_command(command)

@@ -15,7 +15,6 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 
 from needle_bringup.allocator import keep_freed_memory
@@ -289,23 +288,22 @@ def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: fl
 
 def main(args: list[str] | None = None) -> int:
     """Run the recorder; returns the exit code."""
-    stop = EndRequest()
     keep_freed_memory()
 
-    def spin(node: Node) -> int:
+    def spin(node: Node, end: EndRequest) -> int:
         recorder = cast(Recorder, node)
         executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
-            while not stop.wanted:
+            while not end.wanted:
                 _spin_once(executor, recorder, 0.1)
             limit = time.monotonic() + LAST_WORDS_LIMIT
-            end = time.monotonic() + LAST_WORDS
-            while time.monotonic() < min(end, limit):
+            quiet = time.monotonic() + LAST_WORDS
+            while time.monotonic() < min(quiet, limit):
                 before = recorder.recording.messages_received
                 _spin_once(executor, recorder, 0.05)
                 if recorder.recording.messages_received > before:
-                    end = time.monotonic() + LAST_WORDS
+                    quiet = time.monotonic() + LAST_WORDS
             return recorder.finish()
         finally:
             recorder.recording.close()
@@ -316,7 +314,8 @@ def main(args: list[str] | None = None) -> int:
         parameters=RecorderParameters,
         args=args,
         spin=spin,
-        signal_handlers=SignalHandlerOptions.NO,
+        # A bag is made whole however long its disk takes.
+        grace=None,
     )
 
 

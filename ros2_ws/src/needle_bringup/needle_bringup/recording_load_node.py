@@ -28,6 +28,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.base_node import run_node
 from needle_common.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
+from needle_common.end_request import EndRequest
 from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import unrecorded
@@ -103,12 +104,12 @@ class RecordingLoad(Node):
         """Whether a topic is not recorded yet."""
         return bool(unrecorded(self, (stream.publisher for stream in self.streams)))
 
-    def run(self) -> None:
+    def run(self, end: EndRequest) -> None:
         """Send until the time is over and everything has arrived, then print the counts."""
-        while self.waits_for_recorder():
+        while self.waits_for_recorder() and not end.wanted:
             time.sleep(0.05)
         begin = time.monotonic()
-        while (elapsed := time.monotonic() - begin) < self.values.duration:
+        while (elapsed := time.monotonic() - begin) < self.values.duration and not end.wanted:
             for stream in self.streams:
                 # Not faster than real time after a pause: a camera does not catch up either.
                 if elapsed >= stream.count * stream.period:
@@ -137,9 +138,9 @@ def _example(kind: type) -> Any:
     return message
 
 
-def _spin(node: Node) -> int:
+def _spin(node: Node, end: EndRequest) -> int:
     assert isinstance(node, RecordingLoad)
-    node.run()
+    node.run(end)
     return 0
 
 

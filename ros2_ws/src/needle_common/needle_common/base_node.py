@@ -12,14 +12,21 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
-from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, internal_error, run_command
+from needle_common.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_INTERNAL_ERROR,
+    internal_error,
+    run_command,
+)
 from needle_common.conversions import RELIABLE, to_diagnostic_status
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import GRACE, EndRequest
 from needle_common.errors import UserError
 from needle_common.executor_node import NodeExecutor
 from needle_common.parameter_fields import describe
@@ -29,6 +36,8 @@ from needle_common.shared_memory import make_private
 
 _LONGEST_TEXT = 200
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
+# An executor that waits does not see a signal: it looks up after this time [s].
+LOOK_PERIOD = 0.1
 
 
 class DiagnosticsPublisher:
@@ -109,8 +118,9 @@ def run_node(
     help_text: str,
     parameters: type,
     args: list[str] | None = None,
-    spin: Callable[[Node], int] | None = None,
-    signal_handlers: SignalHandlerOptions = SignalHandlerOptions.ALL,
+    spin: Callable[[Node, EndRequest], int] | None = None,
+    grace: float | None = GRACE,
+    interrupted: int = EXIT_DONE,
 ) -> int:
     """Run a node until a signal ends it; `--help` explains it instead.
 
@@ -125,43 +135,56 @@ def run_node(
     args : list of str, optional
         Command line with the program's name; sys.argv by default.
     spin : callable, optional
-        Takes the node, runs it and returns the exit code; by default spins until shut down.
-    signal_handlers : SignalHandlerOptions, optional
-        rclpy's handlers; NO for a node that has last messages to send and handles signals itself.
+        Takes the node and the wish to end it, runs it until then and returns the exit code; by
+        default nothing but spins.
+    grace : float, optional
+        How long it may be busy after a signal before the process just ends [s]; None for a node
+        that must finish something, which then limits its time itself.
+    interrupted : int
+        Exit code of a process that just ends.
 
     Returns
     -------
     int
-        0 after a clean end (also by SIGINT or SIGTERM), 2 after bad parameters or arguments, 3
-        after an internal error.
+        0 after a clean end (also by SIGINT, SIGTERM or SIGHUP), 2 after bad parameters or
+        arguments, 3 after an internal error.
     """
     argv = list(sys.argv if args is None else args)
-    try:
-        own = remove_ros_args(argv)[1:]
-        if own in (["--help"], ["-h"]):
-            return run_command(lambda: _explain(help_text, parameters))
-        if own:
-            raise UserError(f"unknown argument {own[0]!r}; see --help")
-        keep_to_this_machine()
-        rclpy.init(args=argv, signal_handler_options=signal_handlers)
-    # rclpy raises its own private types for a bad command line
-    except Exception as error:  # noqa: BLE001
-        return _refuse(error)
+    with EndRequest(grace, interrupted) as end:
+        try:
+            own = remove_ros_args(argv)[1:]
+            if own in (["--help"], ["-h"]):
+                return run_command(lambda: _explain(help_text, parameters))
+            if own:
+                raise UserError(f"unknown argument {own[0]!r}; see --help")
+            keep_to_this_machine()
+            # rclpy's own handlers would shut the context down in the middle of what is under way.
+            rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
+        # rclpy raises its own private types for a bad command line
+        except Exception as error:  # noqa: BLE001
+            return _refuse(error)
+        return _run(create, spin or _spin, end)
+
+
+def _run(
+    create: Callable[[], Node], spin: Callable[[Node, EndRequest], int], end: EndRequest
+) -> int:
     node: Node | None = None
+    code = EXIT_INTERNAL_ERROR
     try:
         node = create()
         make_private()
-        return _spin(node) if spin is None else spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        return EXIT_DONE
+        code = spin(node, end)
     except (UserError, ParameterException) as error:
-        return _refuse(error)
+        code = _refuse(error)
     except Exception as error:  # noqa: BLE001
-        return internal_error(error)
+        code = internal_error(error)
     finally:
+        end.leave(code)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+    return code
 
 
 def _explain(help_text: str, parameters: type) -> int:
@@ -185,14 +208,11 @@ def executor_of(
     return NodeExecutor(node, DiagnosticsPublisher.of(node).refuse, on_failure)
 
 
-def _spin(node: Node) -> int:
+def _spin(node: Node, end: EndRequest) -> int:
     executor = executor_of(node)
     try:
-        executor.spin()
-    except RuntimeError:
-        # A signal ends the context also in the middle of a callback: rclpy then cannot publish.
-        if node.context.ok():
-            raise
+        while not end.wanted:
+            executor.spin_once(timeout_sec=LOOK_PERIOD)
     finally:
         # An executor that outlives the context complains when it is collected.
         executor.shutdown()

@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from needle_common.end_request import interruptible
 from needle_common.errors import UserError
 
 EXIT_DONE = 0
@@ -32,13 +33,14 @@ def run_command(command: Callable[[], int]) -> int:
     Returns
     -------
     int
-        The command's own code, 2 after a `UserError`, 3 after any other exception, 130 after an
-        interrupt.
+        The command's own code, 2 after a `UserError`, 3 after any other exception, 130 after
+        SIGINT, SIGTERM or SIGHUP.
     """
     try:
-        code = command()
-        # a reader that has left shows here, and not when the interpreter ends
-        sys.stdout.flush()
+        with interruptible():
+            code = command()
+            # a reader that has left shows here, and not when the interpreter ends
+            sys.stdout.flush()
         return code
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)

@@ -1,13 +1,16 @@
 """A node's start and end, without a graph."""
 
 import dataclasses
+import os
+import signal
 
 import pytest
-import rclpy
 from rclpy.node import Node
 
-from needle_common.base_node import STEADY_CLOCK, run_node
+from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_ERROR
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import ENDING_SIGNALS
 from needle_common.errors import UserError
 
 
@@ -20,20 +23,30 @@ def run(create: type[Node], *words: str) -> int:
     return run_node(create, help_text="HELP", parameters=NoParameters, args=["node", *words])
 
 
-class EndsInACallback(Node):
-    """Loses its context while a callback is under way, as a signal does it."""
+class Signalled(Node):
+    """Gets signals in the middle of a callback, which it ends."""
 
     def __init__(self) -> None:
-        super().__init__("ends_in_a_callback")
+        super().__init__("signalled")
         self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
 
     def _on_timer(self) -> None:
-        rclpy.shutdown()
-        raise RuntimeError("failed to publish: context is invalid")
+        for number in ENDING_SIGNALS:
+            os.kill(os.getpid(), number)
+        assert self.context.ok()
+        DiagnosticsPublisher(self).set("part", Diagnostic(Level.OK, "last words"))
+
+    def destroy_node(self) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        super().destroy_node()
 
 
-class Fails(EndsInACallback):
+class Fails(Node):
     """Has a fault of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("fails")
+        self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
 
     def _on_timer(self) -> None:
         raise RuntimeError("a fault of its own")
@@ -46,8 +59,8 @@ class Refuses(Node):
         raise UserError("rate = 0 Hz, must be > 0")
 
 
-def test_a_signal_in_the_middle_of_a_callback_is_a_clean_end() -> None:
-    assert run(EndsInACallback) == EXIT_DONE
+def test_signals_in_a_callback_and_at_the_end_are_a_clean_end() -> None:
+    assert run(Signalled) == EXIT_DONE
 
 
 def test_a_fault_in_a_callback_is_an_internal_error(capsys: pytest.CaptureFixture[str]) -> None:

@@ -173,10 +173,10 @@ def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue
 _OUTLIER_WEIGHT = 0.5
 
 
-def main(args: Sequence[str] | None = None) -> None:
-    """Run the command."""
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
     arguments = sys.argv[1:] if args is None else args
-    sys.exit(run_command(lambda: _run(arguments)))
+    return run_command(lambda: _run(arguments))
 
 
 def _run(arguments: Sequence[str]) -> int:
@@ -205,4 +205,4 @@ def _run(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

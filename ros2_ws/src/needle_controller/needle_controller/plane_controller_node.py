@@ -246,17 +246,12 @@ def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
     return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
 
 
-def main(args: list[str] | None = None) -> None:
-    """Run the node."""
-    sys.exit(
-        run_node(
-            PlaneControllerNode,
-            help_text=HELP,
-            parameters=PlaneControllerParameters,
-            args=args,
-        )
+def main(args: list[str] | None = None) -> int:
+    """Run the node; returns its exit code."""
+    return run_node(
+        PlaneControllerNode, help_text=HELP, parameters=PlaneControllerParameters, args=args
     )
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

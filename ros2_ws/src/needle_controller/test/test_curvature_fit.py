@@ -211,10 +211,7 @@ def needle() -> tuple[Array, Array]:
 
 
 def command(*arguments: str | Path) -> int:
-    with pytest.raises(SystemExit) as end:
-        main([str(argument) for argument in arguments])
-    assert isinstance(end.value.code, int)
-    return end.value.code
+    return main([str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize("known", [True, False])

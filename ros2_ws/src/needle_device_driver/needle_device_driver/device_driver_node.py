@@ -11,7 +11,6 @@ from typing import Any
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
@@ -319,10 +318,8 @@ def main() -> int:
     # What canopen and python-can have to say comes as faults of the axes.
     for name in ("canopen", "can"):
         logging.getLogger(name).addHandler(logging.NullHandler())
-    # rclpy's own handlers would shut the context down before the axes are off.
-    end = EndRequest()
 
-    def spin(node: Node) -> int:
+    def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DeviceDriverNode)
         executor = executor_of(node, node.fail)
         # What is there stays: no collection need look through it while the drives wait.
@@ -340,7 +337,8 @@ def main() -> int:
         help_text=HELP,
         parameters=DeviceDriverParameters,
         spin=spin,
-        signal_handlers=SignalHandlerOptions.NO,
+        # Each wait of `close` has a limit of its own, and the axes stand and are off behind it.
+        grace=None,
     )
 
 

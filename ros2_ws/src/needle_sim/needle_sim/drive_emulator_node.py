@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import select
-import signal
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
@@ -173,10 +171,8 @@ class DriveEmulatorNode(Node):
 
 def main() -> int:
     """Run the emulator; returns its exit code."""
-    # rclpy's own handlers would leave the link to the port behind.
-    end = EndRequest(signal.SIGHUP)
 
-    def spin(node: Node) -> int:
+    def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DriveEmulatorNode)
         executor = executor_of(node)
         commands = _CommandInput()
@@ -205,7 +201,6 @@ def main() -> int:
         help_text=HELP,
         parameters=DriveEmulatorParameters,
         spin=spin,
-        signal_handlers=SignalHandlerOptions.NO,
     )
 
 

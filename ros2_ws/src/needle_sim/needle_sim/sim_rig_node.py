@@ -10,7 +10,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.node import Node
-from rclpy.signals import SignalHandlerOptions
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
@@ -351,10 +350,8 @@ class SimRigNode(Node):
 
 def main() -> int:
     """Run sim_rig; returns its exit code."""
-    # rclpy's own handlers would shut the context down in the middle of a tick.
-    end = EndRequest()
 
-    def spin(node: Node) -> int:
+    def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, SimRigNode)
         executor = executor_of(node)
         try:
@@ -370,7 +367,6 @@ def main() -> int:
         help_text=HELP,
         parameters=SimRigParameters,
         spin=spin,
-        signal_handlers=SignalHandlerOptions.NO,
     )
 
 

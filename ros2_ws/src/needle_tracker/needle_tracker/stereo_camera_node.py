@@ -15,10 +15,17 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
+from needle_common.base_node import (
+    LOOK_PERIOD,
+    STEADY_CLOCK,
+    DiagnosticsPublisher,
+    executor_of,
+    run_node,
+)
 from needle_common.cli import EXIT_DONE
 from needle_common.conversions import IMAGES, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
@@ -129,7 +136,7 @@ class StereoCameraNode(Node):
         self._source.close()
         for image, info in self._publishers_of.values():
             for publisher in (image, info):
-                if self.finished and self.context.ok():
+                if self.finished:
                     publisher.wait_for_all_acked(Duration(seconds=_LAST_IMAGES))
 
     def _tick(self) -> None:
@@ -221,17 +228,13 @@ def _image(pixels: GreyImage, info: CameraInfo) -> Image:
     return message
 
 
-def _spin(node: Node) -> int:
+def _spin(node: Node, end: EndRequest) -> int:
     if not isinstance(node, StereoCameraNode):
         raise UserError("not a stereo_camera")
     executor = executor_of(node)
     try:
-        while not node.finished:
-            executor.spin_once()
-    except RuntimeError:
-        # A signal ends the context also in the middle of a callback: rclpy then cannot publish.
-        if node.context.ok():
-            raise
+        while not (node.finished or end.wanted):
+            executor.spin_once(timeout_sec=LOOK_PERIOD)
     finally:
         node.close()
         executor.shutdown()
