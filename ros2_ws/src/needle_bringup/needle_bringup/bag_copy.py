@@ -12,6 +12,7 @@ from needle_bringup.bag_metadata import BagTopic, OfferedQos
 from needle_bringup.bag_writer import BagWriteError, BagWriter
 from needle_common.errors import UserError
 
+_STAMP_END = 12
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -22,7 +23,15 @@ def standard_topic(name: str, type_name: str) -> BagTopic:
 
 
 def stamp_of(data: bytes) -> int:
-    """Return the stamp [ns] of a message (CDR) that begins with a header."""
+    """Return the stamp [ns] of a message (CDR) that begins with a header.
+
+    Raises
+    ------
+    UserError
+        If it is too short for one.
+    """
+    if len(data) < _STAMP_END:
+        raise UserError(f"a message of {len(data)} bytes has no header with a stamp")
     order = "<" if data[1] & 1 else ">"
     sec, nanosec = struct.unpack_from(f"{order}iI", data, 4)
     return int(sec) * 10**9 + int(nanosec)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -14,6 +15,7 @@ from needle_bringup.bag_copy import stamp_of
 from needle_bringup.bag_files import read_messages
 from needle_bringup.bag_order import raw_as_sent
 from needle_bringup.bag_reader import Run, nanoseconds
+from needle_common.errors import UserError
 
 SIDES = ("left", "right")
 TOPICS = {
@@ -44,11 +46,32 @@ def plain_image(message: Any) -> Any:
     if not hasattr(message, "format"):
         return message
     encoded = np.frombuffer(message.data, np.uint8)
-    pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
+    try:
+        pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
+    except cv2.error:  # larger than OpenCV takes
+        pixels = None
     if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint8:
         return PlainImage(message.header, 0, 0, str(message.format), 0, np.empty(0, np.uint8))
     height, width = pixels.shape
     return PlainImage(message.header, height, width, "mono8", width, pixels.ravel())
+
+
+def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
+    """Return a mono image's pixels (H, W).
+
+    Raises
+    ------
+    UserError
+        If the message has more or fewer than it says; `path` names its bag.
+    """
+    size = (image.height, image.width)
+    if image.step < image.width or len(image.data) != image.height * image.step:
+        raise UserError(
+            f"{path}: an image says it has {size[0]} rows of {size[1]} pixels, and holds "
+            f"{len(image.data)} bytes"
+        )
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    return rows[:, : image.width]
 
 
 def exposures(run: Run) -> Stamps:
@@ -87,5 +110,4 @@ def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[
             continue
         image = plain_image(message)
         if image.encoding == "mono8":
-            rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
-            yield index, names[topic], rows[:, : image.width]
+            yield index, names[topic], pixels_of(image, run.path)

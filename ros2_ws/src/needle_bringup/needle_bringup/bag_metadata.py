@@ -9,8 +9,11 @@ from typing import Any, Final
 
 import yaml
 
+from needle_common.bag_directory import METADATA_FILE
+from needle_common.file_access import replace_file
+from needle_common.plain_yaml import load_plain
+
 METADATA_VERSION: Final = 9
-METADATA_FILE: Final = "metadata.yaml"
 # Name of the MCAP metadata records that rosbag2 writes.
 METADATA_RECORD: Final = "rosbag2"
 INFINITE_NS: Final = 2**63 - 1
@@ -103,6 +106,21 @@ class OfferedQos:
             liveliness=policy("liveliness", _LIVELINESSES),
             lease_duration=duration("liveliness_lease_duration"),
         )
+
+
+def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[OfferedQos, ...]:
+    """Return the profiles that metadata.yaml or an MCAP channel has; none if it has other things.
+
+    Parameters
+    ----------
+    profiles : sequence of mapping or str
+        As they are from version 9 on, or as YAML text.
+    """
+    try:
+        found = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
+        return tuple(OfferedQos.from_rosbag2(profile) for profile in found)
+    except (ValueError, TypeError, KeyError, IndexError):
+        return ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,22 +229,15 @@ def bag_information(
 
 
 def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
-    """Write metadata.yaml; one that exists is complete.
+    """Write metadata.yaml; one that exists is complete, and on the disk.
 
     Raises
     ------
     OSError
         If the disk refuses it.
     """
-    partial = directory / f"{METADATA_FILE}.tmp"
-    try:
-        partial.write_text(
-            to_yaml({"rosbag2_bagfile_information": dict(information)}), encoding="utf-8"
-        )
-        partial.replace(directory / METADATA_FILE)
-    except OSError:
-        partial.unlink(missing_ok=True)
-        raise
+    text = to_yaml({"rosbag2_bagfile_information": dict(information)})
+    replace_file(directory / METADATA_FILE, text.encode())
 
 
 def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:

@@ -10,10 +10,10 @@ from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-import yaml
 
 from needle_bringup.bag_files import BagContents, read_contents, read_messages
 from needle_common.errors import UserError
+from needle_common.plain_yaml import load_plain
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
@@ -378,8 +378,8 @@ def _parameters(text: str) -> dict[str, dict[str, Any]]:
 def _mapping(text: str) -> dict[str, Any]:
     """Return YAML or JSON text as a mapping; other text under the key `text`."""
     try:
-        value = json.loads(text) if text.lstrip().startswith("{") else yaml.safe_load(text)
-    except (ValueError, yaml.YAMLError):
+        value = json.loads(text) if text.lstrip().startswith("{") else load_plain(text)
+    except ValueError:
         value = text
     if value is None:
         return {}

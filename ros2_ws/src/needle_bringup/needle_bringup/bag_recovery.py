@@ -11,9 +11,7 @@ from typing import Any, Final
 import yaml
 from mcap.records import Channel
 
-from needle_bringup.bag_files import is_being_recorded
 from needle_bringup.bag_metadata import (
-    METADATA_FILE,
     METADATA_RECORD,
     BagTopic,
     DataFile,
@@ -24,6 +22,7 @@ from needle_bringup.bag_metadata import (
 from needle_bringup.bag_writer import DISTRO_KEY, LIBRARY
 from needle_bringup.mcap_repair import FileRecovery, repair, scan_file
 from needle_bringup.mcap_scan import McapScan, NotMcapError
+from needle_common.bag_directory import METADATA_FILE, is_being_recorded
 from needle_common.errors import UserError
 
 # Keys of `custom_data`, and of the records that the recorder leaves in the data for it.

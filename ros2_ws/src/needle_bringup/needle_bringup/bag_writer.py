@@ -11,7 +11,6 @@ from typing import IO, Final
 from mcap.writer import CompressionType, Writer
 
 from needle_bringup.bag_metadata import (
-    METADATA_FILE,
     METADATA_RECORD,
     BagTopic,
     DataFile,
@@ -20,6 +19,7 @@ from needle_bringup.bag_metadata import (
     write_metadata,
 )
 from needle_bringup.mcap_repair import NO_ROOM, give_back_chunk, repair, scan_file
+from needle_common.bag_directory import METADATA_FILE
 from needle_common.errors import UserError
 
 LIBRARY: Final = "needle_bringup"

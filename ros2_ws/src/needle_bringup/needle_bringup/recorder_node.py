@@ -18,7 +18,6 @@ from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
 from needle_bringup.allocator import keep_freed_memory
-from needle_bringup.bag_files import recover_hint
 from needle_bringup.bag_metadata import BagTopic
 from needle_bringup.graph_topics_node import GraphTopics
 from needle_bringup.not_understood import NotUnderstood
@@ -27,6 +26,7 @@ from needle_bringup.provenance import commit, distribution, versions
 from needle_bringup.recorder_health import RecorderHealth
 from needle_bringup.recorder_parameters import PARAMETERS_OF, RecorderParameters
 from needle_bringup.recording import Received, Recording
+from needle_common.bag_directory import recover_hint
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level

@@ -10,14 +10,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-import numpy.typing as npt
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bringup.bag_copy import BagCopy, stamp_of, standard_topic
 from needle_bringup.bag_files import read_contents
 from needle_bringup.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bringup.bag_images import plain_image
+from needle_bringup.bag_images import pixels_of, plain_image
 from needle_bringup.bag_order import SentMessage, raw_as_sent
 from needle_bringup.bag_reader import Run, read_run
 from needle_common.cli import EXIT_DONE, run_command
@@ -82,7 +81,7 @@ def write_small_bag(source: Path, target: Path) -> None:
             topic = contents.topics[message.topic]
             copy.put(topic, message.data, message.log_time, message.time)
         elif stamp_of(message.data) in chosen:
-            _put_image(copy, message)
+            _put_image(copy, message, source)
     copy.close()
 
 
@@ -95,10 +94,12 @@ def _exposures(run: Run) -> set[int]:
     return {int(stamps[np.nanargmin(np.abs(depth - wanted))]) for wanted in DEPTHS}
 
 
-def _put_image(copy: BagCopy, message: SentMessage) -> None:
+def _put_image(copy: BagCopy, message: SentMessage, source: Path) -> None:
     image = plain_image(_STORE.deserialize_cdr(message.data, message.type_name))
-    rows: npt.NDArray[np.uint8] = np.reshape(image.data, (image.height, image.step))
-    _, encoded = cv2.imencode(".jpg", rows[:, : image.width], [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    pixels = pixels_of(image, source)
+    if not pixels.size:
+        return
+    _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     content: Any = _STORE.types[_COMPRESSED](
         header=image.header, format="mono8; jpeg compressed mono8", data=encoded.ravel()
     )

@@ -158,31 +158,25 @@ def read_bag(path: Path) -> InsertionRecord:
     are left out.
     """
     # Here, for reading a CSV does without.
-    from rosbags.highlevel import AnyReader, AnyReaderError  # noqa: PLC0415
-    from rosbags.rosbag2 import ReaderError  # noqa: PLC0415
-    from rosbags.typesys import Stores, get_typestore  # noqa: PLC0415
+    from needle_common.bag_directory import BagDirectory  # noqa: PLC0415
 
-    if not (path / "metadata.yaml").is_file():
-        raise UserError(f"{path} is not a bag: it has no metadata.yaml")
     tips: dict[int, list[float]] = {}
     joints: dict[int, list[float]] = {}
-    try:
-        with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-            wanted = {
-                c.topic: "/" + c.topic.lstrip("/")
-                for c in reader.connections
-                if ("/" + c.topic.lstrip("/")).endswith(("/needle/tip", "/joint_states"))
-            }
-            connections = [c for c in reader.connections if c.topic in wanted]
-            for connection, _, data in reader.messages(connections=connections):
-                message = reader.deserialize(data, connection.msgtype)
-                if wanted[connection.topic].endswith("/needle/tip"):
+
+    def is_wanted(topic: str) -> bool:
+        return ("/" + topic.lstrip("/")).endswith(("/needle/tip", "/joint_states"))
+
+    with BagDirectory(path) as bag:
+        store = bag.typestore()
+        for sent in bag.messages(is_wanted):
+            message = bag.deserialize(store, sent)
+            try:
+                if sent.topic.endswith("needle/tip"):
                     _take_tip(path, message, tips)
                 else:
                     _take_joints(message, joints)
-    except (AnyReaderError, ReaderError, OSError, ValueError, AttributeError, KeyError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
-        raise UserError(f"{path}: the bag cannot be read: {first}") from error
+            except AttributeError as error:
+                raise UserError(f"{path}: {sent.topic} is of another type: {error}") from error
     for topic, found in (("needle/tip", tips), ("joint_states", joints)):
         if not found:
             raise UserError(f"{path}: the bag holds nothing on {topic}")
