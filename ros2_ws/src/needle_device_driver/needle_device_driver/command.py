@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from needle_common.foreign_text import plain_list
 from needle_device_driver.limits import SafetyLimits
 from needle_device_driver.rules import Rule
 
@@ -63,8 +64,8 @@ class CommandContext:
         Where the joints were last told to be, and a motion begins [m], [rad].
     homed : bool
         Whether both axes are homed.
-    last_stamp_ns : int or None
-        Stamp of the last command that was accepted.
+    not_new : str
+        Why the command's stamp is no new one; empty: it is.
     tip_age : float or None
         Steady age of the command's stamp [s]; None: from the future.
     publishers : int
@@ -74,7 +75,7 @@ class CommandContext:
     insertion: float
     rotation: float
     homed: bool
-    last_stamp_ns: int | None
+    not_new: str
     tip_age: float | None
     publishers: int
 
@@ -131,11 +132,11 @@ def check_command(
 
 
 def _check_form(command: Command) -> Refusal | None:
-    names = sorted(command.joint_names)
-    if names != [INSERTION_JOINT, ROTATION_JOINT]:
+    names = command.joint_names
+    if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
         return Refusal(
             Rule.COMMAND_FORM,
-            f"joints {', '.join(names) or 'none'}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
+            f"joints {plain_list(names)}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
         )
     if len(command.points) != 1:
         return Refusal(Rule.COMMAND_FORM, f"{len(command.points)} points, wanted 1")
@@ -152,11 +153,8 @@ def _check_form(command: Command) -> Refusal | None:
 
 
 def _check_time(command: Command, context: CommandContext, limits: SafetyLimits) -> Refusal | None:
-    if context.last_stamp_ns is not None and command.stamp_ns <= context.last_stamp_ns:
-        return Refusal(
-            Rule.COMMAND_NEWER,
-            f"stamp {command.stamp_ns} ns is not newer than the last, {context.last_stamp_ns} ns",
-        )
+    if context.not_new:
+        return Refusal(Rule.COMMAND_NEWER, context.not_new)
     if context.tip_age is None:
         return Refusal(Rule.TIP_AGE, f"stamp {command.stamp_ns} ns is from the future")
     if context.tip_age > limits.tip_age_limit:

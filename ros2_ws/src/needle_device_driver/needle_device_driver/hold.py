@@ -5,9 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 
+from needle_common.foreign_text import plain
 from needle_device_driver.rules import Rule
 
 MAX_SENDERS = 16
+LONGEST_NAME = 64
+
+# So much may a press's way here be quicker than that of the release before it [ns].
+_JITTER_NS = 20_000_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,9 +39,14 @@ class HoldMessage:
 
 @dataclasses.dataclass
 class _Sender:
+    # A press must be above it.
     stamp_ns: int
     pressed: bool
     arrival: float
+    # Whether a release came since the last press.
+    armed: bool
+    # Time from stamp to arrival of a release that was stamped before a reset [ns].
+    delay_ns: int | None = None
 
 
 class Hold:
@@ -54,6 +64,8 @@ class Hold:
         self._owner: str | None = None
         self._speed_scale = 0.0
         self._lapsed = False
+        self._spent_ns: int | None = None
+        self._strangers_armed = True
 
     @property
     def owner(self) -> str | None:
@@ -104,25 +116,30 @@ class Hold:
         pressed = message.pressed and 0.0 <= scale <= 1.0
         sender = self._senders.get(message.sender)
         if sender is None:
-            if len(self._senders) >= MAX_SENDERS:
+            if len(self._senders) >= MAX_SENDERS or len(message.sender) > LONGEST_NAME:
                 return Rule.HOLD_ONE_OWNER
-            sender = _Sender(stamp_ns=message.stamp_ns, pressed=False, arrival=now)
-            self._senders[message.sender] = sender
-        elif pressed and message.stamp_ns <= sender.stamp_ns:
+            sender = self._senders[message.sender] = _Sender(
+                stamp_ns=message.stamp_ns - 1,
+                pressed=False,
+                arrival=now,
+                armed=self._strangers_armed and not self._is_spent(message.stamp_ns),
+            )
+        if pressed and not self._is_new(sender, message.stamp_ns, now):
             return Rule.HOLD_STAMP_INCREASES
-        was_pressed = sender.pressed
-        sender.stamp_ns = max(sender.stamp_ns, message.stamp_ns)
         sender.pressed = pressed
         sender.arrival = now
         if not pressed:
+            self._take_release(sender, message.stamp_ns, now)
             if self._owner == message.sender:
                 self._owner = None
             return Rule.SPEED_SCALE if message.pressed else None
+        sender.stamp_ns = message.stamp_ns
+        armed, sender.armed = sender.armed, False
         if self._owner == message.sender:
             self._speed_scale = scale
             self._lapsed = False
             return None
-        if was_pressed or not counting:
+        if not armed or not counting:
             return Rule.HOLD_NEW_PRESS
         if self._owner is not None:
             return Rule.HOLD_ONE_OWNER
@@ -141,3 +158,82 @@ class Hold:
     def require_new_press(self) -> None:
         """Take the hold from its owner; who presses now must release first to count again."""
         self._owner = None
+
+    def knows(self, sender: str) -> bool:
+        """Return whether a sender is among those whose hold may count."""
+        return sender in self._senders
+
+    def readmit(self, now: float) -> None:
+        """Let in who was shut out, as a person at the rig wants it; nobody's press counts then.
+
+        Who is silent is forgotten, and a release may bear a lower stamp than was heard before. What
+        was stamped before must not let anything move, though it comes late or twice: a press after
+        such a release counts only if it was as long on its way, which nothing in a burst is, and
+        nothing that follows an older one.
+
+        Parameters
+        ----------
+        now : float
+            Steady time [s].
+        """
+        self.require_new_press()
+        for name, sender in tuple(self._senders.items()):
+            if not self._is_spent(sender.stamp_ns):
+                self._spent_ns = sender.stamp_ns
+            if now - sender.arrival > self._timeout:
+                del self._senders[name]
+                # One that was cut off while it pressed may come back, still pressing.
+                self._strangers_armed = self._strangers_armed and sender.armed
+
+    def _is_spent(self, stamp_ns: int) -> bool:
+        """Return whether a stamp is none above all that were heard before the last reset."""
+        return self._spent_ns is not None and stamp_ns <= self._spent_ns
+
+    def _is_new(self, sender: _Sender, stamp_ns: int, now: float) -> bool:
+        """Return whether a press comes after what was heard, and in its time."""
+        if stamp_ns <= sender.stamp_ns:
+            sender.armed = False
+            return False
+        least = sender.delay_ns
+        return least is None or _delay_ns(stamp_ns, now) >= least - _JITTER_NS
+
+    def _take_release(self, sender: _Sender, stamp_ns: int, now: float) -> None:
+        if self._is_spent(stamp_ns):
+            delay, least = _delay_ns(stamp_ns, now), sender.delay_ns
+            goes_on = least is not None and stamp_ns > sender.stamp_ns
+            sender.delay_ns = min(delay, least) if least is not None and goes_on else delay
+        elif stamp_ns > sender.stamp_ns:
+            sender.delay_ns = None
+        else:
+            # It ends a hold like any other, but what follows it is no new press.
+            return
+        sender.stamp_ns = stamp_ns
+        sender.armed = True
+
+
+class HoldRefusals:
+    """What there is to say of holds that do not count: each thing once, until it changes."""
+
+    def __init__(self) -> None:
+        # Those whose name is not known share one entry.
+        self._rules: dict[str | None, Rule | None] = {}
+
+    def clear(self) -> None:
+        """Begin anew: everything is worth saying again."""
+        self._rules.clear()
+
+    def take(self, sender: str, rule: Rule | None, *, known: bool) -> str:
+        """Take what became of a message, and return what there is to say; empty: nothing."""
+        key = sender if known else None
+        if rule is self._rules.get(key):
+            return ""
+        self._rules[key] = rule
+        if rule is None:
+            return ""
+        lasting = rule is Rule.HOLD_STAMP_INCREASES or not known
+        way_out = "; device/reset ends this" if lasting else ""
+        return f"hold of '{plain(sender)}' does not count ({rule.value}){way_out}"
+
+
+def _delay_ns(stamp_ns: int, arrival: float) -> int:
+    return round(arrival * 1e9) - stamp_ns

@@ -6,7 +6,7 @@ import bisect
 import math
 
 # A sender's clock may be ahead of what was noted here by its latency, not by more [ns].
-_AHEAD_NS = 100_000_000
+AHEAD_NS = 100_000_000
 
 
 class StampAges:
@@ -25,6 +25,11 @@ class StampAges:
         self._horizon = horizon
         self._ros_ns: list[int] = []
         self._last_seen: list[float] = []
+
+    @property
+    def newest_ns(self) -> int | None:
+        """The ROS time that was noted last [ns]; None: none yet."""
+        return self._ros_ns[-1] if self._ros_ns else None
 
     def note(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] at steady time `now` [s]."""
@@ -51,7 +56,7 @@ class StampAges:
         float or None
             Infinite for a stamp not newer than the first note; None for one from the future.
         """
-        if not self._ros_ns or stamp_ns > self._ros_ns[-1] + _AHEAD_NS:
+        if not self._ros_ns or stamp_ns > self._ros_ns[-1] + AHEAD_NS:
             return None
         after = bisect.bisect_left(self._ros_ns, stamp_ns)
         # The stamp became current at the earliest when the note before it was last seen.

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from needle_common.foreign_text import plain
 from needle_device_driver.axis import Axis, AxisError
 from needle_device_driver.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.command import Command, CommandContext, Refusal, check_command
+from needle_device_driver.command_stamps import CommandStamps
 from needle_device_driver.device_core import DeviceCore
-from needle_device_driver.hold import Hold, HoldMessage
+from needle_device_driver.hold import Hold, HoldMessage, HoldRefusals
 from needle_device_driver.limits import SafetyLimits
 from needle_device_driver.reports import DeviceStatus, Event, JointSample, Reply
 from needle_device_driver.rules import Rule
-from needle_device_driver.stamp_ages import StampAges
 from needle_device_driver.states import Activity, State, Trigger
 from needle_device_driver.watch import axes_problem
 
@@ -56,12 +57,11 @@ class MotionSupervisor:
         self._limits = limits
         self._pause_on_lapse = pause_on_lapse
         self._hold = Hold(limits.hold_timeout)
-        self._hold_refusals: dict[str, Rule | None] = {}
-        self._ages = StampAges(2.0 * limits.tip_age_limit)
+        self._hold_refusals = HoldRefusals()
+        self._stamps = CommandStamps(2.0 * limits.tip_age_limit)
         self._estop_pressed = False
         self._needle_out = False
         self._others = ""
-        self._last_stamp_ns: int | None = None
         self._commands_refused = 0
         self._core = DeviceCore(
             self._axes,
@@ -115,7 +115,7 @@ class MotionSupervisor:
             state=self._core.state,
             activity=self._core.activity,
             homed=self._core.snapshot is not None and self._core.snapshot.homed,
-            hold_owner=self._hold.owner or "",
+            hold_owner=plain(self._hold.owner or ""),
             speed_scale=self._hold.speed_scale,
             insertion=None if joints is None else joints.insertion,
             rotation=None if joints is None else joints.rotation,
@@ -164,7 +164,7 @@ class MotionSupervisor:
 
     def note_time(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
-        self._ages.note(ros_ns, now)
+        self._stamps.note(ros_ns, now)
 
     def receive_hold(self, message: HoldMessage, now: float) -> None:
         """Take a hold message that arrived now."""
@@ -172,11 +172,12 @@ class MotionSupervisor:
         self._watch_hold(now)
         counting = self._core.state in (State.HOLDING, State.MOVING)
         rule = self._hold.receive(message, now, counting=counting)
-        if rule is not self._hold_refusals.get(message.sender):
-            self._hold_refusals[message.sender] = rule
-            if rule is not None and counting:
-                self._core.reason = f"hold of '{message.sender}' does not count ({rule.value})"
-                self._core.notice(self._core.reason, rule)
+        text = self._hold_refusals.take(
+            message.sender, rule, known=self._hold.knows(message.sender)
+        )
+        if text and counting:
+            self._core.reason = text
+            self._core.notice(text, rule)
         if self._core.moves_with_hold and self._hold.owner is None:
             self._core.abort("hold released")
 
@@ -221,8 +222,8 @@ class MotionSupervisor:
             insertion=at.insertion.set_point,
             rotation=at.rotation.set_point,
             homed=at.homed,
-            last_stamp_ns=self._last_stamp_ns,
-            tip_age=self._ages.age(command.stamp_ns, now),
+            not_new=self._stamps.why_not_new(command.stamp_ns),
+            tip_age=self._stamps.age(command.stamp_ns, now),
             publishers=publishers,
         )
         step = check_command(command, context, self._limits)
@@ -230,7 +231,8 @@ class MotionSupervisor:
             self._refuse(command, step)
             return
         self._needle_out = False
-        self._last_stamp_ns = self._core.step_stamp_ns = command.stamp_ns
+        self._stamps.use(command.stamp_ns)
+        self._core.step_stamp_ns = command.stamp_ns
         self._core.start(Activity.STEP, (step.insertion, step.rotation), step.duration)
 
     def count_watchdog_trip(self) -> None:
@@ -312,10 +314,12 @@ class MotionSupervisor:
         return Reply(True, f"{activity} stopped")
 
     def reset(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
-        """Leave FAULT or ESTOPPED; moves nothing and enables nothing."""
+        """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
         if self._core.state is State.MOVING:
             return Reply(False, f"a {self._core.activity.value} is under way")
-        self._hold.require_new_press()
+        self._hold.readmit(now)
+        self._hold_refusals.clear()
+        self._stamps.readmit()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
             return Reply(True, "nothing to reset")
         if self._others:

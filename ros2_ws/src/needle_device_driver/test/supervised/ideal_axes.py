@@ -128,9 +128,13 @@ class Bench:
         return [event for event in self.events if isinstance(event, StepResult)]
 
     @property
-    def last_rule(self) -> Rule | None:
+    def notices(self) -> list[Notice]:
         self._collect()
-        notices = [event for event in self.events if isinstance(event, Notice)]
+        return [event for event in self.events if isinstance(event, Notice)]
+
+    @property
+    def last_rule(self) -> Rule | None:
+        notices = self.notices
         return notices[-1].rule if notices else None
 
     @property
