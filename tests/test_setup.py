@@ -294,6 +294,21 @@ def test_what_is_linked_needs_no_build(workspace: Workspace, commands: Commands)
     assert commands.names == []
 
 
+def test_a_file_that_is_gone_from_the_sources_does_not_break_the_build(
+    workspace: Workspace, commands: Commands
+) -> None:
+    package = workspace.WORKSPACE / "src" / "needle_one"
+    (package / "config" / "rig.yaml").write_text("a: 1")
+    link = workspace.WORKSPACE / "build" / "needle_one" / "config" / "rig.yaml"
+    link.parent.mkdir(parents=True)
+    link.symlink_to(package / "config" / "rig.yaml")
+    workspace.main()
+    assert link.exists()
+    (package / "config" / "rig.yaml").unlink()
+    assert workspace.main() == 0
+    assert not link.is_symlink()
+
+
 @pytest.mark.parametrize(("stage", "again"), [("pip", FIRST), ("import", FIRST), ("colcon", BUILD)])
 def test_the_next_set_up_repairs_an_interrupted_one(
     workspace: Workspace, commands: Commands, stage: str, again: list[str]

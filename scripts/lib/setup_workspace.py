@@ -403,6 +403,10 @@ def build(mode: str, lock: int) -> None:
         for path in folder.glob("*/"):
             if path.name not in names:
                 shutil.rmtree(path, ignore_errors=True)
+    # A link to a file that is gone from the sources would fail the build.
+    for path in (WORKSPACE / "build").glob("*/*/*"):
+        if path.is_symlink() and not path.exists():
+            path.unlink()
     # Run by the environment's Python, so that the executables get it as their interpreter.
     command: list[str | Path] = [VENV_PYTHON, "-c", COLCON, "--log-base", "log"]
     try:

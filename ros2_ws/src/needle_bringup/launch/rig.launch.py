@@ -13,14 +13,13 @@ from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import LaunchConfigurationNotEquals
 from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch_ros.actions import Node, SetParametersFromFile
 
 from launch import LaunchDescription
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return the graph beside a rig."""
-    rig = str(Path(get_package_share_directory("needle_bringup")) / "config" / "rig.yaml")
     calibration = str(
         Path(get_package_share_directory("needle_tracker")) / "config" / "calibration.yaml"
     )
@@ -33,8 +32,9 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
             DeclareLaunchArgument(
-                "params", default_value=rig, description="parameter file on top of rig.yaml"
+                "params", default_value="", description="parameter file for any node; empty: none"
             ),
+            SetParametersFromFile(params, condition=LaunchConfigurationNotEquals("params", "")),
             DeclareLaunchArgument(
                 "drives", default_value="", description="the drives' parameter file; empty: none"
             ),
@@ -48,19 +48,18 @@ def generate_launch_description() -> LaunchDescription:
             Node(
                 package="needle_bringup",
                 executable="recorder",
-                parameters=[rig, params, calibration_file, {"bag": LaunchConfiguration("bag")}],
+                parameters=[calibration_file, {"bag": LaunchConfiguration("bag")}],
                 condition=LaunchConfigurationNotEquals("bag", ""),
             ),
             Node(
                 package="needle_tracker",
                 executable="stereo_tracker",
-                parameters=[rig, params, calibration_file],
+                parameters=[calibration_file],
                 output="screen",
             ),
             Node(
                 package="needle_controller",
                 executable="plane_controller",
-                parameters=[rig, params],
                 output="screen",
             ),
         ]

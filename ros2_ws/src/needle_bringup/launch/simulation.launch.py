@@ -5,15 +5,12 @@
 `scripts/simulate` does the same without `launch`, and reports.
 """
 
-from pathlib import Path
-
-from ament_index_python.packages import get_package_share_directory
 from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
 from launch.conditions import IfCondition, LaunchConfigurationEquals, LaunchConfigurationNotEquals
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration, PythonExpression
-from launch_ros.actions import Node
+from launch_ros.actions import Node, SetParametersFromFile
 from launch_ros.parameter_descriptions import ParameterValue
 
 from launch import LaunchDescription
@@ -21,14 +18,13 @@ from launch import LaunchDescription
 
 def generate_launch_description() -> LaunchDescription:
     """Return the graph of a simulated run."""
-    rig = str(Path(get_package_share_directory("needle_bringup")) / "config" / "rig.yaml")
     params = LaunchConfiguration("params")
     sim_time = {"use_sim_time": True}
     with_drives = LaunchConfigurationEquals("level", "drive")
     operator = Node(
         package="needle_bringup",
         executable="operator",
-        parameters=[rig, params, sim_time],
+        parameters=[sim_time],
         output="screen",
         condition=IfCondition(LaunchConfiguration("operator")),
     )
@@ -54,20 +50,19 @@ def generate_launch_description() -> LaunchDescription:
                 description="level drive: where the emulated CAN adapter appears",
             ),
             DeclareLaunchArgument(
-                "params", default_value=rig, description="parameter file on top of rig.yaml"
+                "params", default_value="", description="parameter file for any node; empty: none"
             ),
+            SetParametersFromFile(params, condition=LaunchConfigurationNotEquals("params", "")),
             Node(
                 package="needle_bringup",
                 executable="recorder",
-                parameters=[rig, params, {"bag": LaunchConfiguration("bag")}],
+                parameters=[{"bag": LaunchConfiguration("bag")}],
                 condition=LaunchConfigurationNotEquals("bag", ""),
             ),
             Node(
                 package="needle_sim",
                 executable="sim_rig",
                 parameters=[
-                    rig,
-                    params,
                     sim_time,
                     {
                         "level": LaunchConfiguration("level"),
@@ -82,7 +77,7 @@ def generate_launch_description() -> LaunchDescription:
             Node(
                 package="needle_tracker",
                 executable="stereo_tracker",
-                parameters=[rig, params, sim_time],
+                parameters=[sim_time],
                 output="screen",
                 condition=LaunchConfigurationNotEquals("level", "tip"),
             ),
@@ -90,8 +85,6 @@ def generate_launch_description() -> LaunchDescription:
                 package="needle_sim",
                 executable="drive_emulator",
                 parameters=[
-                    rig,
-                    params,
                     sim_time,
                     {"pty": LaunchConfiguration("can"), "motion_clock": "sync"},
                 ],
@@ -102,8 +95,6 @@ def generate_launch_description() -> LaunchDescription:
                 package="needle_device_driver",
                 executable="device_driver",
                 parameters=[
-                    rig,
-                    params,
                     sim_time,
                     {
                         "link": "slcan",
@@ -120,7 +111,7 @@ def generate_launch_description() -> LaunchDescription:
             Node(
                 package="needle_controller",
                 executable="plane_controller",
-                parameters=[rig, params, sim_time, {"preset": LaunchConfiguration("controller")}],
+                parameters=[sim_time, {"preset": LaunchConfiguration("controller")}],
                 output="screen",
             ),
             operator,

@@ -12,11 +12,9 @@ from typing import Any
 
 import yaml
 
-from needle_bringup.installed import find_shared
 from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 
-RIG_FILE = "config/rig.yaml"
 # Node -> its package, in the order in which they start.
 PACKAGES = {
     "recorder": "needle_bringup",
@@ -111,11 +109,6 @@ def merge(*layers: Parameters) -> Parameters:
 def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
     """Return the nodes that a run needs."""
     return tuple(node for node in NODES if options.level in _LEVELS.get(node, (options.level,)))
-
-
-def rig_parameters() -> Parameters:
-    """Return the rig's own configuration, config/rig.yaml."""
-    return read_parameters(find_shared("needle_bringup", RIG_FILE))
 
 
 def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:

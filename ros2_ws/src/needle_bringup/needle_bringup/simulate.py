@@ -25,7 +25,6 @@ from needle_bringup.rig_configuration import (
     nodes_of,
     read_parameters,
     refuse_reserved,
-    rig_parameters,
     write_parameters,
 )
 from needle_bringup.simulate_options import SimulateOptions, parse
@@ -143,7 +142,7 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
         refuse_reserved(options.params, given, options)
     executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     bag = _make_folder(options)
-    parameters = merge(rig_parameters(), command_line_parameters(options, bag), given)
+    parameters = merge(command_line_parameters(options, bag), given)
     parameters["recorder"].setdefault(
         "calibration_file",
         parameters["sim_rig"].get("calibration_file")

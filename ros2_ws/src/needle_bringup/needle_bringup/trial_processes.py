@@ -13,9 +13,7 @@ from needle_bringup.rig_configuration import (
     PACKAGES,
     can_adapter,
     command_line_parameters,
-    merge,
     nodes_of,
-    rig_parameters,
     write_parameters,
 )
 from needle_bringup.simulate_options import SimulateOptions
@@ -131,7 +129,7 @@ def graph_in_real_time(seed: int) -> Parameters:
         Of the simulation.
     """
     options = SimulateOptions(level="drive", real_time_factor=1.0, seed=seed)
-    parameters = merge(rig_parameters(), command_line_parameters(options, Path()))
+    parameters = command_line_parameters(options, Path())
     for values in parameters.values():
         values.pop("wait_for_recorder", None)
     return {node: parameters[node] for node in nodes_of(options) if node != "recorder"}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bringup.drive_hand_node import DriveHand
-from needle_bringup.rig_configuration import command_line_parameters, merge, rig_parameters
+from needle_bringup.rig_configuration import command_line_parameters
 from needle_bringup.simulate_options import SimulateOptions
 from needle_bringup.trial_processes import Parameters, TrialProcesses, drives_and_driver
 from needle_common.cli import EXIT_BAD_INPUT
@@ -87,7 +87,7 @@ def _way(positions: list[float]) -> float:
 
 def _parameters() -> Parameters:
     options = SimulateOptions(level="tip", depth_mm=_DEPTH_MM)
-    parameters = merge(rig_parameters(), command_line_parameters(options, Path()))
+    parameters = command_line_parameters(options, Path())
     for values in parameters.values():
         values.pop("wait_for_recorder", None)
     simulation = {name: parameters[name] for name in STARTED if name != "device_driver"}

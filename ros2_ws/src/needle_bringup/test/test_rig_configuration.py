@@ -10,11 +10,11 @@ from needle_bringup.rig_configuration import (
     nodes_of,
     read_parameters,
     refuse_reserved,
-    rig_parameters,
     write_parameters,
 )
 from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
+from needle_controller.parameters import PlaneControllerParameters
 
 
 def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
@@ -50,10 +50,6 @@ def test_a_written_file_reads_back(tmp_path: Path) -> None:
     parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
     write_parameters(tmp_path / "p.yaml", parameters)
     assert read_parameters(tmp_path / "p.yaml") == parameters
-
-
-def test_the_rig_file_names_known_nodes() -> None:
-    assert rig_parameters()
 
 
 @pytest.mark.parametrize(
@@ -102,5 +98,25 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
     assert exact["plane_controller"]["tip_noise_bound"] > 0.0
     camera = command_line_parameters(SimulateOptions(), Path("bag"))
     assert "tip_noise" not in camera["plane_controller"]
-    assert rig_parameters()["plane_controller"]["tip_noise"] == "normal"
-    assert rig_parameters()["plane_controller"]["tip_covariance"] == "from_tip_pose"
+
+
+def test_by_hand_is_the_rig_that_simulate_runs() -> None:
+    # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
+    # time, recording and the emulated adapter: nothing of it describes the rig.
+    set_by_simulate = command_line_parameters(SimulateOptions(level="drive"), Path("bag"))
+    of_run = {
+        "use_sim_time",
+        "wait_for_recorder",
+        "level",
+        "seed",
+        "real_time_factor",
+        "preset",
+    }
+    of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
+    told = {node: set(values) - of_run for node, values in set_by_simulate.items()}
+    assert told["sim_rig"] == of_needle
+    assert told["plane_controller"] == {"depth", "target_offset"}
+    assert told["stereo_tracker"] == set()
+    defaults = PlaneControllerParameters()
+    assert defaults.tip_covariance == "from_tip_pose"
+    assert SimulateOptions().depth_mm == pytest.approx(defaults.depth * 1e3)

@@ -95,11 +95,11 @@ class PlaneControllerParameters:
         upper=60.0,
     )
     tip_covariance: str = parameter(
-        "configured",
+        "from_tip_pose",
         unit="-",
-        description="configured = every tip has the noise of tip_noise; from_tip_pose = a tip has "
-        "the covariance of the needle/tip_pose with its stamp plus measurement_std squared, and is "
-        "refused without one.",
+        description="from_tip_pose = a tip has the covariance of the needle/tip_pose with its "
+        "stamp plus measurement_std squared, and is refused without one; configured = every tip "
+        "has the noise of tip_noise: for a source of needle/tip alone.",
         choices=TIP_COVARIANCES,
     )
     result_timeout: float = parameter(
@@ -131,7 +131,7 @@ class PlaneControllerParameters:
         upper=0.01,
     )
     tip_noise: str = parameter(
-        ControlSettings.tip_noise,
+        "normal",
         unit="-",
         description="Where tip_covariance is configured: a coordinate is off by up to "
         "tip_noise_bound (bounded, used as such by best), or "
@@ -179,7 +179,7 @@ class PlaneControllerParameters:
         lower=0.0,
     )
     measurement_std: float = parameter(
-        ControlSettings.measurement_std,
+        1e-4,
         unit="m",
         description="Standard deviation of one measured tip coordinate; with tip_covariance "
         "from_tip_pose of what its covariance leaves out.",

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import default_rng
 
 from needle_controller.arrays import Array
+from needle_controller.control_settings import ControlSettings
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.luenberger import LuenbergerObserver
 from needle_controller.parameters import PlaneControllerParameters
@@ -23,7 +24,9 @@ def endpoint_grid() -> Array:
 
 
 def final_x(preset: str, seed: int) -> Array:
-    parameters = PlaneControllerParameters(preset=preset)
+    parameters = PlaneControllerParameters(
+        preset=preset, measurement_std=ControlSettings.measurement_std
+    )
     settings = parameters.control()
     gains = settings.gains()
     law = make_law(settings, gains)

@@ -8,6 +8,7 @@ import pytest
 from numpy.random import default_rng
 
 from needle_controller.arrays import Array
+from needle_controller.control_settings import ControlSettings
 from needle_controller.feedback_linearization import rotation_rate
 from needle_controller.kinematics import rotation_from_angles
 from needle_controller.law import LinearizingLaw, OpenLoopLaw
@@ -16,7 +17,7 @@ from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.presets import make_law, observer_settings
 from needle_sim.plant import NeedlePlant
 
-PARAMETERS = PlaneControllerParameters()
+PARAMETERS = PlaneControllerParameters(measurement_std=ControlSettings.measurement_std)
 CURVATURE = PARAMETERS.curvature
 STEP = 0.001
 

@@ -163,7 +163,10 @@ def test_a_flip_turns_the_bevel_over_and_holds_the_plane(preset: str) -> None:
         ({"state_weights": tuple(range(9))}, "state_weights.*three numbers"),
         ({"process_noise": (1.0, 1.0)}, "process_noise.*three numbers"),
         ({"tip_covariance": "none"}, "'none'"),
-        ({"preset": "measured_pitch"}, "wants tip_covariance from_tip_pose"),
+        (
+            {"preset": "measured_pitch", "tip_covariance": "configured"},
+            "wants tip_covariance from_tip_pose",
+        ),
     ],
 )
 def test_a_bad_whole_is_refused_with_what_and_why(changes: dict[str, Any], said: str) -> None:

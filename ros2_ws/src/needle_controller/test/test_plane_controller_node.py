@@ -56,9 +56,11 @@ class Bench:
     """The node under test, a scripted device and a scripted tracker, on one executor."""
 
     def __init__(self, context: Context, **parameters: Any) -> None:
+        # most tests send tips alone
+        given = {"tip_covariance": "configured", **parameters}
         self.node = PlaneControllerNode(
             context=context,
-            parameter_overrides=[Parameter(name, value=v) for name, v in parameters.items()],
+            parameter_overrides=[Parameter(name, value=v) for name, v in given.items()],
         )
         self.outside = outside = Node("outside", context=context)
         self._executor = SingleThreadedExecutor(context=context)
