@@ -17,7 +17,7 @@ from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup import verify_rerun
+from needle_bringup import verify_rerun, verify_signals
 from needle_bringup.recording_trials import (
     FullRate,
     Killed,
@@ -246,4 +246,11 @@ def _witness(domain: int, bag: Path) -> subprocess.Popen[bytes]:
     )
 
 
-CHECKS: tuple[Check, ...] = (full_rate, killed, disk_full, bag_format, *verify_rerun.CHECKS)
+CHECKS: tuple[Check, ...] = (
+    full_rate,
+    killed,
+    disk_full,
+    bag_format,
+    *verify_rerun.CHECKS,
+    *verify_signals.CHECKS,
+)
