@@ -10,6 +10,7 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from needle_bringup.bag_metadata import BagTopic
@@ -153,6 +154,9 @@ class GraphTopics:
         if topic.subscription is not None and not offers:
             return
         qos = strictest_request(offers, IMAGE_DEPTH if topic.type_name in IMAGE_TYPES else DEPTH)
+        if not offers and self._is_taken_best_effort(topic.name):
+            # More would be more than the publisher that is still to come is likely to offer.
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
         before = topic.subscription
         if before is not None:
             now = before.qos_profile
@@ -173,6 +177,12 @@ class GraphTopics:
         )
         if before is not None:
             self._node.destroy_subscription(before)
+
+    def _is_taken_best_effort(self, name: str) -> bool:
+        return any(
+            info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+            for info in self._node.get_subscriptions_info_by_topic(name)
+        )
 
     def _take_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         """Take a message and those that wait behind it: a turn costs more than they."""

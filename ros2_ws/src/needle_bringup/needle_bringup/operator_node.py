@@ -29,6 +29,7 @@ from needle_common.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_
 from needle_common.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import RECORDER, full_name, publishers_of
 from needle_common.reach import DISCOVERY, is_open
@@ -85,6 +86,13 @@ class OperatorNode(Node):
         )
         self._device_status = self.create_subscription(
             DiagnosticStatus, "device/status", self._on_device_status, LATCHED
+        )
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            "stands in for the person who holds",
+            self._waits_for,
+            alone_on=("device/hold",),
         )
         # The hold must not follow simulated time: steady clock.
         self.create_timer(1.0 / values.hold_rate, self._on_timer, clock=STEADY_CLOCK)
@@ -183,6 +191,11 @@ class OperatorNode(Node):
         if not self._hold.get_subscription_count():
             missing.append("subscriber of device/hold")
         return missing or self._unrecorded_nodes()
+
+    def _waits_for(self) -> list[str]:
+        if self._sequence.steering or self.ended:
+            return []
+        return self._missing() or [self._sequence.hangs()]
 
     def _call(self, call: ServiceCall) -> Future[Any]:
         request = Trigger.Request() if call.data is None else SetBool.Request(data=call.data)

@@ -229,7 +229,7 @@ class OperatorSequence:
             self._released_until = self._press_since = now + RELEASE_TIME
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
-                self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self._hangs()}")
+                self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
         elif now >= self._progress_at + self._stall_timeout:
             state = self._progress[0] if self._progress else "silent"
             self._end(
@@ -242,7 +242,8 @@ class OperatorSequence:
         """Whether the only device that is there has said that it is simulated."""
         return self._simulated and list(self._devices) == [self._speaker]
 
-    def _hangs(self) -> str:
+    def hangs(self) -> str:
+        """Return what the preparation waits for."""
         call = PREPARATION[self._prepared].service
         if self._missing:
             return "missing " + ", ".join(self._missing)

@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.context import Context
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -279,6 +280,27 @@ def test_a_latched_publisher_is_served_although_the_topic_was_volatile_before(
     publisher.publish(Int32(data=8))
     assert end(process)[0] == 0
     assert numbers(bag, "/plane") == [7, 8]
+
+
+def test_a_best_effort_publisher_that_comes_last_is_not_told_of_incompatible_requests(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    source.node.create_subscription(Int32, "hold", lambda _: None, best_effort)
+    process = start(domain, f"bag:={bag}")
+    source.wait(lambda: source.node.count_subscribers("/hold") == 2, "the recorder to subscribe")
+    refused: list[Any] = []
+    callbacks = PublisherEventCallbacks(incompatible_qos=refused.append)
+    publisher = source.node.create_publisher(Int32, "hold", best_effort, event_callbacks=callbacks)
+    source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
+    publisher.publish(Int32(data=1))
+    source.wait(lambda: source.node.count_subscribers("/hold") == 2, "one subscription each")
+    code, _, errors = end(process)
+    assert code == 0
+    assert refused == []
+    assert "incompatible" not in errors
+    assert numbers(bag, "/hold") == [1]
 
 
 class Health:

@@ -57,6 +57,20 @@ def unheard(node: Node, topics: Iterable[str]) -> list[str]:
     return [f"subscriber of {topic}" for topic in topics if not _listeners(node, topic) - nobody]
 
 
+def unpublished(node: Node, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
+    """Return what nobody publishes of what is listened to, as `publisher of T`.
+
+    Parameters
+    ----------
+    node : Node
+        The node that listens.
+    subscriptions : iterable of Subscription
+        Its own.
+    """
+    topics = [subscription.topic_name for subscription in subscriptions]
+    return [f"publisher of {topic}" for topic in topics if not node.count_publishers(topic)]
+
+
 def full_name(namespace: str, name: str) -> str:
     """Return a node's fully qualified name."""
     return f"{namespace.rstrip('/')}/{name}"

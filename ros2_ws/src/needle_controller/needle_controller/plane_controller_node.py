@@ -33,11 +33,18 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, signature, unheard, unrecorded
+from needle_common.partners_node import (
+    AnsweringNodes,
+    signature,
+    unheard,
+    unpublished,
+    unrecorded,
+)
 from needle_controller import conversions
 from needle_controller.parameters import PlaneControllerParameters
-from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep
+from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep, State
 
 HELP = """
 plane_controller: steers the needle into the target plane, one insertion step per measured tip.
@@ -114,6 +121,13 @@ class PlaneControllerNode(Node):
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            f"preset {values.preset}",
+            self._waits_for,
+            alone_on=("device/joint_trajectory", "needle/controller_status"),
+        )
         self._do([])
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -154,6 +168,12 @@ class PlaneControllerNode(Node):
             *no_device,
             *unrecorded(self, mine),
         ]
+
+    def _waits_for(self) -> list[str]:
+        missing = list(dict.fromkeys(self._missing() + unpublished(self, self._sources)))
+        if missing or self._steering.state is not State.IDLE:
+            return missing
+        return [f"service call {self.resolve_service_name('~/start')}"]
 
     def _on_joints(self, message: JointState) -> None:
         try:

@@ -19,8 +19,9 @@ from needle_common.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
+from needle_common.partners_node import AnsweringNodes, unheard, unpublished, unrecorded
 from needle_common.reach import DISCOVERY, is_open
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
@@ -108,7 +109,12 @@ class DeviceDriverNode(LifecycleNode):
             refuse=self._why_not_ready,
         )
         # rclpy's first line takes a tenth of a second: not once the drives wait for a heartbeat.
-        self.get_logger().info(f"looking for the drives on {values.link_settings}")
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            f"looking for the drives on {values.link_settings}",
+            lambda: self._missing() or unpublished(self, self._sources[1:]),
+        )
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
         self._sources = [self._device.commands]
@@ -118,8 +124,12 @@ class DeviceDriverNode(LifecycleNode):
         self._partners = AnsweringNodes(self)
 
     def _why_not_ready(self) -> str:
+        missing = self._missing()
+        return f"waiting for {', '.join(missing)}" if missing else ""
+
+    def _missing(self) -> list[str]:
         if not self._active:
-            return f"waiting for {self._waiting_for}"
+            return [self._waiting_for]
         missing = []
         publishers = [self._device.joint_states, self._device.results, self._device.statuses]
         if self._settings.lock_step:
@@ -127,7 +137,7 @@ class DeviceDriverNode(LifecycleNode):
         if self._settings.wait_for_recorder:
             missing += unrecorded(self, publishers)
             missing += self._partners.unaware_sources(self._sources)
-        return f"waiting for {', '.join(missing)}" if missing else ""
+        return missing
 
     # ---- the cycle ----------------------------------------------------------------------------
 

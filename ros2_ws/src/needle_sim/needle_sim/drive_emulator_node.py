@@ -19,6 +19,7 @@ from needle_common.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.drive_server import DriveServer, Port
@@ -85,6 +86,13 @@ class DriveEmulatorNode(Node):
             port = pty
             self.get_logger().info(f"slcan adapter at {pty.path}")
         self._server = DriveServer(self._bus, port)
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            "emulates both drives; no motor hangs on them",
+            lambda: [] if self._bus.syncs else ["a driver on the bus"],
+            alone_on=("sim/drive_positions",),
+        )
 
     def turn(self) -> bool:
         """Serve the bus for a moment.

@@ -25,8 +25,9 @@ from needle_common.conversions import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, unheard, unrecorded
+from needle_common.partners_node import AnsweringNodes, unheard, unpublished, unrecorded
 from needle_sim.bench import SimulatedBench
 from needle_sim.conversions import to_truth
 from needle_sim.driven_device_node import DrivenDevice
@@ -96,7 +97,7 @@ class SimRigNode(Node):
         # What the tick under way is for; None between ticks.
         self._under_way: Action | None = None
         self._ended = ""
-        self._missing = "all partners"
+        self._missing = ["all partners"]
         self._match_checked_at = -math.inf
         self._clock_told_at = -math.inf
         self._exposures = 0
@@ -138,6 +139,14 @@ class SimRigNode(Node):
         else:
             self._sensors = SimulatedCameras(self, self._bench, values, self._on_answer)
         self._partners = AnsweringNodes(self)
+        tips = ("needle/tip",) if values.level == "tip" else ()
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            f"simulates the rig at level {values.level}, seed {values.seed}",
+            lambda: [] if self._started else self._missing,
+            alone_on=("/clock", *tips),
+        )
 
     # ---- the loop -----------------------------------------------------------------------------
 
@@ -284,10 +293,10 @@ class SimRigNode(Node):
         if now - self._match_checked_at < _MATCH_CHECK:
             return
         self._match_checked_at = now
-        self._missing = ", ".join(self._missing_partners())
+        self._missing = self._missing_partners()
         if self._missing:
             self._diagnostics.set(
-                "simulation", Diagnostic(Level.WARN, f"waiting for {self._missing}")
+                "simulation", Diagnostic(Level.WARN, f"waiting for {', '.join(self._missing)}")
             )
             return
         self._started = True
@@ -304,11 +313,7 @@ class SimRigNode(Node):
             *self._sensors.subscriptions,
         ]
         missing = unheard(self, [publisher.topic_name for publisher in publishers])
-        missing += [
-            f"publisher of {subscription.topic_name}"
-            for subscription in subscriptions
-            if subscription.get_publisher_count() == 0
-        ]
+        missing += unpublished(self, subscriptions)
         missing += self._device.missing()
         if not missing and self._settings.wait_for_recorder:
             publishers += [self._truth, *self._sensors.publishers]
@@ -319,7 +324,7 @@ class SimRigNode(Node):
     def _why_not_ready(self) -> str:
         if self._ended:
             return f"the run has ended: {self._ended}"
-        return "" if self._started else f"waiting for {self._missing}"
+        return "" if self._started else f"waiting for {', '.join(self._missing)}"
 
     # ---- callbacks ----------------------------------------------------------------------------
 

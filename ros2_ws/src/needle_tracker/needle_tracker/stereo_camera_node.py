@@ -27,8 +27,10 @@ from needle_common.conversions import IMAGES, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameter_fields import check_fields, fixed_parameter
 from needle_common.parameters import NodeParameters
+from needle_common.partners_node import unheard
 from needle_tracker.calibration import SIDES, Camera, load_calibration
 from needle_tracker.image_files import Image as GreyImage
 from needle_tracker.stereo_source import (
@@ -129,6 +131,14 @@ class StereoCameraNode(Node):
         self._begun = time.monotonic()
         self.create_timer(1.0 / self._parameters.rate, self._tick, clock=STEADY_CLOCK)
         self.create_timer(0.5, self._report, clock=STEADY_CLOCK)
+        images = [f"stereo/{side}/image_raw" for side in ("left", "right")]
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            f"publishes images at {self._parameters.rate:g} Hz",
+            lambda: [] if self._awaited() else unheard(self, images),
+            alone_on=images,
+        )
         self._report()
 
     def close(self) -> None:

@@ -26,8 +26,9 @@ from needle_common.conversions import (
     to_nanoseconds,
 )
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, unrecorded
+from needle_common.partners_node import AnsweringNodes, unpublished, unrecorded
 from needle_tracker.annotation import annotate
 from needle_tracker.calibration import SIDES, load_calibration
 from needle_tracker.conversions import (
@@ -111,7 +112,23 @@ class StereoTrackerNode(Node):
         if not parameters.wait_for_recorder:
             self._hear_images()
         self.create_timer(_CHECK_PERIOD, self._check, clock=STEADY_CLOCK)
+        self._life = LifeSigns(
+            self,
+            self._diagnostics,
+            "finds the needle's tip in stereo images",
+            self._waits_for,
+            alone_on=("needle/tip", "needle/tip_pose"),
+        )
         self._report()
+
+    def _waits_for(self) -> list[str]:
+        missing = unpublished(self, self._sources)
+        missing += [
+            f"publisher of {topic}"
+            for side in SIDES
+            if not self.count_publishers(topic := self.resolve_topic_name(_image_of(side)))
+        ]
+        return missing
 
     def _hear_images(self) -> None:
         """Subscribe to the images."""
@@ -119,7 +136,7 @@ class StereoTrackerNode(Node):
         for side in SIDES:
             self.create_subscription(
                 Image,
-                f"stereo/{side}/image_raw",
+                _image_of(side),
                 lambda message, side=side: self._on_image(side, message),
                 self._image_quality,
             )
@@ -214,6 +231,10 @@ class StereoTrackerNode(Node):
         if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
             self.get_logger().warning(f"{part}: {diagnostic.message}")
         self._told[part] = kind
+
+
+def _image_of(side: str) -> str:
+    return f"stereo/{side}/image_raw"
 
 
 def main() -> int:
