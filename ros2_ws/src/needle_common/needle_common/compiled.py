@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import os
 import re
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+
+from needle_common.private_folder import private_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.MULTILINE)
@@ -26,7 +28,7 @@ def compiled(function: Function) -> Function:
     What was compiled is kept in the user's cache, in a folder named after all files with compiled
     functions, or marked as read by such, beside the function's own: numba itself looks at the file
     of the called function only, and would go on using old code of what that function calls in
-    another file.
+    another file. What lies there is run: where it cannot be this user's alone, nothing is kept.
 
     Parameters
     ----------
@@ -67,22 +69,24 @@ def _compile(function: Function, *, always_inline: bool) -> Function:
 
 @functools.cache
 def _cache_directory(package: Path) -> str:
-    """Return a writable folder for this state of a package's sources, or "" where there is none."""
+    """Return a private folder for this state of a package's sources, or "" where there is none."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in [Path(__file__), *sorted(package.glob("*.py"))]:
         source = path.read_bytes()
         if _COMPILED.search(source) or path == Path(__file__):
             digest.update(source)
-    places = [os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", "")]
-    if home := os.environ.get("HOME", ""):
-        places.append(f"{home}/.cache")
-    places.append(f"{tempfile.gettempdir()}/cache-{os.getuid()}")
-    for place in filter(None, places):
-        directory = Path(place) / package.name / digest.hexdigest()[:16]
-        try:
-            directory.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(directory, os.W_OK):
-            return str(directory)
+    for place in _places():
+        folder = private_folder(place, "needle_steering", package.name, digest.hexdigest()[:16])
+        if folder is not None:
+            return str(folder)
     return ""
+
+
+def _places() -> list[Path]:
+    """Return where a cache may be, the first choice first; never one that anybody can guess."""
+    named = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
+    places = [Path(place) for place in named if place]
+    # HOME, or else the home that the password database has; without either there is none.
+    with contextlib.suppress(RuntimeError):
+        places.append(Path.home() / ".cache")
+    return [place for place in places if place.is_absolute()]

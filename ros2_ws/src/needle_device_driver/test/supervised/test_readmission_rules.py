@@ -120,12 +120,17 @@ def test_hold_stamp_increases_nothing_from_before_a_reset_counts_again(
     assert has_hold(bench, "a")
 
 
-def test_hold_stamp_increases_a_press_that_was_on_its_way_at_a_reset(bench: Bench) -> None:
+@pytest.mark.parametrize("silence", [0.0, 5.0])
+def test_hold_stamp_increases_a_press_that_was_on_its_way_at_a_reset(
+    bench: Bench, silence: float
+) -> None:
     bench.ready(holding=False)
     hand = Hand(bench)
     hand.send(False, 3)
     late = round(bench.now * 1e9) + 10 * MS
     hand.send(False)
+    bench.now += silence
+    bench.supervisor.observe(bench.now)
     assert bench.supervisor.reset(bench.now).success
     bench.hold(stamp_ns=late)
     assert not has_hold(bench, "a")

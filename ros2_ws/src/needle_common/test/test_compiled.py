@@ -1,0 +1,56 @@
+"""Where compiled code is kept: it is run by whoever finds it."""
+
+from __future__ import annotations
+
+import pwd
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from needle_common import compiled
+
+
+@pytest.fixture
+def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    tmp_path.chmod(0o755)
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path / "tmp"))
+    (tmp_path / "tmp").mkdir(mode=0o1777)
+    package = tmp_path / "package"
+    package.mkdir()
+    return package
+
+
+def test_it_is_kept_in_the_users_cache(package: Path, tmp_path: Path) -> None:
+    folder = Path(compiled._cache_directory(package))
+    assert folder.is_relative_to(tmp_path / "home" / ".cache")
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("name", ["NUMBA_CACHE_DIR", "XDG_CACHE_HOME"])
+def test_it_is_kept_where_the_user_says(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    monkeypatch.setenv(name, str(tmp_path / "named"))
+    assert Path(compiled._cache_directory(package)).is_relative_to(tmp_path / "named")
+
+
+def test_without_a_home_nothing_is_kept_where_others_could_guess(
+    package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HOME")
+    nowhere = SimpleNamespace(pw_dir="/dev/null/nobody")
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: nowhere)
+    assert compiled._cache_directory(package) == ""
+    assert not list((tmp_path / "tmp").iterdir())
+
+
+def test_a_cache_that_others_could_have_filled_is_not_used(package: Path, tmp_path: Path) -> None:
+    planted = tmp_path / "home" / ".cache" / "needle_steering"
+    planted.mkdir(parents=True)
+    planted.chmod(0o777)
+    assert compiled._cache_directory(package) == ""
+    assert not list(planted.iterdir())
