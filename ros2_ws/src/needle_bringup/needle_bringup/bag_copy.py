@@ -22,6 +22,12 @@ def standard_topic(name: str, type_name: str) -> BagTopic:
     return BagTopic(name, type_name, definition, _STORE.hash_rihs01(type_name), (OfferedQos(),))
 
 
+def standard_text(text: str) -> bytes:
+    """Return a std_msgs/String as CDR."""
+    name = "std_msgs/msg/String"
+    return bytes(_STORE.serialize_cdr(_STORE.types[name](data=text), name))
+
+
 def stamp_of(data: bytes) -> int:
     """Return the stamp [ns] of a message (CDR) that begins with a header.
 

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from needle_bringup.bag_files import BagContents, read_contents, read_messages
+from needle_bringup.bag_files import read_contents, read_messages
+from needle_bringup.bag_rigs import CALIBRATION, namespace_of, namespaces, require_types
 from needle_common.errors import UserError
 from needle_common.plain_yaml import load_plain
 
@@ -20,21 +21,6 @@ Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
 RECORDING = ("recording_ended", "recovered", "messages_lost", "parameter_changes")
-_LANDMARK = "needle/controller_status"
-_TYPES = {
-    "needle/tip": "geometry_msgs/msg/PointStamped",
-    "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "sim/tip_pose": "geometry_msgs/msg/PoseStamped",
-    "needle/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
-    "needle/reduced_state": "geometry_msgs/msg/Vector3Stamped",
-    "needle/control_input": "geometry_msgs/msg/Vector3Stamped",
-    "joint_states": "sensor_msgs/msg/JointState",
-    "device/hold": "sensor_msgs/msg/Joy",
-    "device/joint_trajectory": "trajectory_msgs/msg/JointTrajectory",
-    "device/result": "std_msgs/msg/Header",
-    "needle/controller_status": "diagnostic_msgs/msg/DiagnosticStatus",
-    "device/status": "diagnostic_msgs/msg/DiagnosticStatus",
-}
 
 
 class _HasStamp(Protocol):
@@ -138,7 +124,8 @@ class Run:
     run_info, versions : dict
         What the recorder was told about the run, and what made it.
     calibration, commit : str
-        Text of the calibration file and the commit of the sources; empty where unknown.
+        Text of the calibration (the tracker's own, or what the recorder was told) and the commit
+        of the sources; empty where unknown.
     recording : dict of str to str
         What the recorder, or `recover`, had to say about the recording: keys of `RECORDING`.
     namespace : str
@@ -194,33 +181,44 @@ class Run:
         return default
 
     def parameter(self, node: str, name: str) -> Any:
-        """Return a node's parameter (last part of the node's name), None if it is not recorded."""
-        for full_name, values in self.parameters.items():
-            if full_name.rsplit("/", maxsplit=1)[-1] == node:
-                return values.get(name)
-        return None
+        """Return a node's parameter, None if it is not recorded.
+
+        The rig's own node, or else the only other one of that name.
+        """
+        own = self.parameters.get(f"{self.namespace}{node}")
+        if own is not None:
+            return own.get(name)
+        others = [
+            values
+            for full_name, values in self.parameters.items()
+            if full_name.rsplit("/", maxsplit=1)[-1] == node
+        ]
+        return others[0].get(name) if len(others) == 1 else None
 
 
-def read_run(path: Path) -> Run:
+def read_run(path: Path, namespace: str | None = None) -> Run:
     """Read a run from its bag.
 
     Parameters
     ----------
     path : Path
         A rosbag2 directory written by the recorder (or by rosbag2's own).
+    namespace : str, optional
+        Which rig's run, where the bag holds several.
 
     Raises
     ------
     UserError
-        If there is no bag, it is broken or incomplete, or it holds no needle run.
+        If there is no bag, it is broken or incomplete, it holds no needle run, or several and none
+        is named.
     """
     contents = read_contents(path)
     custom = contents.custom_data
-    namespace = _namespace(contents)
-    collected = _Collector()
+    namespace = namespace_of(contents, namespace)
+    collected = _Collector(namespace, namespaces(contents))
     takers = {namespace + name: taker for name, taker in collected.takers().items()}
     takers["/diagnostics"] = collected.take_diagnostics
-    _require_types(contents, namespace)
+    require_types(contents, namespace)
     for topic, log_time, message in read_messages(path, lambda name: name in takers):
         try:
             takers[topic](log_time, message)
@@ -250,7 +248,7 @@ def read_run(path: Path) -> Run:
         parameters=_parameters(custom.get("parameters", "")),
         run_info=_mapping(custom.get("run_info", "")),
         versions={str(k): str(v) for k, v in _mapping(custom.get("versions", "")).items()},
-        calibration=custom.get("calibration", ""),
+        calibration=collected.calibration or custom.get("calibration", ""),
         commit=custom.get("commit", ""),
         recording={key: custom[key] for key in RECORDING if custom.get(key)},
         namespace=namespace,
@@ -258,14 +256,17 @@ def read_run(path: Path) -> Run:
 
 
 class _Collector:
-    """Turns messages into rows, topic by topic."""
+    """Turns messages into rows, topic by topic; `/diagnostics` are those of one rig of several."""
 
-    def __init__(self) -> None:
+    def __init__(self, namespace: str, rigs: Sequence[str]) -> None:
+        self._own = namespace.lstrip("/")
+        self._others = tuple(rig.lstrip("/") for rig in rigs if rig not in ("/", namespace))
         self._rows: dict[str, list[tuple[int, int, tuple[float, ...]]]] = {}
         self.controller_status: list[Status] = []
         self.device_status: list[Status] = []
         self.results: list[Result] = []
         self.health: list[HealthEvent] = []
+        self.calibration = ""
         self._last_health: dict[str, tuple[int, str]] = {}
 
     def takers(self) -> dict[str, Callable[[int, Any], None]]:
@@ -292,6 +293,7 @@ class _Collector:
             "device/status": lambda t, m: self.device_status.append(
                 Status(t, {pair.key: pair.value for pair in m.values})
             ),
+            CALIBRATION: self._take_calibration,
         }
 
     def series(self, name: str, width: int) -> Series:
@@ -331,39 +333,23 @@ class _Collector:
             rotation = float(positions.get("rotation_joint", np.nan))
         self._add("commands", log_time, message, (insertion, rotation))
 
+    def _take_calibration(self, _: int, message: Any) -> None:
+        self.calibration = str(message.data)
+
     def _take_result(self, log_time: int, message: Any) -> None:
         self.results.append(Result(log_time, nanoseconds(message.stamp), message.frame_id))
 
     def take_diagnostics(self, log_time: int, message: Any) -> None:
         """Take what is not well, and what is again, where it changed."""
         for status in message.status:
+            name = str(status.name).removeprefix(self._own)
+            if name == status.name and name.startswith(self._others):
+                continue
             now = (int(status.level), str(status.message))
-            before = self._last_health.get(status.name, (0, ""))
+            before = self._last_health.get(name, (0, ""))
             if before != now and (now[0] or before[0]):
-                self.health.append(HealthEvent(log_time, status.name, *now))
-            self._last_health[status.name] = now
-
-
-def _namespace(contents: BagContents) -> str:
-    found = sorted(name for name in contents.topics if name.endswith(f"/{_LANDMARK}"))
-    if not found:
-        raise UserError(
-            f"{contents.path} holds no needle run: no topic {_LANDMARK} among its "
-            f"{len(contents.topics)}; it needs a bag that the rig's recorder made"
-        )
-    return found[0].removesuffix(_LANDMARK)
-
-
-def _require_types(contents: BagContents, namespace: str) -> None:
-    types = {namespace + name: type_name for name, type_name in _TYPES.items()}
-    types["/diagnostics"] = "diagnostic_msgs/msg/DiagnosticArray"
-    for name, wanted in types.items():
-        topic = contents.topics.get(name)
-        if topic is not None and topic.type_name != wanted:
-            raise UserError(
-                f"{contents.path}: {name} has type {topic.type_name}, the rig's has {wanted}: "
-                "this bag is not of the rig's graph"
-            )
+                self.health.append(HealthEvent(log_time, name, *now))
+            self._last_health[name] = now
 
 
 def _parameters(text: str) -> dict[str, dict[str, Any]]:

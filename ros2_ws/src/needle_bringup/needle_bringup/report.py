@@ -159,20 +159,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--json", type=Path, metavar="FILE", help="also write the figures of the run as flat JSON"
     )
     parser.add_argument(
+        "--namespace", metavar="NS", help="of the rig to show, where a bag holds several"
+    )
+    parser.add_argument(
         "--output", type=Path, metavar="DIR", help="write here and not into the bag's directory"
     )
     return run_command(lambda: _report(parser.parse_args(arguments)))
 
 
 def _report(given: argparse.Namespace) -> int:
-    first = read_run(given.bag)
+    first = read_run(given.bag, given.namespace)
     summary = summarize(first)
     if given.other is None:
         page = write_report(first, summary, given.output)
         words, sentence = verdict_text(summary)
         print(f"{words}: {sentence}\n{page}")
     else:
-        second = read_run(given.other)
+        second = read_run(given.other, given.namespace)
         summaries = (summary, summarize(second))
         page = write_pair_report((first, second), summaries, given.output)
         for letter, figures in zip("AB", summaries, strict=True):

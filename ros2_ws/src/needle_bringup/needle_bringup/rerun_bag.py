@@ -9,11 +9,12 @@ from typing import Any
 
 import yaml
 
-from needle_bringup.bag_copy import BagCopy, stamp_of, standard_topic
+from needle_bringup.bag_copy import BagCopy, stamp_of, standard_text, standard_topic
 from needle_bringup.bag_files import read_contents
 from needle_bringup.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bringup.bag_order import raw_as_sent
 from needle_bringup.bag_reader import Run
+from needle_bringup.bag_rigs import CALIBRATION
 from needle_bringup.provenance import commit
 from needle_bringup.rerun import TIP_TOPICS, TYPES, Output
 from needle_bringup.rerun_text import outputs_table
@@ -62,6 +63,8 @@ def write_rerun(
         topic = contents.topics[message.topic]
         name = topic.name.removeprefix(run.namespace)
         data = message.data
+        if name == CALIBRATION:
+            data = standard_text(calibration)
         if name in topics:
             stamp = stamp_of(data)
             if name not in TIP_TOPICS or stamp in answered:

@@ -117,7 +117,7 @@ def _run(words: Sequence[str]) -> int:
         if given.preset not in PRESETS:
             raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
         changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), "preset": given.preset}}
-    run = read_run(given.bag)
+    run = read_run(given.bag, given.namespace)
     tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
     controller_node = _node(run, CONTROLLER, changes)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
@@ -162,6 +162,7 @@ def _parser() -> CommandParser:
         metavar="NEW_BAG",
         help="write a copy of the bag with today's outputs in place of the recorded ones",
     )
+    add("--namespace", metavar="NS", help="of the rig to run again, where the bag holds several")
     add("--json", type=Path, metavar="FILE", help="write the result as one flat JSON object")
     return parser
 

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType, ModuleType
 
-from needle_bringup.installed import find_executable, find_shared
+from needle_bringup.installed import find_executable
 from needle_bringup.node_process import NodeProcess, stop, wait_for
 from needle_bringup.progress import PROGRESS_FD
 from needle_bringup.rig_configuration import (
@@ -143,11 +143,6 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
     executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     bag = _make_folder(options)
     parameters = merge(command_line_parameters(options, bag), given)
-    parameters["recorder"].setdefault(
-        "calibration_file",
-        parameters["sim_rig"].get("calibration_file")
-        or str(find_shared("needle_tracker", "config/calibration.yaml")),
-    )
     interruption.check()
     try:
         with own_domain() as domain:

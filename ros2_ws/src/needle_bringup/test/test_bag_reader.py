@@ -4,12 +4,17 @@ import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_bringup.bag_reader import HealthEvent, Series, read_run
+from needle_bringup.bag_copy import BagCopy
+from needle_bringup.bag_files import read_contents
+from needle_bringup.bag_order import raw_as_sent
+from needle_bringup.bag_reader import HealthEvent, Series, _Collector, read_run
 from needle_bringup.bag_writer import BagWriter
 from needle_bringup.run_summary import reduced_states, summarize
 from needle_common.errors import UserError
@@ -67,6 +72,53 @@ def test_a_namespace_is_found(make_run: MakeRun) -> None:
     run = read_run(make_run(namespace="/bench/left/"))
     assert run.namespace == "/bench/left/"
     assert len(run.tips) == 121
+
+
+@pytest.fixture
+def two_rigs(make_run: MakeRun, tmp_path: Path) -> Path:
+    """A bag of a rig without a namespace, and of a shorter run of one in /bench."""
+    copy = BagCopy(tmp_path / "two", "jazzy", {})
+    for bag in (make_run("one"), make_run("other", namespace="/bench/", steps=60)):
+        contents = read_contents(bag)
+        for m in raw_as_sent(bag, lambda _: True, lambda _: False):
+            copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
+    copy.close()
+    return tmp_path / "two"
+
+
+def test_of_two_rigs_one_has_to_be_chosen(two_rigs: Path) -> None:
+    with pytest.raises(UserError, match=r"two holds 2 rigs, in /, /bench: choose one with --names"):
+        read_run(two_rigs)
+    with pytest.raises(UserError, match=r"two has no rig in /desk; it has those in /, /bench"):
+        read_run(two_rigs, "/desk")
+    for name in ("bench", "/bench", "/bench/"):
+        run = read_run(two_rigs, name)
+        assert (run.namespace, len(run.tips)) == ("/bench/", 61)
+    assert len(read_run(two_rigs, "/").tips) == 121
+
+
+def test_a_rigs_parameters_are_its_own_nodes(make_run: MakeRun) -> None:
+    run = read_run(make_run(namespace="/bench/"))
+    nodes = {"/sim_rig": {"seed": 1}, "/bench/sim_rig": {"seed": 2}, "/desk/tracker": {"a": 3}}
+    run = dataclasses.replace(run, parameters=nodes)
+    assert run.parameter("sim_rig", "seed") == 2
+    assert run.parameter("tracker", "a") == 3
+    nodes["/desk/sim_rig"] = nodes.pop("/bench/sim_rig")
+    assert run.parameter("sim_rig", "seed") is None
+
+
+def test_health_is_the_chosen_rigs() -> None:
+    def status(name: str) -> Any:
+        return SimpleNamespace(name=name, level=1, message="not well")
+
+    names = ("sim_rig: a", "bench/sim_rig: b", "camera/left: c")
+    for namespace, kept in (
+        ("/", ["sim_rig: a", "camera/left: c"]),
+        ("/bench/", ["sim_rig: a", "sim_rig: b", "camera/left: c"]),
+    ):
+        collected = _Collector(namespace, ["/", "/bench/"])
+        collected.take_diagnostics(0, SimpleNamespace(status=[status(name) for name in names]))
+        assert [event.part for event in collected.health] == kept
 
 
 def test_reduced_states_undo_the_rotation() -> None:

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from builtin_interfaces.msg import Time
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bringup import rerun_node
-from needle_bringup.bag_copy import BagCopy, standard_topic
+from needle_bringup.bag_copy import BagCopy, standard_text, standard_topic
 from needle_bringup.bag_files import read_contents
 from needle_bringup.bag_order import raw_as_sent
 from needle_bringup.bag_reader import read_run
@@ -160,6 +161,30 @@ def test_parameters_as_nodes_announced_them_do_as_well(tmp_path: Path) -> None:
         copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
     copy.close()
     assert rerun(tmp_path / "bag") == 0
+
+
+def test_the_calibration_that_the_tracker_told_is_used(tmp_path: Path, capsys: Capture) -> None:
+    """It says it on a topic of its own: nobody has to tell the recorder."""
+    contents, text = read_contents(BAG), read_run(BAG).calibration
+    custom = {"parameters": contents.custom_data["parameters"], "calibration": "left: {}"}
+    copy = BagCopy(tmp_path / "bag", "jazzy", custom)
+    topic = standard_topic("/stereo_tracker/calibration", "std_msgs/msg/String")
+    copy.put(topic, standard_text(text), contents.start, contents.start)
+    for m in raw_as_sent(BAG, lambda _: True, lambda _: False):
+        copy.put(contents.topics[m.topic], m.data, m.log_time, m.time)
+    copy.close()
+    assert rerun(tmp_path / "bag") == 0
+    other = yaml.safe_load(text)
+    other["phantom"]["refractive_index"] += 0.01
+    (tmp_path / "other.yaml").write_text(yaml.safe_dump(other))
+    values = f"{{ros__parameters: {{calibration_file: {tmp_path}/other.yaml}}}}"
+    (tmp_path / "given.yaml").write_text(f"stereo_tracker: {values}")
+    again = tmp_path / "again"
+    given = ("--params", tmp_path / "given.yaml", "--output", again)
+    assert rerun(tmp_path / "bag", *given) == 1
+    # What was used is in the copy, which runs again unchanged.
+    assert yaml.safe_load(read_run(again).calibration) == other
+    capsys.readouterr()
 
 
 def event(node: str, parameters: dict[str, Any]) -> bytes:

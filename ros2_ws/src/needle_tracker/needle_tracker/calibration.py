@@ -91,11 +91,20 @@ def load_calibration(path: Path) -> StereoCalibration:
         Unreadable, not YAML, or a value missing, not finite, of the wrong size or out of bounds;
         the message says which.
     """
+    return calibration_from(read_calibration(path), path)
+
+
+def read_calibration(path: Path) -> str:
+    """Return the text of a calibration file; a `UserError` says why it cannot be read."""
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
         raise UserError(f"cannot read calibration {path}: {reason}") from error
+
+
+def calibration_from(text: str, path: Path) -> StereoCalibration:
+    """Return what the text of a calibration file says; raises as `load_calibration`."""
     try:
         content = yaml.safe_load(text)
     except yaml.YAMLError as error:

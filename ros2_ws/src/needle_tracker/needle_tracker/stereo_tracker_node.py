@@ -15,6 +15,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamp
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import String
 
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.conversions import (
@@ -30,7 +31,7 @@ from needle_common.life_signs_node import LifeSigns
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, unpublished, unrecorded
 from needle_tracker.annotation import annotate
-from needle_tracker.calibration import SIDES, load_calibration
+from needle_tracker.calibration import SIDES, calibration_from, read_calibration
 from needle_tracker.conversions import (
     camera_info_problem,
     insertion_of,
@@ -52,8 +53,8 @@ stereo_tracker: where the needle's tip is, from stereo images through the phanto
 
 Subscribes: stereo/{left,right}/image_raw, stereo/{left,right}/camera_info, joint_states.
 Publishes: needle/tip (only where a tip was found), needle/tip_pose (one for every image pair; an
-infinite covariance says that no tip was found), /diagnostics, ~/annotated_image (while someone
-subscribes).
+infinite covariance says that no tip was found), /diagnostics, ~/calibration (the text of the file
+in use, latched), ~/annotated_image (while someone subscribes).
 """
 _CHECK_PERIOD = 0.05  # [s]
 
@@ -75,9 +76,10 @@ class StereoTrackerNode(Node):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__("stereo_tracker", **kwargs)
         parameters = NodeParameters(self, StereoTrackerParameters).values
-        path = parameters.calibration_file
         default = Path(get_package_share_directory("needle_tracker"), "config", "calibration.yaml")
-        calibration = load_calibration(Path(path) if path else default)
+        path = Path(parameters.calibration_file or default)
+        text = read_calibration(path)
+        calibration = calibration_from(text, path)
         self._cameras = {"left": calibration.left, "right": calibration.right}
         self._answers = PairAnswers(
             calibration,
@@ -96,6 +98,9 @@ class StereoTrackerNode(Node):
             PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE
         )
         self._annotated = self.create_publisher(Image, "~/annotated_image", IMAGES)
+        # So that whatever records the graph has what the tips were measured with.
+        self._calibration = self.create_publisher(String, "~/calibration", LATCHED)
+        self._calibration.publish(String(data=text))
         self._diagnostics = DiagnosticsPublisher(self)
         self._sources: list[Subscription[Any]] = [
             self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from ament_index_python.packages import get_package_share_directory
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
@@ -19,8 +20,16 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_msgs.msg import String
 
-from needle_common.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
+from needle_common.conversions import (
+    IMAGES,
+    JOINT_STATES,
+    LATCHED,
+    RELIABLE,
+    to_nanoseconds,
+    to_stamp,
+)
 from needle_common.errors import UserError
 from needle_common.own_context_node import own_context
 from needle_tracker.stereo_tracker_node import StereoTrackerNode
@@ -205,6 +214,14 @@ def test_no_image_is_taken_before_the_recorder_listens(context: Context) -> None
             executor.remove_node(each)
             each.destroy_node()
         executor.shutdown()
+
+
+def test_late_joiners_are_told_the_calibration_in_use(bench: Bench) -> None:
+    told: list[String] = []
+    bench.outside.create_subscription(String, "stereo_tracker/calibration", told.append, LATCHED)
+    bench.until(lambda: bool(told))
+    share = get_package_share_directory("needle_tracker")
+    assert told[0].data == Path(share, "config", "calibration.yaml").read_text()
 
 
 def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None:
