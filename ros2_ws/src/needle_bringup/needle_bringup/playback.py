@@ -26,10 +26,15 @@ class PlaybackClock:
         Steady time [s].
     paused : bool
         Whether to begin paused.
+
+    Attributes
+    ----------
+    rate : float
+        The present rate.
     """
 
     def __init__(self, rate: float, start: int, now: float, *, paused: bool = False) -> None:
-        self._rate = rate
+        self.rate = rate
         self.is_paused = paused
         self._since = now
         self._time = float(start)
@@ -43,6 +48,11 @@ class PlaybackClock:
         self._time, self._since = self._at(now), now
         self.is_paused = paused
 
+    def set_rate(self, rate: float, now: float) -> None:
+        """Go on at another rate."""
+        self._time, self._since = self._at(now), now
+        self.rate = rate
+
     def time(self, now: float) -> int:
         """Return the time of recording [ns] at a steady time [s]."""
         return int(self._at(now))
@@ -51,12 +61,12 @@ class PlaybackClock:
         """Return how long [s] until a time of recording [ns]; infinite while paused."""
         if self.is_paused:
             return float("inf")
-        return max(0.0, (time - self._at(now)) / (_NANOSECONDS * self._rate))
+        return max(0.0, (time - self._at(now)) / (_NANOSECONDS * self.rate))
 
     def _at(self, now: float) -> float:
         if self.is_paused:
             return self._time
-        return self._time + (now - self._since) * _NANOSECONDS * self._rate
+        return self._time + (now - self._since) * _NANOSECONDS * self.rate
 
 
 class ReadAhead(Generic[T]):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import sys
 import time
 from collections.abc import Iterator
@@ -13,6 +12,7 @@ from typing import Any, Final, cast
 
 from rclpy.duration import Duration
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
@@ -21,17 +21,24 @@ from tqdm import tqdm
 from needle_bringup.bag_files import BagContents, raw_messages, read_contents
 from needle_bringup.bag_metadata import BagTopic
 from needle_bringup.conversions import recorded_offer
-from needle_bringup.message_definitions import full_definition, type_hash
+from needle_bringup.playable import message_class, unplayable
 from needle_bringup.playback import PlaybackClock, ReadAhead
-from needle_bringup.player_options import PlayerOptions, parse_options, require_fits
+from needle_bringup.player_options import (
+    MAX_RATE,
+    MIN_RATE,
+    PlayerOptions,
+    parse_options,
+    require_fits,
+)
 from needle_bringup.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
-from needle_bringup.terminal_keys import Keys
+from needle_bringup.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
 from needle_common.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.conversions import RELIABLE, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
+from needle_common.parameter_fields import check_fields, parameter
 from needle_common.parameters import NodeParameters
 from needle_common.partners_node import AnsweringNodes, full_name
 
@@ -42,16 +49,28 @@ DISCOVERY: Final = 2.0
 MATCHING: Final = 3.0
 LOOK_PERIOD: Final = 0.1
 ACKNOWLEDGED: Final = 5.0
-# The longest that a signal, a key or a service call waits [s].
-PATIENCE: Final = 0.02
+PATIENCE: Final = 0.02  # the longest that a signal, a key or a service call waits [s]
 _NANOSECONDS: Final = 1_000_000_000
+RATE_STEP: Final = 1.1
+SEEK_STEP: Final = 5 * _NANOSECONDS
 
 Message = tuple[str, int, bytes]
 
 
 @dataclasses.dataclass(frozen=True)
 class PlayerParameters:
-    """The player has no ROS parameters of its own: it takes options."""
+    """What can be set while it plays; the rest are options."""
+
+    rate: float = parameter(
+        1.0, unit="-", description="How many times faster.", lower=MIN_RATE, upper=MAX_RATE
+    )
+    seek: float = parameter(
+        0.0, unit="s", description="Set it to go there, after the first message.", lower=0.0
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
 
 
 class RigAppearedError(Exception):
@@ -63,7 +82,6 @@ class Player(Node):
 
     def __init__(self, options: PlayerOptions, contents: BagContents) -> None:
         super().__init__("player")
-        NodeParameters(self, PlayerParameters)
         self._options = options
         self._contents = contents
         self.start = contents.start + round(options.start * 1e9)
@@ -72,25 +90,31 @@ class Player(Node):
         self._topics = self._playable()
         self._senders: dict[str, Publisher] = {}
         self._diagnostics = DiagnosticsPublisher(self)
-        self.clock = PlaybackClock(
-            options.rate, self.start, time.monotonic(), paused=options.paused
-        )
+        now = time.monotonic()
+        self.clock = PlaybackClock(options.rate, self.start, now, paused=options.paused)
         self._clock_publisher: Publisher | None = None
         self._next_clock = 0.0
         self._looked_at = 0.0
         self.beside_rig = False
         self.messages = 0
+        self._go_to: int | None = None
+        self._begin = self.start
         self.create_service(SetBool, "~/pause", self._on_pause)
+        NodeParameters(self, PlayerParameters)
+        self.set_parameters([Parameter("rate", value=options.rate)])
+        self.add_post_set_parameters_callback(self._on_parameters)
 
     def _playable(self) -> dict[str, BagTopic]:
         """Return the topics to play; say why others are left out."""
         options, known = self._options, self._contents.topics
-        chosen = {n: t for n, t in known.items() if not options.topics or n in options.topics}
+        chosen = {name: topic for name, topic in known.items() if name in options.topics}
+        if not chosen:
+            raise UserError(f"{options.bag}: no topic is chosen; it has {', '.join(known)}")
         if options.clock is not None:
             chosen.pop(CLOCK, None)
         playable = {}
         for name, topic in chosen.items():
-            why = _unplayable(topic)
+            why = unplayable(topic)
             if why:
                 self.get_logger().warning(f"{name} is not played: {why}")
             else:
@@ -129,7 +153,7 @@ class Player(Node):
         answering.close()
         if end.wanted:
             return False
-        self._publish_latched()
+        self._publish_latched(self.start)
         self.clock.restart(self.start, time.monotonic())
         return True
 
@@ -148,7 +172,7 @@ class Player(Node):
             topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
         )
         publisher = self.create_publisher(
-            _message_class(topic.type_name),
+            message_class(topic.type_name),
             name,
             recorded_offer(topic.type_name, topic.offered_qos),
         )
@@ -177,24 +201,52 @@ class Player(Node):
             if not info.node_name.startswith("_")
         } - {self.get_fully_qualified_name()}
 
-    def _publish_latched(self) -> None:
-        """Publish what late joiners would have got at the start."""
+    def _publish_latched(self, before: int) -> None:
+        """Publish what late joiners would have got at a time of recording [ns]."""
         latched = {
             name
             for name, topic in self._topics.items()
             if any(offer.durability == "transient_local" for offer in topic.offered_qos)
         }
-        if self.start == self._contents.start or not latched:
+        if before == self._contents.start or not latched:
             return
         last: dict[str, Message] = {}
-        for message in raw_messages(self._options.bag, latched, self._contents.start, self.start):
+        for message in raw_messages(self._options.bag, latched, self._contents.start, before):
             last[message[0]] = message
         for message in sorted(last.values(), key=lambda one: one[1]):
             self.publish(message)
 
     def read(self) -> Iterator[Message]:
-        """Yield the messages to play, in order."""
-        return raw_messages(self._options.bag, set(self._topics), self.start, self.end + 1)
+        """Yield the messages to play, in order, from where playing begins."""
+        return raw_messages(self._options.bag, set(self._topics), self._begin, self.end + 1)
+
+    @property
+    def is_sought(self) -> bool:
+        """Whether playing goes on elsewhere (`seek`)."""
+        return self._go_to is not None
+
+    def seek(self, time: int) -> None:
+        """Go on at another time of recording [ns], or at the nearest that the bag has."""
+        self._go_to = min(max(time, self._contents.start), self.end)
+
+    def begin(self) -> None:
+        """Go to where playing goes on: where somebody wanted, or the start."""
+        self._begin, sought = self._go_to or self.start, self.is_sought
+        self._go_to = None
+        if sought:
+            self._publish_latched(self._begin)
+        self.clock.restart(self._begin, time.monotonic())
+
+    def press(self, key: str) -> None:
+        """Do what a key in the terminal stands for."""
+        now = time.monotonic()
+        if key == PAUSE:
+            self.pause(not self.clock.is_paused)
+        elif key in (FASTER, SLOWER):
+            rate = self.clock.rate * (RATE_STEP if key == FASTER else 1.0 / RATE_STEP)
+            self.set_parameters([Parameter("rate", value=min(max(rate, MIN_RATE), MAX_RATE))])
+        elif key in (BACK, ON):
+            self.seek(self.clock.time(now) + (SEEK_STEP if key == ON else -SEEK_STEP))
 
     def publish(self, message: Message) -> None:
         """Send one message."""
@@ -242,37 +294,18 @@ class Player(Node):
                         return f"{info.node_name} publishes {name}"
         return None
 
+    def _on_parameters(self, changes: list[Parameter[Any]]) -> None:
+        for change in changes:
+            if change.name == "rate":
+                self.clock.set_rate(change.value, time.monotonic())
+            elif change.name == "seek":
+                self.seek(self._contents.start + round(change.value * _NANOSECONDS))
+
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
         self.pause(request.data)
         response.success = True
         response.message = "paused" if request.data else "playing"
         return response
-
-
-def _unplayable(topic: BagTopic) -> str:
-    """Return why a topic cannot be played here; an empty text if it can."""
-    try:
-        installed = full_definition(topic.type_name)
-        _message_class(topic.type_name)
-        here = type_hash(topic.type_name, installed)
-        there = topic.type_hash or (
-            type_hash(topic.type_name, topic.definition) if topic.definition else here
-        )
-    except UserError as error:
-        return str(error)
-    except (ImportError, AttributeError, ValueError):
-        return f"{topic.type_name} is not installed"
-    if here != there:
-        return (
-            f"{topic.type_name} is defined otherwise in this bag than here (another ROS "
-            "distribution): play it where it was recorded"
-        )
-    return ""
-
-
-def _message_class(type_name: str) -> Any:
-    package, kind, short = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
 def _play(player: Player, loop: bool, end: EndRequest) -> int:
@@ -282,7 +315,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
         unit="s",
         disable=None,
         leave=False,
-        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar pauses",
+        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar and arrows",
     )
     with bar, Keys() as keys:
         if not player.prepare(partial(executor.spin_once, 0.05), end):
@@ -290,7 +323,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
         while True:
             with contextlib.closing(ReadAhead(player.read)) as source:
                 message = source.next()
-                while message is not None:
+                while message is not None and not player.is_sought:
                     # A turn of the executor costs more than a message: take it now and then.
                     wait = player.clock.wait(message[1], time.monotonic())
                     turn = time.monotonic() + PATIENCE
@@ -303,15 +336,15 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
                     player.look_around()
                     if end.wanted:
                         return EXIT_DONE
-                    if keys.pressed() == " ":
-                        player.pause(not player.clock.is_paused)
+                    for key in keys.pressed():
+                        player.press(key)
                     elapsed = player.clock.time(time.monotonic()) - player.start
                     bar.n = min(bar.total, elapsed / _NANOSECONDS)
                     bar.set_description("paused" if player.clock.is_paused else "playing")
-            if not loop:
+            if not (loop or player.is_sought):
                 player.finish()
                 return EXIT_DONE
-            player.clock.restart(player.start, time.monotonic())
+            player.begin()
 
 
 def main(args: list[str] | None = None) -> int:

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from needle_bringup.bag_files import BagContents
+from needle_bringup.topic_choice import TopicChoice
 from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.options import CommandParser
 
@@ -22,19 +23,24 @@ a living rig (something publishes device/status) everything is; a rig that comes
 playing.
 """
 _EPILOG = """\
-While it plays, the space bar pauses and goes on (in a terminal), or anywhere
+While it plays, in a terminal: the space bar pauses and goes on, up and down play a tenth faster
+and slower, right and left go five seconds on and back. From anywhere:
   ros2 service call /player/pause std_srvs/srv/SetBool "{data: true}"
+  ros2 param set /player rate 0.5
+  ros2 param set /player seek 12.5       (seconds after the bag's first message)
 
 examples:
   ros2 run needle_bringup player bags/my_run
   ros2 run needle_bringup player bags/my_run --rate 0.5 --start 10 --end 20 --loop
   ros2 run needle_bringup player bags/my_run --topics needle/tip joint_states --paused
+  ros2 run needle_bringup player bags/my_run --regex '^/needle/' --exclude-regex pose
   ros2 run needle_bringup player bags/my_run --remap needle/tip:=old/tip
 
 A recorded /clock is played like any topic; --clock makes one from the time of recording instead.
 Exit codes: 0 done, or ended by Ctrl-C; 1 a rig came up; 2 bad arguments, or a bag that cannot be
 played.
 """
+MIN_RATE = 0.001
 MAX_RATE = 1000.0
 
 
@@ -50,8 +56,8 @@ class PlayerOptions:
         How many times faster than recorded.
     start, end : float
         From and to when, after the bag's first message [s].
-    topics : tuple of str
-        Absolute names; empty: all.
+    topics : TopicChoice
+        Which topics.
     remaps : dict of str to str
         Absolute recorded name to absolute name.
     loop, paused : bool
@@ -64,7 +70,7 @@ class PlayerOptions:
     rate: float = 1.0
     start: float = 0.0
     end: float = math.inf
-    topics: tuple[str, ...] = ()
+    topics: TopicChoice = dataclasses.field(default_factory=TopicChoice)
     remaps: dict[str, str] = dataclasses.field(default_factory=dict)
     loop: bool = False
     paused: bool = False
@@ -72,7 +78,7 @@ class PlayerOptions:
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        _require("--rate", self.rate, 0.001, MAX_RATE, "-")
+        _require("--rate", self.rate, MIN_RATE, MAX_RATE, "-")
         _require("--start", self.start, 0.0, 1e9, "s")
         if self.clock is not None:
             _require("--clock", self.clock, 0.1, 1000.0, "Hz")
@@ -89,11 +95,17 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         If they are not what `--help` says.
     """
     parser = CommandParser("player", _DESCRIPTION, _EPILOG)
+
+    def add_regex(name: str, text: str) -> None:
+        parser.add_argument(name, default="", metavar="REGEX", help=text)
+
     parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin here [s]")
     parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end here [s]")
     parser.add_argument("--topics", nargs="+", default=[], metavar="T", help="only these topics")
+    add_regex("--regex", "topics in whose name this is found (and those of --topics)")
+    add_regex("--exclude-regex", "not those in whose name this is found, but for --topics")
     parser.add_argument(
         "--remap", nargs="+", default=[], metavar="A:=B", help="play topic A under the name B"
     )
@@ -113,7 +125,9 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
         given.rate,
         given.start,
         given.end,
-        tuple(_absolute(name) for name in given.topics),
+        TopicChoice(
+            tuple(_absolute(name) for name in given.topics), given.regex, given.exclude_regex
+        ),
         dict(_remap(text) for text in given.remap),
         given.loop,
         given.paused,
@@ -124,7 +138,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
 def require_fits(options: PlayerOptions, contents: BagContents) -> None:
     """Raise a `UserError` if the options ask for what the bag does not have."""
     known = contents.topics
-    for name in (*options.topics, *options.remaps):
+    for name in (*options.topics.names, *options.remaps):
         if name not in known:
             raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
     seconds = (contents.end - contents.start) / 1e9

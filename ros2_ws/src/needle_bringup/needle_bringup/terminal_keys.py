@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+import os
+import re
 import select
 import sys
 import termios
 import tty
-from typing import Any
+from typing import Any, Final
+
+PAUSE: Final = " "
+FASTER: Final = "\x1b[A"
+SLOWER: Final = "\x1b[B"
+ON: Final = "\x1b[C"
+BACK: Final = "\x1b[D"
+# A terminal sends an arrow as three characters, or with O where a program asked for that.
+_KEY: Final = re.compile(r"\x1b[\[O][A-D]|.", re.DOTALL)
+
+
+def keys_in(text: str) -> list[str]:
+    """Return the keys that a terminal's characters stand for."""
+    return [key.replace("\x1bO", "\x1b[") for key in _KEY.findall(text)]
 
 
 class Keys:
@@ -26,8 +41,8 @@ class Keys:
         if self._file is not None:
             termios.tcsetattr(self._file, termios.TCSADRAIN, self._before)
 
-    def pressed(self) -> str:
-        """Return the key pressed since the last call, or an empty text."""
+    def pressed(self) -> list[str]:
+        """Return the keys pressed since the last call."""
         if self._file is None or not select.select([self._file], [], [], 0.0)[0]:
-            return ""
-        return sys.stdin.read(1)
+            return []
+        return keys_in(os.read(self._file, 256).decode(errors="replace"))

@@ -10,6 +10,7 @@ import pytest
 from needle_bringup.playback import READ_AHEAD, PlaybackClock, ReadAhead
 from needle_bringup.player_options import parse_options
 from needle_bringup.replay_names import is_guarded, marks_a_rig, played_name
+from needle_bringup.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, keys_in
 from needle_common.errors import UserError
 
 SECOND = 1_000_000_000
@@ -32,6 +33,21 @@ def test_a_pause_takes_no_time() -> None:
     assert clock.wait(3 * SECOND, 50.0) == math.inf
     clock.pause(False, 60.0)
     assert clock.wait(3 * SECOND, 60.25) == pytest.approx(0.75)
+
+
+def test_another_rate_counts_from_now() -> None:
+    clock = PlaybackClock(1.0, 0, now=0.0)
+    clock.set_rate(4.0, 2.0)
+    assert clock.time(3.0) == 6 * SECOND
+    clock.pause(True, 3.0)
+    clock.set_rate(0.5, 9.0)
+    assert clock.time(9.0) == 6 * SECOND
+    clock.pause(False, 10.0)
+    assert clock.wait(7 * SECOND, 10.0) == pytest.approx(2.0)
+
+
+def test_arrows_are_keys_of_their_own() -> None:
+    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", ON, BACK]
 
 
 def test_beginning_paused() -> None:
@@ -115,7 +131,7 @@ def test_options() -> None:
     line = "bag --rate 0.5 --start 1 --end 2 --topics needle/tip /clock --remap a:=/b --loop"
     options = parse_options(line.split())
     assert options.bag == Path("bag")
-    assert options.topics == ("/needle/tip", "/clock")
+    assert options.topics.names == ("/needle/tip", "/clock")
     assert options.remaps == {"/a": "/b"}
     assert options.loop
     assert options.clock is None

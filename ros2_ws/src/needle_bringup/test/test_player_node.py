@@ -16,9 +16,11 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.srv import SetParameters
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from rosgraph_msgs.msg import Clock
@@ -210,6 +212,36 @@ def test_late_joiners_pause_and_loop(listener: Listener, tmp_path: Path) -> None
     assert listener.numbers("/numbered")[:80] == [*range(10, 50), *range(10, 50)]
 
 
+def test_seeking_and_another_rate_while_it_plays(listener: Listener, tmp_path: Path) -> None:
+    path = make_bag(tmp_path / "bag", count=100, period=10.0)
+    listener.listen("/numbered", Int32)
+    listener.listen("/noisy", Int32, BEST_EFFORT)
+    process = play(listener, path, "--regex", "^/n|plane", "--exclude-regex", "noisy")
+    listener.wait(lambda: listener.numbers("/numbered") == [0], "the first message")
+    setting = listener.node.create_client(SetParameters, "/player/set_parameters")
+    listener.wait(setting.service_is_ready, "the service")
+
+    def set_parameter(name: str, value: float) -> None:
+        given = Parameter(name, value=value).to_parameter_msg()
+        answer = setting.call_async(SetParameters.Request(parameters=[given]))
+        listener.wait(answer.done, "the answer")
+        assert [result.successful for result in answer.result().results] == [value > 0.0]
+
+    # A bag of a thousand seconds: nothing but these can play it in time.
+    set_parameter("seek", 500.0)
+    listener.wait(lambda: listener.numbers("/numbered") == [0, 50], "the 50th")
+    set_parameter("seek", 200.0)
+    listener.wait(lambda: listener.numbers("/numbered") == [0, 50, 20], "the 20th")
+    set_parameter("seek", 200.0)
+    listener.wait(lambda: listener.numbers("/numbered") == [0, 50, 20, 20], "the 20th again")
+    set_parameter("rate", -1.0)
+    set_parameter("rate", 1000.0)
+    code, _, errors = end(listener, process)
+    assert code == 0, errors
+    assert listener.numbers("/numbered") == [0, 50, 20, *range(20, 100)]
+    assert not listener.heard["/noisy"]
+
+
 def test_beside_a_rig_all_is_under_replay(listener: Listener, tmp_path: Path) -> None:
     path = make_bag(tmp_path / "bag", count=5)
     rig = listener.add_node("device_driver")
@@ -246,6 +278,8 @@ def test_a_rig_that_comes_up_ends_the_playing(listener: Listener, tmp_path: Path
         ("{path}/bag --topics nonsense", "/nonsense is not in"),
         ("{path}/bag --start 9", "--start 9 s"),
         ("{path}/bag --rate fast", "invalid float value"),
+        ("{path}/bag --regex (", "is not a regular expression"),
+        ("{path}/bag --regex nonsense", "no topic is chosen; it has /plane"),
     ],
 )
 def test_what_cannot_be_played_is_one_line(
