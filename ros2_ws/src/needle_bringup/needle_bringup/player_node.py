@@ -97,7 +97,7 @@ class Player(Node):
         self._looked_at = 0.0
         self.beside_rig = False
         self.messages = 0
-        self._go_to: int | None = None
+        self.sought: int | None = None  # where playing goes on [ns]
         self._begin = self.start
         self.create_service(SetBool, "~/pause", self._on_pause)
         NodeParameters(self, PlayerParameters)
@@ -220,21 +220,16 @@ class Player(Node):
         """Yield the messages to play, in order, from where playing begins."""
         return raw_messages(self._options.bag, set(self._topics), self._begin, self.end + 1)
 
-    @property
-    def is_sought(self) -> bool:
-        """Whether playing goes on elsewhere (`seek`)."""
-        return self._go_to is not None
-
     def seek(self, time: int) -> None:
         """Go on at another time of recording [ns], or at the nearest that the bag has."""
-        self._go_to = min(max(time, self._contents.start), self.end)
+        self.sought = min(max(time, self._contents.start), self.end)
 
     def begin(self) -> None:
         """Go to where playing goes on: where somebody wanted, or the start."""
-        self._begin, sought = self._go_to or self.start, self.is_sought
-        self._go_to = None
-        if sought:
+        self._begin = self.start if self.sought is None else self.sought
+        if self.sought is not None:
             self._publish_latched(self._begin)
+        self.sought = None
         self.clock.restart(self._begin, time.monotonic())
 
     def press(self, key: str) -> None:
@@ -323,7 +318,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
         while True:
             with contextlib.closing(ReadAhead(player.read)) as source:
                 message = source.next()
-                while message is not None and not player.is_sought:
+                while message is not None and player.sought is None:
                     # A turn of the executor costs more than a message: take it now and then.
                     wait = player.clock.wait(message[1], time.monotonic())
                     turn = time.monotonic() + PATIENCE
@@ -341,7 +336,7 @@ def _play(player: Player, loop: bool, end: EndRequest) -> int:
                     elapsed = player.clock.time(time.monotonic()) - player.start
                     bar.n = min(bar.total, elapsed / _NANOSECONDS)
                     bar.set_description("paused" if player.clock.is_paused else "playing")
-            if not (loop or player.is_sought):
+            if not loop and player.sought is None:
                 player.finish()
                 return EXIT_DONE
             player.begin()

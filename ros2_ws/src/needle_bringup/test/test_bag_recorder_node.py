@@ -294,13 +294,19 @@ def test_a_best_effort_publisher_that_comes_last_is_not_told_of_incompatible_req
     callbacks = PublisherEventCallbacks(incompatible_qos=refused.append)
     publisher = source.node.create_publisher(Int32, "hold", best_effort, event_callbacks=callbacks)
     source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
-    publisher.publish(Int32(data=1))
+
+    def heard() -> bool:
+        # A best effort message is lost where the recorder has not learnt of its publisher yet.
+        publisher.publish(Int32(data=1))
+        return b"/hold" in (bag / "bag_0.mcap").read_bytes()
+
+    source.wait(heard, "the recorder to hear it")
     source.wait(lambda: source.node.count_subscribers("/hold") == 2, "one subscription each")
     code, _, errors = end(process)
     assert code == 0
     assert refused == []
     assert "incompatible" not in errors
-    assert numbers(bag, "/hold") == [1]
+    assert set(numbers(bag, "/hold")) == {1}
 
 
 class Health:
