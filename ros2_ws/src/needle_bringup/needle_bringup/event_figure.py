@@ -9,8 +9,9 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from needle_bringup.bag_reader import Run, Status
+from needle_bringup.bag_reader import HealthEvent, Run, Status
 from needle_bringup.figure_style import ESTIMATE, GOAL_BAND, GREY, MEASURED, RED, STYLE, WIDTH
+from needle_bringup.run_events import health_of, trips
 
 _STATE_COLORS = {
     "STEERING": ESTIMATE,
@@ -61,8 +62,11 @@ def lanes_of(run: Run) -> list[Lane]:
     ]
     if stops:
         lanes.append(Lane("aborted steps", stops))
-    parts = dict.fromkeys(event.part for event in run.health)
-    lanes += [Lane(part, list(_health(run, part, end))) for part in list(parts)[:_MOST_PARTS]]
+    tripped = [Span(event.log_time, event.log_time, MEASURED) for event in trips(run)]
+    lanes.append(Lane("watchdogs", tripped))
+    health = health_of(run)
+    parts = dict.fromkeys(event.part for event in health)
+    lanes += [Lane(part, list(_health(health, part, end))) for part in list(parts)[:_MOST_PARTS]]
     return [lane for lane in lanes if lane.spans]
 
 
@@ -124,9 +128,9 @@ def _pressed(run: Run, end: int) -> Iterable[Span]:
         yield Span(begin, end, GOAL_BAND)
 
 
-def _health(run: Run, part: str, end: int) -> Iterable[Span]:
+def _health(health: Sequence[HealthEvent], part: str, end: int) -> Iterable[Span]:
     """Yield the stretches in which a part was not well."""
-    events = [event for event in run.health if event.part == part]
+    events = [event for event in health if event.part == part]
     for event, after in zip(events, [*(e.log_time for e in events[1:]), end], strict=True):
         if event.level:
             yield Span(event.log_time, after, _LEVEL_COLORS.get(event.level, RED))

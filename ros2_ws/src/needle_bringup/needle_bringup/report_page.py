@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from needle_bringup import html_page
 from needle_bringup.bag_reader import Run
 from needle_bringup.event_figure import level_name
+from needle_bringup.run_events import troubles
 from needle_bringup.stage_timing import StageTiming
 from needle_bringup.step_figures import timing_rows
 from needle_common.cli import JsonValue
@@ -151,7 +152,7 @@ def _timing(timings: Sequence[StageTiming]) -> str:
 
 def _health(run: Run) -> str:
     title = "<h2>Warnings and faults</h2>"
-    events = [event for event in run.health if event.level]
+    events = troubles(run)
     if not events:
         return title + html_page.note("None were reported.")
     start = run.first_command or events[0].log_time
@@ -167,7 +168,10 @@ def _health(run: Run) -> str:
     shown = html_page.table(("when", "what", "where", "why"), rows[:_MOST_EVENTS])
     more = len(rows) - _MOST_EVENTS
     rest = html_page.note(f"{more} more are in the bag, on /diagnostics.") if more > 0 else ""
-    words = "Seconds of wall time after the first step's command."
+    words = (
+        "Seconds of wall time after the first step's command. What was over before it, while nodes "
+        "waited for each other, is left out."
+    )
     return title + html_page.note(words) + shown + rest
 
 

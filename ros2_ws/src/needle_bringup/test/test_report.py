@@ -9,9 +9,10 @@ from pathlib import Path
 import pytest
 
 from needle_bringup import report
-from needle_bringup.bag_reader import HealthEvent, Result, read_run
+from needle_bringup.bag_reader import HealthEvent, Result, Status, read_run
 from needle_bringup.event_figure import lanes_of
 from needle_bringup.report_page import verdict_text
+from needle_bringup.run_events import troubles
 from needle_bringup.run_summary import summarize
 
 MakeRun = Callable[..., Path]
@@ -103,6 +104,39 @@ def test_lanes_show_what_was_when(make_run: MakeRun) -> None:
     assert len(lanes["aborted steps"]) == 1
     (steering,) = lanes["controller"]
     assert steering.begin == begin
+
+
+def test_troubles_are_what_went_wrong_and_not_how_every_run_starts(make_run: MakeRun) -> None:
+    run = read_run(make_run())
+    begin, second = run.first_command, 10**9
+    assert begin is not None
+    health = [
+        HealthEvent(begin - 3 * second, "sim_rig: simulation", 1, "waiting"),
+        HealthEvent(begin - 2 * second, "stereo_tracker: images", 1, "no images yet"),
+        HealthEvent(begin - second, "sim_rig: simulation", 0, "running"),
+        HealthEvent(begin + 2 * second, "sim_rig: simulation", 1, "waiting again"),
+    ]
+
+    def device(seconds: float, trips: int, reason: str) -> Status:
+        values = {"state": "MOVING", "watchdog_trips": str(trips), "reason": reason}
+        return Status(begin + round(seconds * second), values)
+
+    run = dataclasses.replace(
+        run,
+        health=health,
+        results=[Result(begin + second, 0, "aborted: hold released"), *run.results],
+        device_status=[device(0.0, 1, "old"), device(0.5, 2, "no hold"), device(0.6, 2, "no hold")],
+    )
+    assert [(event.part, event.message) for event in troubles(run)] == [
+        ("stereo_tracker: images", "no images yet"),
+        ("device: watchdog", "no hold"),
+        ("device: step", "aborted: hold released"),
+        ("sim_rig: simulation", "waiting again"),
+    ]
+    lanes = {lane.name: lane.spans for lane in lanes_of(run)}
+    assert lanes["watchdogs"][0].begin == begin + second // 2
+    (waiting,) = lanes["sim_rig: simulation"]
+    assert waiting.begin == begin + 2 * second
 
 
 def test_verdicts(make_run: MakeRun) -> None:

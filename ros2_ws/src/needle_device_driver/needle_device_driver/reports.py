@@ -87,7 +87,7 @@ class DeviceStatus:
     needle_out_confirmed : bool
         Whether a person said that the needle is out.
     watchdog_trips : int
-        How often a hold, tip or reply was too old.
+        How often a hold, tip or reply was too old; a lapse that only pauses is none.
     commands_refused : int
         How many commands were refused.
     needs_time : bool

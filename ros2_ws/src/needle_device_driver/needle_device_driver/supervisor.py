@@ -371,12 +371,13 @@ class MotionSupervisor:
             return
         core = self._core
         moving = core.moves_with_hold
-        core.watchdog_trips += moving
         text = f"no hold message for {age:.3f} s, limit {self._limits.hold_timeout:g} s"
         core.notice(text, Rule.HOLD_AGE)
         if self._pause_on_lapse:
+            # Simulated time waits too: the same motion goes on later.
             core.reason = text + ": paused"
             return
+        core.watchdog_trips += moving
         self._hold.require_new_press()
         core.reason = text + ": release and press again"
         if moving:
