@@ -123,8 +123,10 @@ class OperatorNode(Node):
         while disabled is not None and not disabled.done() and time.monotonic() < deadline:
             executor.spin_once(timeout_sec=0.05)
         line = f"operator: {outcome.reason}"
-        self._progress.close(line)
-        if self._progress.stream is not sys.stderr:
+        supervised = self._progress.stream is not sys.stderr
+        # Whoever supervises knows why it interrupts, and says so.
+        self._progress.close("" if supervised and outcome.interrupted else line)
+        if supervised:
             print(line, file=sys.stderr)
         if outcome.interrupted:
             return EXIT_INTERRUPTED
@@ -157,6 +159,7 @@ class OperatorNode(Node):
         self._sequence.see_controller(values_of(message), time.monotonic())
         if self._sequence.steering and self._sequence.depth is not None:
             self._progress.show(self._sequence.insertion, self._sequence.depth)
+            self._progress.tell_wait(self._sequence.waits_because)
 
     def _on_device_status(self, message: DiagnosticStatus) -> None:
         speaker = f"/{message.hardware_id}"

@@ -29,7 +29,7 @@ class OperatorParameters:
         3600.0,
     )
     stall_timeout: float = fixed_parameter(
-        60.0,
+        30.0,
         "s",
         "The hold is released when the needle has not moved on for this long.",
         0.1,

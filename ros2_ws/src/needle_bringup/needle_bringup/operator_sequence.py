@@ -107,6 +107,7 @@ class OperatorSequence:
         self.presses_again = 0
         self.insertion = 0.0
         self.depth: float | None = None
+        self.waits_because = ""
         self.outcome: Outcome | None = None
 
     @property
@@ -194,6 +195,8 @@ class OperatorSequence:
         """Take the key-values of needle/controller_status."""
         self.insertion = _number(values.get("insertion_m")) or 0.0
         self.depth = _number(values.get("depth_m"))
+        waits = values.get("state") == "WAITING_FOR_TIP"
+        self.waits_because = values.get("reason", "") if waits else ""
         progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
@@ -232,9 +235,10 @@ class OperatorSequence:
                 self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
         elif now >= self._progress_at + self._stall_timeout:
             state = self._progress[0] if self._progress else "silent"
+            why = f": {self.waits_because}" if self.waits_because else ""
             self._end(
                 f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
-                f"(plane_controller is {state})"
+                f"(plane_controller is {state}{why})"
             )
 
     @property

@@ -24,6 +24,7 @@ class Progress:
         self._terminal = stream.isatty()
         self._bar: tqdm[None] | None = None
         self._shown_quarter = 0
+        self._told_wait = ""
 
     def show(self, insertion: float, depth: float) -> None:
         """Show that the needle is `insertion` of `depth` in [m]."""
@@ -37,12 +38,23 @@ class Progress:
             self._shown_quarter = quarter
             print(f"{insertion * 1e3:5.1f} of {depth * 1e3:.1f} mm", file=self.stream, flush=True)
 
+    def tell_wait(self, reason: str) -> None:
+        """Say once why the needle does not go on; an empty reason: it does."""
+        if reason and reason != self._told_wait:
+            self._take_bar_away()
+            print(f"waiting: {reason}", file=self.stream, flush=True)
+        self._told_wait = reason
+
     def close(self, line: str) -> None:
-        """Take the bar away and leave one line."""
+        """Take the bar away and leave one line, unless it is empty."""
+        self._take_bar_away()
+        if line:
+            print(line, file=self.stream, flush=True)
+
+    def _take_bar_away(self) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None
-        print(line, file=self.stream, flush=True)
 
     def _show_bar(self, insertion: float, depth: float) -> None:
         if self._bar is None:

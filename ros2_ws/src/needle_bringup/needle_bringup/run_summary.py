@@ -12,6 +12,9 @@ GOAL = 1e-3
 LAST_STRETCH = 20e-3
 # The axes report the depth with encoder steps, not exactly.
 DEPTH_TOLERANCE = 1e-6
+# A device that moves no more, and the level of diagnostics that says so.
+STOPPED = ("FAULT", "ESTOPPED")
+ERROR = 2
 
 Floats = npt.NDArray[np.float64]
 
@@ -63,7 +66,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "wall_s": wall_s,
         "watchdog_trips": watchdog_trips(run),
         "state": run.last_status("state"),
-        "reason": run.recording.get("recording_ended") or run.last_status("reason"),
+        "reason": run.recording.get("recording_ended") or stop_cause(run),
         "commit": run.commit,
         "bag": str(run.path),
     }
@@ -123,6 +126,33 @@ def reached_depth(run: Run) -> bool:
         return False
     deepest = float(run.joints.values[:, 0].max(initial=0.0))
     return deepest >= wanted - DEPTH_TOLERANCE
+
+
+def stop_cause(run: Run) -> str:
+    """Return why the needle went no deeper: what was said first after it was last steered.
+
+    What comes later, such as a device that is disabled at the end, only follows from it.
+    """
+    if reached_depth(run):
+        return run.last_status("reason")
+    steered = [s.log_time for s in run.controller_status if s.values.get("state") == "STEERING"]
+    causes = [
+        (status.log_time, status.values["reason"])
+        for status in run.controller_status
+        if status.log_time > max(steered, default=0) and status.values.get("reason")
+    ]
+    begin = run.first_command or 0
+    causes += [
+        (status.log_time, status.values.get("fault") or status.values.get("reason", ""))
+        for status in run.device_status
+        if status.log_time > begin and status.values.get("state") in STOPPED
+    ]
+    causes += [
+        (event.log_time, event.message)
+        for event in run.health
+        if event.log_time > begin and event.part == "sim_rig: simulation" and event.level >= ERROR
+    ]
+    return min(causes, default=(0, ""))[1]
 
 
 def watchdog_trips(run: Run) -> int:

@@ -284,9 +284,18 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
         value = summary.get(key)
         return f"{value:.{digits}f}" if isinstance(value, (int, float)) else "-"
 
-    verdict = "CONVERGED" if summary.get("converged") else "MISSED"
+    if summary.get("reached_depth"):
+        verdict = "CONVERGED" if summary.get("converged") else "MISSED"
+        away = f"{figure('r1_final_mm')} mm from the plane"
+        head = [f"{verdict}: the tip ends {away} (goal: within 1 mm)"]
+    else:
+        reason = summary.get("reason") or "no reason given"
+        head = [
+            f"NOT FINISHED: stopped at {figure('insertion_final_mm', 1)} mm: {reason}",
+            f"  r1 there          {figure('r1_final_mm')} mm",
+        ]
     lines = [
-        f"{verdict}: the tip ends {figure('r1_final_mm')} mm from the plane (goal: within 1 mm)",
+        *head,
         f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
         f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms",
         f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
@@ -294,9 +303,6 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
         f"  speed             {figure('steps_per_s', 1)} steps/s; {figure('wall_s', 1)} s in all",
         f"  report            {shown(bag / REPORT)}",
     ]
-    if not summary.get("reached_depth"):
-        reason = summary.get("reason") or "no reason given"
-        lines.insert(1, f"  ended early       {reason}")
     if summary.get("watchdog_trips"):
         trips = summary["watchdog_trips"]
         lines.append(f"  watchdogs         tripped {trips} times: this run may not repeat exactly")

@@ -94,6 +94,7 @@ class DeviceDriverNode(LifecycleNode):
         self.ended = False
         self._waiting_for = "the driver to be activated"
         self._refusal = ""
+        self._ends_if_refused = False
         self._give_up_at = time.monotonic() + values.connect_timeout
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_ns: int | None = None
@@ -224,7 +225,9 @@ class DeviceDriverNode(LifecycleNode):
         if not why_not:
             # Once: afterwards the lifecycle is in somebody's hands.
             self._autostart = False
+            self._ends_if_refused = True
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
+                self._ends_if_refused = False
                 self.trigger_activate()
                 return
             raise UserError(f"{self.get_fully_qualified_name()}: {self._refusal}")
@@ -247,6 +250,10 @@ class DeviceDriverNode(LifecycleNode):
             why_not = "" if reply.success else reply.message
         if not why_not:
             self._device.simulated = self._is_simulated()
+        elif self._ends_if_refused:
+            # Its last words are these.
+            self._refusal = why_not
+            return TransitionCallbackReturn.FAILURE
         self._device.report()
         if why_not:
             self._refusal = why_not

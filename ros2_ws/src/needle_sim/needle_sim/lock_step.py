@@ -5,6 +5,8 @@ from __future__ import annotations
 import enum
 
 _STEERING = ("STEERING", "WAITING_FOR_TIP")
+# So many exposures in a row may pass without a step: hands that block both cameras take half of it.
+MAX_WITHOUT_STEP = 60
 
 
 class Action(enum.Enum):
@@ -37,10 +39,20 @@ class LockStep:
         self._tip_wanted_after_ns: int | None = None
         self._heard_at = 0.0
         self.watchdog_trips = 0
+        self._without_step = 0
+
+    @property
+    def why_stuck(self) -> str:
+        """Why the needle will not go on; empty while it may."""
+        if self._without_step < MAX_WITHOUT_STEP:
+            return ""
+        tip = "no tip was found" if self._tip_lost else "no tip led to one"
+        return f"{self._without_step} exposures since the last step, and {tip}"
 
     def step_ended(self, now: float) -> None:
         """Take the end of a step, whether it succeeded or was aborted."""
         self._step_ended = True
+        self._without_step = 0
         self._heard_at = now
 
     def take_controller_status(
@@ -48,6 +60,8 @@ class LockStep:
     ) -> None:
         """Take the controller's state, what it waits for, and after which stamp it wants a tip."""
         self._state = state
+        if state not in _STEERING:
+            self._without_step = 0
         self._tip_wanted_after_ns = tip_after_ns if awaiting == "tip" else None
         self._heard_at = now
 
@@ -57,6 +71,7 @@ class LockStep:
             return
         self._unanswered = False
         self._tip_lost = not found
+        self._without_step += self._state in _STEERING
         self._heard_at = now
 
     def exposed(self, stamp_ns: int, now: float) -> None:

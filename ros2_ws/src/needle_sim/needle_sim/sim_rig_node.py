@@ -279,13 +279,19 @@ class SimRigNode(Node):
 
     def _end_outside_phantom(self) -> None:
         height, surface = float(self._bench.tip[0]), self._sensors.surface_height
-        if abs(height) > surface and not self._ended:
-            self._ended = (
+        if abs(height) > surface:
+            self._end_run(
                 f"the tip left the phantom: x = {height * 1e3:.2f} mm is beyond "
                 f"{math.copysign(surface, height) * 1e3:.2f} mm"
             )
-            self._device.end_run(self._ended)
-            self._tell_health()
+
+    def _end_run(self, why: str) -> None:
+        if self._ended:
+            return
+        self._ended = why
+        # The cause is heard before what follows from it.
+        self._tell_health()
+        self._device.end_run(why)
 
     # ---- start --------------------------------------------------------------------------------
 
@@ -351,6 +357,8 @@ class SimRigNode(Node):
                 math.isfinite(message.pose.covariance[0]),
                 time.monotonic(),
             )
+            if self._lock_step.why_stuck:
+                self._end_run(self._lock_step.why_stuck)
 
 
 def main() -> int:

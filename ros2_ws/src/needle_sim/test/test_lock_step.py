@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from needle_sim.lock_step import Action, LockStep
+from needle_sim.lock_step import MAX_WITHOUT_STEP, Action, LockStep
 
 STAMP = 40_000_000
 
@@ -117,3 +117,26 @@ def test_an_unanswered_exposure_keeps_the_next_back_but_for_rule_4() -> None:
     lock_step.take_answer(STAMP, True, 0.0)
     assert next_action(lock_step) is Action.EXPOSE
     assert lock_step.watchdog_trips == 1
+
+
+def test_exposures_without_a_step_have_a_bound_while_steering() -> None:
+    lock_step = LockStep(answered=True, reexpose_after=2.0)
+
+    def expose(count: int, *, found: bool) -> None:
+        for number in range(count):
+            lock_step.exposed(STAMP + number, 0.0)
+            lock_step.take_answer(STAMP + number, found, 0.0)
+
+    lock_step.take_controller_status("IDLE", "nothing", 0, 0.0)
+    expose(2 * MAX_WITHOUT_STEP, found=False)
+    assert lock_step.why_stuck == ""
+    lock_step.take_controller_status("STEERING", "tip", 0, 0.0)
+    expose(MAX_WITHOUT_STEP - 1, found=False)
+    assert lock_step.why_stuck == ""
+    lock_step.step_ended(0.0)
+    expose(MAX_WITHOUT_STEP - 1, found=True)
+    assert lock_step.why_stuck == ""
+    expose(1, found=True)
+    assert lock_step.why_stuck == "60 exposures since the last step, and no tip led to one"
+    expose(1, found=False)
+    assert lock_step.why_stuck == "61 exposures since the last step, and no tip was found"
