@@ -74,11 +74,11 @@ def for_users(found: dict[str, Path]) -> dict[str, Path]:
 
     Those of the virtual environment itself are ROS 2's generators of message code.
     """
-    environment = Path(sys.executable).parents[1]
+    environment = Path(sys.executable).parents[1].resolve()
     return {
         name: prefix
         for name, prefix in found.items()
-        if prefix != environment and executables(name, prefix)
+        if prefix.resolve() != environment and executables(name, prefix)
     }
 
 

@@ -1,0 +1,319 @@
+"""Types what the documents say, word for word and in order, and tells what did not work.
+
+    python scripts/lib/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
+
+Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`
+is a file of that name; `text` and `mermaid` are not typed. What goes on until Ctrl-C runs until the
+page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block leaves it out.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import re
+import shlex
+import signal
+import subprocess
+import sys
+import tempfile
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = (
+    "docs/setup.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
+)  # fmt: skip
+COMMAND, PROGRAM, FILE = "command", "python", "yaml"
+NOT_TYPED = ("text", "mermaid")
+# Executables that go on until Ctrl-C, as anything with `--loop`.
+NODES = (
+    "sim_rig", "stereo_tracker", "plane_controller", "recorder", "device_driver", "drive_emulator",
+    "stereo_camera",
+)  # fmt: skip
+# It types these pages itself.
+LEFT_OUT = ("scripts/test",)
+# A command; a service that refuses because something is still under way is asked again [s].
+LIMIT = 600.0
+READY = 60.0
+ENDS = 40.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Block:
+    """What a page says to type.
+
+    Attributes
+    ----------
+    line : int
+        Where it begins in the page, from 1.
+    kind : str
+        COMMAND, PROGRAM or FILE.
+    text : str
+        Its lines.
+    name : str
+        A FILE's name.
+    ends_nodes : bool
+        Whether Ctrl-C comes before it.
+    """
+
+    line: int
+    kind: str
+    text: str
+    name: str = ""
+    ends_nodes: bool = False
+
+
+class PageError(Exception):
+    """Something that does not work as a page says."""
+
+
+def blocks(page: str) -> list[Block]:
+    """Return what a page says to type, in order.
+
+    Raises
+    ------
+    PageError
+        For a fence of an unknown kind, or a YAML block without a name.
+    """
+    found = []
+    marks: list[str] = []
+    pattern = re.compile(
+        r"^(?P<indent> *)```(?P<info>.*)\n(?P<fenced>(?:.*\n)*?) *```$"
+        r"|^<!-- (?P<mark>.+?) -->$"
+        r"|(?<=\n\n)(?P<indented>(?:    .*\n+)+)",
+        re.MULTILINE,
+    )
+    for match in pattern.finditer(page):
+        if match["mark"]:
+            marks.append(match["mark"])
+            continue
+        line = page.count("\n", 0, match.start()) + 1
+        kind, _, name = (match["info"] or "sh").partition(" ")
+        text = textwrap.dedent(match["fenced"] or match["indented"] or "").strip("\n")
+        left_out = any(mark.startswith("not typed: ") for mark in marks)
+        ends_nodes = "Ctrl-C" in marks
+        marks.clear()
+        if left_out or kind in NOT_TYPED:
+            continue
+        known = {"sh": COMMAND, PROGRAM: PROGRAM, FILE: FILE}
+        if kind not in known or (kind == FILE and not name):
+            raise PageError(f"line {line}: a block of kind '{kind} {name}' cannot be typed")
+        found.append(Block(line, known[kind], text, name, ends_nodes))
+    return found
+
+
+def commands(text: str) -> list[str]:
+    """Return a block's commands; one that goes on over several lines is one."""
+    found: list[str] = []
+    for line in text.replace("\\\n", " ").splitlines():
+        if found and found[-1].count('"') % 2:
+            found[-1] += f"\n{line}"
+        elif line.strip():
+            found.append(line)
+    return found
+
+
+class Session:
+    """Someone who types a page.
+
+    Parameters
+    ----------
+    folder : Path
+        The checkout, or what looks like one.
+    environment : mapping
+        Of every command.
+    say : callable
+        Takes each command before it is run.
+    change : callable, optional
+        Changes a command before it is run: a test has less time.
+
+    Attributes
+    ----------
+    said : list of str
+        What each command printed.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        environment: Mapping[str, str],
+        say: Callable[[str], None],
+        change: Callable[[str], str] = str,
+    ) -> None:
+        self._folder = folder
+        self._environment = dict(environment)
+        self._say = say
+        self._change = change
+        self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
+        self.said: list[str] = []
+        self._logs = Path(tempfile.mkdtemp(prefix="typed_"))
+
+    def type(self, page: Path) -> None:
+        """Type a page, then end what it started.
+
+        Raises
+        ------
+        PageError
+            At the first block that does not work.
+        """
+        found = blocks(page.read_text("utf-8"))
+        for block in found:
+            if block.kind == FILE:
+                (self._folder / block.name).write_text(f"{block.text}\n", encoding="utf-8")
+        try:
+            for block in found:
+                try:
+                    self._type_block(block)
+                except PageError as error:
+                    raise PageError(f"{page}:{block.line}: {error}") from error
+            self.end_nodes()
+        finally:
+            for process, _ in self._nodes.values():
+                process.kill()
+                process.wait()
+
+    def _type_block(self, block: Block) -> None:
+        if block.ends_nodes:
+            self.end_nodes()
+        if block.kind == PROGRAM:
+            self._run(shlex.join(["python", "-c", block.text]))
+        elif block.kind == COMMAND and re.search(r"&$", block.text, re.MULTILINE):
+            self._run(block.text)
+        elif block.kind == COMMAND:
+            for command in commands(block.text):
+                self._type_command(command)
+
+    def _type_command(self, command: str) -> None:
+        words = shlex.split(command, comments=True)
+        if not words or words[0] in LEFT_OUT:
+            return
+        runs = words[:2] == ["ros2", "run"] and "--help" not in words
+        if runs and (words[3] in NODES or "--loop" in words):
+            self._start_node(words[3], command)
+            return
+        said = self._run(command)
+        end = time.monotonic() + READY
+        while "success=False" in said:
+            if time.monotonic() > end:
+                raise PageError(f"{command}\n{said}")
+            said = self._run(command)
+
+    def _shell(self, command: str) -> list[str]:
+        command = self._change(command)
+        self._say(command)
+        before = "" if "scripts/setup" in command else "source scripts/env.sh\n"
+        return ["bash", "-c", f"{before}{command}"]
+
+    def _run(self, command: str) -> str:
+        wanted = re.search(r"exit code (\d+)", command)
+        try:
+            result = subprocess.run(
+                self._shell(command),
+                check=False,
+                cwd=self._folder,
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                timeout=LIMIT,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise PageError(f"{command}\ndoes not end") from error
+        self.said.append(result.stdout)
+        if result.returncode != int(wanted[1] if wanted else 0):
+            raise PageError(f"{command}\nends with {result.returncode}: {result.stdout}")
+        return result.stdout
+
+    def _start_node(self, name: str, command: str) -> None:
+        log = self._logs / name
+        # Without job control a background process would ignore Ctrl-C.
+        shell = self._shell(f"exec {command}")
+        with log.open("wb") as output:
+            process = subprocess.Popen(
+                shell,
+                cwd=self._folder,
+                env=self._environment,
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+            )
+        self._nodes[name] = process, log
+        end = time.monotonic() + READY
+        listing = ["bash", "-c", "source scripts/env.sh; ros2 node list"]
+        while f"/{name}" not in self._ask(listing).split():
+            if process.poll() is not None or time.monotonic() > end:
+                raise PageError(f"{command}\nis not there: {log.read_text('utf-8')}")
+
+    def _ask(self, shell: list[str]) -> str:
+        return subprocess.run(
+            shell,
+            check=False,
+            cwd=self._folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            timeout=READY,
+        ).stdout
+
+    def end_nodes(self) -> None:
+        """Press Ctrl-C in every terminal.
+
+        Raises
+        ------
+        PageError
+            If a node does not end, ended before, or complained.
+        """
+        for name, (process, log) in list(self._nodes.items()):
+            if process.poll() is not None:
+                raise PageError(f"{name} has ended by itself: {log.read_text('utf-8')}")
+            process.send_signal(signal.SIGINT)
+        for name, (process, log) in list(self._nodes.items()):
+            try:
+                code = process.wait(ENDS)
+            except subprocess.TimeoutExpired as error:
+                raise PageError(f"{name} does not end on Ctrl-C") from error
+            assert process.stdin is not None
+            process.stdin.close()
+            said = log.read_text("utf-8")
+            if code not in (0, 130) or "Traceback" in said:
+                raise PageError(f"{name} ends with {code}: {said}")
+            del self._nodes[name]
+
+
+@contextlib.contextmanager
+def fresh_clone() -> Iterator[Path]:
+    """Make a clone of this checkout's last commit, for as long as the context lasts."""
+    with tempfile.TemporaryDirectory(prefix="needle_clone_") as folder:
+        clone = Path(folder) / "needle"
+        subprocess.run(["git", "clone", "--quiet", str(ROOT), str(clone)], check=True)
+        yield clone
+
+
+def main(pages: list[str]) -> int:
+    """Type pages in a fresh clone; returns 1 where one does not work."""
+    environment = {
+        name: value
+        for name, value in os.environ.items()
+        if name not in ("PYTHONPATH", "AMENT_PREFIX_PATH", "VIRTUAL_ENV")
+    }
+    failed = 0
+    with fresh_clone() as clone:
+        for page in pages or PAGES:
+            print(f"== {page}", flush=True)
+            try:
+                Session(clone, environment, lambda line: print(f"$ {line}", flush=True)).type(
+                    clone / page
+                )
+            except PageError as error:
+                print(f"FAILED {error}", flush=True)
+                failed = 1
+    return failed
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

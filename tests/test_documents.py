@@ -1,0 +1,143 @@
+"""README and docs, typed word for word against the simulated rig; only insertions are shorter."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import sys
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import pytest
+import yaml
+
+from needle_common.ros_domain import own_domain
+from needle_tracker.calibration_session import parse_session
+from typed_pages import PAGES, ROOT, PageError, Session, blocks
+
+SHORT_MM = 6
+FREE_VIEWS = 12
+SHARED = (".venv", "README.md", "docs", "ros2_ws", "scripts")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """Return a folder that looks like this checkout, but has bags of its own."""
+    folder = tmp_path / "needle"
+    (folder / "bags").mkdir(parents=True)
+    for name in SHARED:
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "bags" / "README.md").symlink_to(ROOT / "bags" / "README.md")
+    return folder
+
+
+def shortened(scratch: Path) -> Callable[[str], str]:
+    """Return what makes a command's insertion short and keeps its files out of the way."""
+    numbers = count()
+
+    def change(command: str) -> str:
+        command = command.replace("/tmp/", f"{scratch}/")
+        if "plane_controller" in command:
+            return f"{command} -p depth:=0.00{SHORT_MM}"
+        if "render_images" in command:
+            return f"{command} --frames 8"
+        if not command.startswith("scripts/simulate"):
+            return command
+        words, _, _ = command.partition("#")
+        words = re.sub(r"--depth-mm \d+", "", words) + f" --depth-mm {SHORT_MM}"
+        if "--bag" not in words:
+            words += f" --bag {scratch}/run_{next(numbers)}"
+        # So short a needle may not have reached the plane.
+        return f"{words}; test $? -le 1"
+
+    return change
+
+
+def draw_session(folder: Path) -> None:
+    """Draw the images that docs/calibration.md asks for, of the places in its session file."""
+    sys.path.insert(0, str(ROOT / "ros2_ws/src/needle_tracker/test"))
+    try:
+        session = importlib.import_module("calibration.session")
+        rig = importlib.import_module("calibration.synthetic_rig").TrueRig
+    finally:
+        sys.path.pop(0)
+    (text,) = (
+        block.text
+        for block in blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
+        if block.name == "session.yaml"
+    )
+    truth = rig.read(ROOT / "ros2_ws/src/needle_tracker/config/calibration.yaml")
+    places = parse_session(yaml.safe_load(text)).places
+    session.record(folder, truth, places, free=FREE_VIEWS)
+    (folder / "left").rename(folder / "L")
+    (folder / "right").rename(folder / "R")
+
+
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("page", PAGES)
+def test_every_block_works_as_written(page: str, checkout: Path, tmp_path: Path) -> None:
+    scratch = tmp_path / "t"
+    scratch.mkdir()
+    if page == "docs/calibration.md":
+        draw_session(checkout)
+    with own_domain() as domain:
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        session = Session(checkout, environment, print, shortened(scratch))
+        session.type(checkout / page)
+    if page == "docs/hardware.md":
+        step, joints = session.said[-2:]
+        assert "frame_id: succeeded" in step
+        insertion, rotation = map(float, re.findall(r"-?\d[\d.e-]*", joints))
+        assert insertion == pytest.approx(0.001, abs=1e-5)
+        assert rotation == pytest.approx(0.1, abs=2e-3)
+
+
+def test_a_block_that_fails_is_named_by_page_and_line(checkout: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.md"
+    page.write_text("Words.\n\n    true\n\nMore.\n\n    echo said; exit 3   # so it is\n")
+    session = Session(checkout, os.environ, print)
+    with pytest.raises(PageError, match=r"page\.md:7: .*\nends with 3: said"):
+        session.type(page)
+
+
+def test_blocks_of_every_kind_are_found() -> None:
+    page = """\
+Words.
+
+    one
+    two \\
+        more
+
+<!-- not typed: a reason -->
+
+    three
+
+- item
+
+  ```sh
+  four
+  ```
+
+```text
+five
+```
+
+<!-- Ctrl-C -->
+
+```yaml a.yaml
+six: 1
+```
+"""
+    found = [(b.line, b.kind, b.text, b.name, b.ends_nodes) for b in blocks(page)]
+    assert found == [
+        (3, "command", "one\ntwo \\\n    more", "", False),
+        (13, "command", "four", "", False),
+        (23, "yaml", "six: 1", "a.yaml", True),
+    ]
+
+
+def test_a_yaml_file_without_a_name_cannot_be_typed() -> None:
+    with pytest.raises(PageError, match="line 1"):
+        blocks("```yaml\na: 1\n```\n")
