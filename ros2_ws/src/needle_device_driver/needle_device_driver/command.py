@@ -6,7 +6,7 @@ import dataclasses
 import math
 
 from needle_common.foreign_text import plain_list
-from needle_device_driver.limits import SafetyLimits
+from needle_device_driver.limits import HARD_STEP_TIME_CAP, SafetyLimits
 from needle_device_driver.rules import Rule
 
 INSERTION_JOINT = "insertion_joint"
@@ -145,9 +145,11 @@ def _check_form(command: Command) -> Refusal | None:
         return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, wanted 2")
     if not all(map(math.isfinite, (*point.positions, *point.others, point.time_from_start))):
         return Refusal(Rule.COMMAND_FINITE, "a number is not finite")
-    if point.time_from_start <= 0.0:
+    if not 0.0 < point.time_from_start <= HARD_STEP_TIME_CAP:
         return Refusal(
-            Rule.COMMAND_FORM, f"time_from_start {point.time_from_start:g} s, wanted > 0 s"
+            Rule.COMMAND_FORM,
+            f"time_from_start {point.time_from_start:g} s, wanted > 0 s and at most "
+            f"{HARD_STEP_TIME_CAP:g} s",
         )
     return None
 

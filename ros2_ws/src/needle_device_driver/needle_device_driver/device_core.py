@@ -198,7 +198,7 @@ class DeviceCore:
         self.fault = reason
         self.end_motion(f"aborted: {reason}", stop=True)
         self.go(trigger, reason)
-        self.notice(reason, rule)
+        self._events.append(Notice(reason, rule, fault=True))
         try:
             # A drive that keeps its power pulls a blocked axis on as soon as it comes free.
             self._axes.each(lambda axis: axis.power(False))

@@ -25,6 +25,7 @@ from needle_common.partners_node import AnsweringNodes, unheard, unpublished, un
 from needle_common.reach import DISCOVERY, is_open
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
+from needle_device_driver.cycle_schedule import CycleSchedule
 from needle_device_driver.device_interface_node import DeviceInterface
 from needle_device_driver.drive_cycle import DriveCycle
 from needle_device_driver.drive_identity import are_emulated
@@ -54,7 +55,7 @@ PERIOD = PERIOD_NS / NANOSECONDS
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 _HELD_UP = 2.5 * PERIOD
-_LATE = 1.5 * PERIOD
+_SLACK = 0.1 * PERIOD
 
 
 class DeviceDriverNode(LifecycleNode):
@@ -98,9 +99,8 @@ class DeviceDriverNode(LifecycleNode):
         self._give_up_at = time.monotonic() + values.connect_timeout
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_ns: int | None = None
-        self._cycled_at: float | None = None
+        self._schedule = CycleSchedule(PERIOD, _SLACK)
         self._timed_at: float | None = None
-        self._late_cycles = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
             self,
@@ -143,6 +143,8 @@ class DeviceDriverNode(LifecycleNode):
     # ---- the cycle ----------------------------------------------------------------------------
 
     def _on_timer(self) -> None:
+        self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
+        self._timer.reset()
         if self._supervisor.state is State.UNCONFIGURED:
             self._start_by_itself()
             return
@@ -153,12 +155,6 @@ class DeviceDriverNode(LifecycleNode):
             self._supervisor.observe(time.monotonic())
             self._device.report()
             return
-        # A cycle that comes late is never made up for: set-points sent faster than the drives take
-        # them would be a speed that nobody asked for.
-        self._timer.reset()
-        now = time.monotonic()
-        self._late_cycles += self._cycled_at is not None and now - self._cycled_at > _LATE
-        self._cycled_at = now
         self._cycle(self.get_clock().now().nanoseconds, _REPLY_WAIT)
 
     def _hear_first(self) -> None:
@@ -202,7 +198,7 @@ class DeviceDriverNode(LifecycleNode):
             "frames_sent": str(link.frames_sent),
             "frames_received": str(link.frames_received),
             "bus_errors": str(link.errors),
-            "late_cycles": str(self._late_cycles),
+            "late_cycles": str(self._schedule.late),
             "unanswered_syncs": str(self._drives.unanswered),
         }
         level, message = Level.OK, "connected"

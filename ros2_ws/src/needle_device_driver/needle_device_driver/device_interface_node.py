@@ -27,6 +27,7 @@ from needle_device_driver.conversions import (
     to_result,
     to_status,
 )
+from needle_device_driver.notice_limit import NoticeLimit
 from needle_device_driver.reports import DeviceStatus, Notice, Reply, StepResult
 from needle_device_driver.supervisor import MotionSupervisor
 
@@ -78,6 +79,7 @@ class DeviceInterface:
         self._on_result = on_result
         self._told: DeviceStatus | None = None
         self._told_at = 0.0
+        self._notices = NoticeLimit()
         self.simulated = simulated
         self._topic = node.resolve_topic_name("device/status")
         domain = node.context.get_domain_id()
@@ -112,8 +114,7 @@ class DeviceInterface:
                 self.results.publish(to_result(event))
                 self._on_result(event)
             elif isinstance(event, Notice):
-                rule = "" if event.rule is None else f" [{event.rule.value}]"
-                self._node.get_logger().warning(event.text + rule)
+                self._log(event)
         now = time.monotonic()
         status = dataclasses.replace(self._supervisor.status(now), simulated=self.simulated)
         told = self._told
@@ -125,6 +126,14 @@ class DeviceInterface:
             or dataclasses.replace(status, insertion=told.insertion, rotation=told.rotation) != told
         ):
             self._tell(status, now)
+
+    def _log(self, notice: Notice) -> None:
+        text = self._notices.admit(notice, time.monotonic())
+        # rclpy wants each place in the code to keep to one level.
+        if text and notice.fault:
+            self._node.get_logger().error(text)
+        elif text:
+            self._node.get_logger().warning(text)
 
     @property
     def others(self) -> str:

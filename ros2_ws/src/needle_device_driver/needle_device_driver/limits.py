@@ -11,6 +11,8 @@ from needle_common.errors import OutOfBoundsError
 HARD_SPEED_CAP = 0.005
 HARD_STEP_LENGTH_CAP = 0.005
 HARD_HOLD_TIMEOUT_CAP = 0.5
+# The longest step there is, at a hundredth of a millimetre a second, and some more [s].
+HARD_STEP_TIME_CAP = 600.0
 
 
 @dataclasses.dataclass(frozen=True)

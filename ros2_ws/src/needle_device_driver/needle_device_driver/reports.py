@@ -37,10 +37,17 @@ class Notice:
         One sentence with value, unit and bound.
     rule : Rule or None
         The safety rule behind it.
+    fault : bool
+        Whether it led to FAULT or ESTOPPED.
     """
 
     text: str
     rule: Rule | None = None
+    fault: bool = False
+
+    def __str__(self) -> str:
+        """Return the sentence with the rule's name."""
+        return self.text if self.rule is None else f"{self.text} [{self.rule.value}]"
 
 
 Event: TypeAlias = StepResult | Notice

@@ -61,6 +61,8 @@ def test_command_one_publisher(bench: Bench) -> None:
         (NAMES, (CommandPoint((0.001,), (), 0.5),)),
         (NAMES, (dataclasses.replace(POINT, time_from_start=0.0),)),
         (NAMES, (dataclasses.replace(POINT, time_from_start=-0.5),)),
+        (NAMES, (dataclasses.replace(POINT, time_from_start=600.1),)),
+        (NAMES, (dataclasses.replace(POINT, time_from_start=2147483647.0),)),
     ],
 )
 def test_command_form(
@@ -69,6 +71,16 @@ def test_command_form(
     bench.ready()
     bench.supervisor.submit(Command(bench.ros_ns, names, points), bench.now)
     refused(bench, Rule.COMMAND_FORM)
+
+
+def test_command_form_what_others_call_their_joints_is_told_in_short(bench: Bench) -> None:
+    bench.ready()
+    names = tuple("joint\n" * 100_000 for _ in range(300))
+    bench.supervisor.submit(Command(bench.ros_ns, names, (POINT,)), bench.now)
+    reason = refused(bench, Rule.COMMAND_FORM)
+    assert len(reason) < 500
+    assert reason.isprintable()
+    assert "and 296 more" in reason
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])

@@ -21,6 +21,7 @@ def test_estop_latches_until_released_hold_off_and_reset(bench: Bench) -> None:
     assert bench.insertion.stops == bench.rotation.stops == 1
     assert bench.results[-1].outcome == "aborted: emergency stop"
     assert bench.last_rule is Rule.ESTOP_LATCHES
+    assert bench.notices[-1].fault
     bench.cycle(1, holding=True)
     assert "still pressed" in bench.supervisor.reset(bench.now).message
     bench.supervisor.receive_estop(False)
