@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import IO, Final
@@ -18,7 +19,7 @@ from needle_bringup.bag_metadata import (
     to_yaml,
     write_metadata,
 )
-from needle_bringup.mcap_repair import NO_ROOM, give_back_chunk, repair, scan_file
+from needle_bringup.mcap_ending import NO_ROOM, McapEnding
 from needle_common.bag_directory import METADATA_FILE
 from needle_common.errors import UserError
 
@@ -190,19 +191,16 @@ class BagWriter:
         path = self.data_file
         taken = self._files[-1].counts
         try:
-            found = scan_file(path)
+            ending = McapEnding(path)
             while True:
-                repair(path, found, library=LIBRARY)
-                names = {number: channel.topic for number, channel in found.channels.items()}
-                counts = {names[number]: count for number, count in found.counts.items()}
-                self._files[-1] = DataFile(path.name, counts, *found.times)
+                ending.write()
+                self._files[-1] = DataFile(path.name, ending.counts, *ending.times)
                 try:
                     write_metadata(self.directory, self._information())
                 except OSError as error:
                     if error.errno not in NO_ROOM:
                         raise
-                    with path.open("r+b", buffering=0) as stream:
-                        give_back_chunk(stream, found)
+                    ending.give_back()
                 else:
                     break
         except OSError as error:
@@ -243,6 +241,8 @@ class BagWriter:
 
     def _end_file(self) -> None:
         self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
         self._stream.close()
 
     def _split(self) -> None:

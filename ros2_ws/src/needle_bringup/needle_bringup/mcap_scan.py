@@ -1,142 +1,64 @@
-"""Reads an MCAP file record by record, without its index: what is whole in it, and what is not.
+"""Reads an MCAP file record by record, whatever state it is in, and finds all that is whole.
 
-The format: https://mcap.dev/spec. A damaged region is passed over up to the next chunk whose
-checksum is right; what a crash cut off is told apart from what was complete.
+The format: https://mcap.dev/spec. A chunk whose checksum is right is taken as it is. Where nothing
+has a checksum, a record is taken if its fields agree with each other and a message fits its type.
+Behind what is damaged, the next record that passes is searched for byte by byte.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import re
 import struct
-import zlib
-from collections.abc import Callable, Iterable
+from collections import Counter
+from collections.abc import Callable, Collection
 from io import BytesIO
 from typing import Any, Final
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Header,
-    Metadata,
-    MetadataIndex,
-    Schema,
-)
+from mcap.records import Channel, ChunkIndex, Header, Message, MessageIndex, Schema
 from mcap.writer import MCAP0_MAGIC
 
-from needle_bringup.mcap_chunk import (
+from needle_bringup.mcap_chunk import CHUNK_HEADER, SIZE, chunk_end, find_chunk, index_of
+from needle_bringup.mcap_records import (
+    MESSAGE,
+    RECORDS,
+    Loose,
+    McapScan,
+    NotMcapError,
+    messages_of,
+    read_message,
+    read_record,
+)
+from needle_bringup.message_fit import MessageFit, mended_schema
+from needle_common.mcap_file import (
     RECORD_HEADER,
-    SIZE,
+    SUMMARY_LIMIT,
+    TIME_LIMIT,
     UNREADABLE,
-    ChunkContent,
-    Definition,
-    HalfChunk,
-    index_record,
-    read_chunk,
-    read_definition,
-    read_half_chunk,
+    BrokenMcapError,
+    read_summary,
 )
 
-_MESSAGE: Final = struct.Struct("<HIQQ")
 # Opcodes from here on are an application's own; every reader passes over them.
 PRIVATE: Final = 0x80
-_DATA_OPCODES: Final = frozenset(
+_CANDIDATE: Final = re.compile(rb"[\x03-\x07\x09\x0c\x0f][\x00-\xff]{4}\x00{4}")
+_INDEX: Final = frozenset(
     (
-        Opcode.SCHEMA,
-        Opcode.CHANNEL,
-        Opcode.MESSAGE,
-        Opcode.CHUNK,
-        Opcode.MESSAGE_INDEX,
-        Opcode.ATTACHMENT,
-        Opcode.METADATA,
-        Opcode.DATA_END,
+        Opcode.FOOTER,
+        Opcode.CHUNK_INDEX,
+        Opcode.ATTACHMENT_INDEX,
+        Opcode.STATISTICS,
+        Opcode.METADATA_INDEX,
+        Opcode.SUMMARY_OFFSET,
     )
 )
+_KNOWN: Final = frozenset((*RECORDS, *_INDEX, *(5, 6, 7, 9, 15)))
 _REPORT_EVERY: Final = 16 * 2**20
-
-
-class NotMcapError(Exception):
-    """The file is not MCAP at all."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Damage:
-    """Bytes [start, end) of the file that hold nothing that can be read."""
-
-    start: int
-    end: int
-
-
-@dataclasses.dataclass
-class McapScan:
-    """What a file holds.
-
-    Attributes
-    ----------
-    size : int
-        Bytes of the file.
-    end : int
-        Where its data ends: behind the last record that is whole or passed over.
-    finished : bool
-        Whether the data's end mark is there: the file was closed in order.
-    schemas, channels : dict
-        By number.
-    chunks : list of ChunkContent
-        In order.
-    loose : dict of int to int
-        Messages outside of chunks, for each channel.
-    metadata : list of Metadata
-        In order.
-    metadata_indexes, attachment_indexes : list
-        As the summary has them.
-    damage : list of Damage
-        What was passed over.
-    reindex : list of (ChunkContent, Damage)
-        Chunks whose message index is not whole, and where it was.
-    lacks_last_index : bool
-        Whether the data ends in a chunk without its whole message index.
-    half_chunk : HalfChunk or None
-        The chunk that the file's end cuts, if something in it is whole.
-    loose_first, loose_last : int or None, int
-        Log times of the earliest and latest message outside of chunks [ns].
-    """
-
-    size: int
-    end: int
-    finished: bool = False
-    schemas: dict[int, Schema] = dataclasses.field(default_factory=dict)
-    channels: dict[int, Channel] = dataclasses.field(default_factory=dict)
-    chunks: list[ChunkContent] = dataclasses.field(default_factory=list)
-    loose: dict[int, int] = dataclasses.field(default_factory=dict)
-    metadata: list[Metadata] = dataclasses.field(default_factory=list)
-    metadata_indexes: list[MetadataIndex] = dataclasses.field(default_factory=list)
-    attachment_indexes: list[AttachmentIndex] = dataclasses.field(default_factory=list)
-    damage: list[Damage] = dataclasses.field(default_factory=list)
-    reindex: list[tuple[ChunkContent, Damage]] = dataclasses.field(default_factory=list)
-    lacks_last_index: bool = False
-    half_chunk: HalfChunk | None = None
-    loose_first: int | None = None
-    loose_last: int = 0
-
-    @property
-    def counts(self) -> dict[int, int]:
-        """Messages for each channel."""
-        total = dict(self.loose)
-        for chunk in self.chunks:
-            for channel, count in chunk.counts.items():
-                total[channel] = total.get(channel, 0) + count
-        return total
-
-    @property
-    def times(self) -> tuple[int | None, int]:
-        """Log times of the earliest and the latest message [ns]; None, 0 where there is none."""
-        firsts = [c.index.message_start_time for c in self.chunks]
-        lasts = [c.index.message_end_time for c in self.chunks]
-        if self.loose_first is not None:
-            firsts.append(self.loose_first)
-            lasts.append(self.loose_last)
-        return min(firsts, default=None), max(lasts, default=0)
+_BLOCK: Final = 2**20
+# Bytes behind a message that its type does not tell: what a wrong length may be wrong by.
+_PADDING: Final = (0, -1, -2, -3, 1, 2, 3)
 
 
 def scan(data: Any, progress: Callable[[int], None] | None = None) -> McapScan:
@@ -152,225 +74,324 @@ def scan(data: Any, progress: Callable[[int], None] | None = None) -> McapScan:
     Raises
     ------
     NotMcapError
-        If the file begins as no MCAP file of ROS 2 does.
+        If there is nothing of an MCAP file of ROS 2 in it.
     """
-    return _Scanner(data, progress).run()
+    first = _Scanner(data, progress)
+    found = first.run()
+    # Where most messages do not fit, it is their definition that is damaged.
+    distrusted = {n for n, count in first.refused.items() if count > found.counts[n]}
+    return _Scanner(data, progress, distrusted).run() if distrusted else found
 
 
 class _Scanner:
-    def __init__(self, data: Any, progress: Callable[[int], None] | None) -> None:
+    def __init__(
+        self,
+        data: Any,
+        progress: Callable[[int], None] | None,
+        distrusted: Collection[int] = (),
+    ) -> None:
         self._data = data
-        self._size = len(data)
+        self._end = self._zeros = len(data)
         self._progress = progress
         self._reported = 0
-        self._is_index_open = False
-        self.found = McapScan(self._size, 0)
+        self._has_header = False
+        self.found = McapScan(self._end, distrusted=distrusted)
+        self._fit = MessageFit(self.found.schemas, self.found.channels, distrusted)
+        self.refused: Counter[int] = Counter()
+        self._chunks: dict[int, ChunkIndex] = {}
+        self._expected: dict[int, list[tuple[int, int]]] = {}
 
     def run(self) -> McapScan:
-        data, found = self._data, self.found
-        beginning = bytes(data[: len(MCAP0_MAGIC)])
-        if not MCAP0_MAGIC.startswith(beginning):
-            raise NotMcapError("it does not begin as an MCAP file")
-        position = len(MCAP0_MAGIC)
-        length = self._length(position)
-        if length is None or position + length > self._size:
-            return found  # not even its header is whole
-        if data[position] != Opcode.HEADER:
-            raise NotMcapError("it has no MCAP header")
-        header = Header.read(self._body(position))
-        if header.profile not in ("ros2", ""):
-            raise NotMcapError(f"its profile is {header.profile!r}, not 'ros2'")
-        position += length
-        found.end = position
-        while position < self._size:
+        found = self.found
+        try:
+            begin = max(0, self._end - SUMMARY_LIMIT)
+            summary = read_summary(bytes(self._data[begin:]), self._end)
+        except BrokenMcapError:
+            summary = None
+        if summary is not None:
+            found.summary = summary
+            self._end = summary.start
+            self._chunks = {chunk.chunk_start_offset: chunk for chunk in summary.chunks}
+            if summary.is_checked:
+                found.schemas.update(summary.schemas)
+                found.channels.update(summary.channels)
+        else:
+            # A power cut leaves zeros where the file was made longer and nothing was written.
+            self._zeros = _end_of_data(self._data)
+        position = self._begin()
+        while position < self._end and not found.finished:
             following = self._take(position)
             if following is None:
-                break
-            found.end = position = following
+                following = self._next(position + 1)
+                self._pass_over(position, following)
+            position = following
             self._report(position)
-        if found.finished:
-            self._read_definitions_of_summary()
-        found.lacks_last_index = self._is_index_open and not found.chunks[-1].is_indexed
-        self._name_unknown_channels()
+        self._close_index()
+        self._read_definitions(position)
+        self._settle_definitions()
+        if not found.parts and not self._has_header and found.size > len(MCAP0_MAGIC):
+            raise NotMcapError("it does not begin as an MCAP file, and holds nothing of one")
         return found
 
-    def _take(self, position: int) -> int | None:
-        """Take the record at a position; return where the next begins, None at the data's end."""
-        opcode, length = self._data[position], self._length(position)
-        known = opcode in _DATA_OPCODES or opcode >= PRIVATE
-        if length is None or not known or position + length > self._size:
-            found = self._next_chunk(position + 1)
-            if found is None:
-                if opcode == Opcode.CHUNK and length is not None:
-                    self._take_half_chunk(position, length)
-                return None
-            self._pass_over(position, found)
-            return found
-        if opcode == Opcode.DATA_END:
-            self.found.finished = True
-            return None
+    def _begin(self) -> int:
+        """Return where the first record behind the header is."""
+        data = self._data
+        size = len(MCAP0_MAGIC)
+        end = self._end_of(size)
         try:
-            self._read(opcode, position, length)
+            if bytes(data[:size]) == MCAP0_MAGIC and self._end > size and data[size] == 1:
+                self._has_header = end is None
+                header = Header.read(ReadDataStream(BytesIO(bytes(data[size + 9 : end]))))
+                self._has_header = header.profile in ("ros2", "")
+                if self._has_header and end is not None and self._is_plausible(end):
+                    return end
+        except UNREADABLE:
+            pass
+        start = self._next(size)
+        self._pass_over(0, start)
+        return start
+
+    def _take(self, position: int) -> int | None:
+        """Take the record at a position; return where the next begins, None if there is none."""
+        try:
+            return self._read(position)
         # Struct errors, texts that are not UTF-8, lengths that point outside, bad checksums.
         except UNREADABLE:
-            # A power cut leaves zeros where the file was made longer and nothing was written.
-            if opcode == Opcode.CHUNK and not any(self._data[position + length :]):
-                self._take_half_chunk(position, length)
-                if self.found.half_chunk is not None:
-                    return None
-            self._pass_over(position, position + length)
-        return position + length
+            return None
 
-    def _read(self, opcode: int, position: int, length: int) -> None:
-        found = self.found
+    def _read(self, position: int) -> int | None:
+        data, found = self._data, self.found
+        opcode = data[position]
         if opcode != Opcode.MESSAGE_INDEX:
-            self._close_index(position)
-        if opcode == Opcode.CHUNK:
-            content, definitions = read_chunk(self._data, position, length)
-            self._define(definitions)
-            found.chunks.append(content)
-            self._is_index_open = True
-        elif opcode == Opcode.MESSAGE_INDEX:
-            self._take_message_index(position, length)
+            self._close_index()
+        if opcode == Opcode.CHUNK or position in self._chunks:
+            return self._read_chunk(position)
+        if opcode == Opcode.MESSAGE:
+            return self._read_loose(position)
+        end = self._end_of(position)
+        if end is None:
+            return None
+        if opcode == Opcode.MESSAGE_INDEX:
+            self._read_index(position, end)
+        elif opcode == Opcode.DATA_END:
+            if end - position != RECORD_HEADER.size + 4:
+                return None
+            found.finished = True
         elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            self._define([read_definition(self._data[position : position + length], 0)])
-        elif opcode == Opcode.MESSAGE:
-            channel, _, time, _ = _MESSAGE.unpack_from(self._data, position + RECORD_HEADER.size)
-            found.loose[channel] = found.loose.get(channel, 0) + 1
-            first = found.loose_first
-            found.loose_first = time if first is None else min(first, time)
-            found.loose_last = max(found.loose_last, time)
-        elif opcode == Opcode.METADATA:
-            metadata = Metadata.read(self._body(position))
-            found.metadata.append(metadata)
-            found.metadata_indexes.append(MetadataIndex(position, length, metadata.name))
-        elif opcode == Opcode.ATTACHMENT:
-            found.attachment_indexes.append(self._attachment(position, length))
+            self._define(read_record(data, position, end))
+        elif opcode in (Opcode.METADATA, Opcode.ATTACHMENT):
+            read_record(data, position, end)
+            found.parts.append(Loose(position, end))
+        elif (opcode < PRIVATE and opcode not in _INDEX) or not self._is_plausible(end):
+            return None
+        return end
 
-    def _take_half_chunk(self, position: int, length: int) -> None:
-        half, definitions = read_half_chunk(self._data, position, length)
-        self.found.half_chunk = half
-        self._define(definitions)
+    def _read_chunk(self, position: int) -> int | None:
+        index = self._chunks.get(position)
+        chunk = find_chunk(self._data, position, self._end, index)
+        if chunk is not None and (chunk.is_vouched or chunk.compression):
+            records = chunk.records(self._data)
+            for record in records:
+                if isinstance(record, Schema | Channel):
+                    self._define(record)
+            for message in messages_of(self._data, chunk, self._fit):
+                self._count(message)
+            self.found.parts.append(chunk)
+            self.found.mended += chunk.is_mended
+            if index is None or index.message_index_offsets:
+                self._expected = index_of(records)
+            return chunk.end
+        crc, name_length = struct.unpack_from("<II", self._data, position + 33)
+        end = chunk_end(self._data, position, index)
+        is_whole = end is not None and end <= min(self._end, self._zeros)
+        if chunk is None and (crc or name_length) and end is not None and is_whole:
+            # Something in it is not what was written, and nothing tells what.
+            self._pass_over(position, end)
+            return end
+        # Not compressed, and no checksum or no end: what is in it is looked at by itself.
+        inside = position + RECORD_HEADER.size + CHUNK_HEADER.size + SIZE.size
+        return None if name_length or inside > self._end else inside
 
-    def _take_message_index(self, position: int, length: int) -> None:
-        damaged = self.found.damage
-        if damaged and damaged[-1].end == position:
-            # The index of a chunk that could not be read goes with it.
-            self._pass_over(position, position + length)
-        elif self._is_index_open:
-            (channel,) = struct.unpack_from("<H", self._data, position + RECORD_HEADER.size)
-            chunk = self.found.chunks[-1]
-            record = self._data[position : position + length]
-            if record != index_record(channel, chunk.entries.get(channel, [])):
-                raise ValueError("the message index does not fit the chunk")
-            chunk.index.message_index_offsets[channel] = position
-            chunk.index.message_index_length += length
-
-    def _close_index(self, end: int) -> None:
-        """Take note if the last chunk's message index, which ends here, is not whole."""
-        if not self._is_index_open:
-            return
-        self._is_index_open = False
-        found = self.found
-        chunk = found.chunks[-1]
-        start = chunk.end
-        if chunk.is_indexed or end == start:
-            chunk.entries = {}
-            return
-        found.reindex.append((chunk, Damage(start, end)))
-        found.damage = [damage for damage in found.damage if damage.end <= start]
-
-    def _define(self, definitions: Iterable[Definition]) -> None:
-        for record in definitions:
-            if isinstance(record, Schema):
-                self.found.schemas[record.id] = record
-            else:
-                self.found.channels[record.id] = record
-
-    def _attachment(self, position: int, length: int) -> AttachmentIndex:
-        start, end = position + RECORD_HEADER.size, position + length
-        (crc,) = struct.unpack_from("<I", self._data, end - 4)
-        if crc and zlib.crc32(self._data[start : end - 4]) != crc:
-            raise ValueError("the attachment's checksum is wrong")
-        body = self._body(position)
-        log_time, create_time = body.read8(), body.read8()
-        name, media_type = body.read_prefixed_string(), body.read_prefixed_string()
-        return AttachmentIndex(
-            offset=position,
-            length=length,
-            log_time=log_time,
-            create_time=create_time,
-            data_size=body.read8(),
-            name=name,
-            media_type=media_type,
+    def _read_loose(self, position: int) -> int | None:
+        told = self._end_of(position, strict=False)
+        if told is None or told - position < RECORD_HEADER.size + MESSAGE.size:
+            return None
+        channel, _, log_time, publish_time = MESSAGE.unpack_from(
+            self._data, position + RECORD_HEADER.size
         )
+        is_known = self._fit.knows(channel)
+        is_closed = self.found.summary is not None and self.found.summary.is_checked
+        if (
+            not self._is_time(log_time)
+            or publish_time >= TIME_LIMIT
+            or (self._zeros < told < self._end)  # its own end may be among the zeros
+            or (is_closed and not is_known and channel not in self.found.channels)
+        ):
+            return None
+        for further in _PADDING:
+            end = told + further
+            if position + RECORD_HEADER.size + MESSAGE.size <= end <= self._end and (
+                self._is_plausible(end) and (not is_known or self._fits(position, end))
+            ):
+                self.found.mended += end != told
+                return self._keep(position, end)
+        if is_known and told <= self._end and self._fits(position, told):
+            return self._keep(position, told)
+        self.refused[channel] += 1
+        return None
 
-    def _next_chunk(self, position: int) -> int | None:
-        """Return where the next whole chunk begins."""
-        mark = bytes([Opcode.CHUNK])
-        while (position := self._data.find(mark, position)) >= 0:
-            length = self._length(position)
-            if length is not None and position + length <= self._size:
-                try:
-                    read_chunk(self._data, position, length)
-                except UNREADABLE:
-                    pass
-                else:
-                    return position
+    def _fits(self, start: int, end: int) -> bool:
+        message = read_message(self._data, start, end)
+        return self._fit.fits(message.channel_id, message.data)
+
+    def _keep(self, start: int, end: int) -> int:
+        self.found.parts.append(Loose(start, end))
+        self._count(read_message(self._data, start, end))
+        return end
+
+    def _read_index(self, position: int, end: int) -> None:
+        """Compare a message index with its chunk's messages."""
+        stream = ReadDataStream(BytesIO(bytes(self._data[position + 9 : end])))
+        index = MessageIndex.read(stream)
+        if stream.count != end - position - 9:
+            raise ValueError("the message index is longer than what is in it")
+        if not self._expected:
+            return  # of a chunk that was looked at message by message, or is lost
+        if sorted(self._expected.pop(index.channel_id, [])) != sorted(index.records):
+            self.found.mended += 1
+
+    def _close_index(self) -> None:
+        """Take note of messages in the last chunk that no index tells of."""
+        self.found.mended += bool(self._expected)
+        self._expected = {}
+
+    def _count(self, message: Message) -> None:
+        found = self.found
+        found.counts[message.channel_id] += 1
+        found.gaps.take(message.channel_id, message.sequence, len(found.damage))
+
+    def _define(self, record: Schema | Channel) -> None:
+        known: dict[int, Any] = (
+            self.found.schemas if isinstance(record, Schema) else self.found.channels
+        )
+        if record.id in known and known[record.id] != record:
+            self.found.mended += 1
+        known.setdefault(record.id, record)
+        self._fit.forget()
+
+    def _next(self, position: int) -> int:
+        """Return where the next whole record begins; the data's end if there is none."""
+        while match := _CANDIDATE.search(self._data, position, self._end):
+            position = match.start()
+            if self._is_record(position):
+                return position
             position += 1
             self._report(position)
-        return None
+        return self._end
+
+    def _is_record(self, position: int) -> bool:
+        """Return whether a record begins here for certain."""
+        end = self._end_of(position)
+        try:
+            return end is not None and self._is_certain(position, end)
+        except UNREADABLE:
+            return False
+
+    def _is_certain(self, position: int, end: int) -> bool:
+        data, opcode = self._data, self._data[position]
+        if opcode == Opcode.CHUNK:
+            return find_chunk(data, position, self._end, self._chunks.get(position)) is not None
+        if opcode == Opcode.MESSAGE:
+            channel, _, log_time, publish_time = MESSAGE.unpack_from(data, position + 9)
+            return (
+                end - position >= RECORD_HEADER.size + MESSAGE.size
+                and (self._fit.knows(channel) or channel in self.found.channels)
+                and self._is_time(log_time)
+                and publish_time < TIME_LIMIT
+                and self._fits(position, end)
+                and (self._fit.knows(channel) or self._is_plausible(end))
+            )
+        if opcode == Opcode.MESSAGE_INDEX:
+            channel, size = struct.unpack_from("<HI", data, position + 9)
+            is_sized = 0 < size == end - position - 15 and not size % 16
+            return is_sized and channel in self.found.channels
+        if opcode == Opcode.DATA_END:
+            return end - position == 13 and end < len(data) and data[end] in (*RECORDS, *_INDEX)
+        read_record(data, position, end)
+        return self._is_plausible(end)
+
+    def _is_plausible(self, position: int) -> bool:
+        """Return whether a record may begin here, or the data end."""
+        if position == self._end:
+            return True
+        end = self._end_of(position, strict=False)
+        opcode = self._data[position] if position < self._end else 0
+        return end is not None and (opcode in _KNOWN or opcode >= PRIVATE)
+
+    def _is_time(self, time: int) -> bool:
+        summary = self.found.summary
+        if summary is not None and summary.is_checked and summary.statistics is not None:
+            told = summary.statistics
+            return bool(told.message_start_time <= time <= told.message_end_time)
+        return time < TIME_LIMIT
+
+    def _end_of(self, position: int, *, strict: bool = True) -> int | None:
+        """Return where a record ends; None if that is not in the file."""
+        if position + RECORD_HEADER.size > self._end:
+            return None
+        length = RECORD_HEADER.unpack_from(self._data, position)[1]
+        end = int(position + RECORD_HEADER.size + length)
+        limit = self._end if strict else self._end + (1 << 32)
+        return end if end <= limit else None
 
     def _pass_over(self, start: int, end: int) -> None:
         damage = self.found.damage
         if damage and damage[-1].end == start:
-            damage[-1] = Damage(damage[-1].start, end)
-        else:
-            damage.append(Damage(start, end))
+            damage[-1] = Loose(damage[-1].start, end)
+        elif end > start:
+            damage.append(Loose(start, end))
 
-    def _read_definitions_of_summary(self) -> None:
-        """Take topics' definitions from the summary, too: damage may have swallowed them."""
-        position = self.found.end
-        while (length := self._length(position)) is not None and position + length <= self._size:
-            opcode = self._data[position]
-            if opcode == Opcode.FOOTER:
-                return
-            try:
-                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    record = read_definition(self._data[position : position + length], 0)
-                    known = self.found.schemas if opcode == Opcode.SCHEMA else self.found.channels
-                    if record.id not in known:
-                        self._define([record])
-            except UNREADABLE:
-                return
-            position += length
+    def _read_definitions(self, position: int) -> None:
+        """Take definitions from an index that is damaged, too: those of the data may be lost."""
+        while (end := self._end_of(position)) is not None:
+            if self._data[position] in (Opcode.SCHEMA, Opcode.CHANNEL):
+                try:
+                    record = read_record(self._data, position, end)
+                except UNREADABLE:
+                    return
+                known = self.found.schemas if isinstance(record, Schema) else self.found.channels
+                if record.id not in known:
+                    self._define(record)
+            position = end
 
-    def _name_unknown_channels(self) -> None:
+    def _settle_definitions(self) -> None:
         """Keep messages readable, as bytes, whose topic's definition was damaged."""
-        channels, schemas = self.found.channels, self.found.schemas
-        counts = dict(self.found.counts)
-        if self.found.half_chunk is not None:
-            counts.update(self.found.half_chunk.content.counts)
-        for number in counts:
-            channel = channels.get(number)
-            if channel is None:
-                channels[number] = Channel(number, f"/unknown/channel_{number}", "cdr", {}, 0)
-            elif channel.schema_id not in schemas:
-                channels[number] = dataclasses.replace(channel, schema_id=0)
-
-    def _length(self, position: int) -> int | None:
-        """Return a record's length with its header; None where the file ends within the header."""
-        if position + RECORD_HEADER.size > self._size:
-            return None
-        return RECORD_HEADER.size + int(SIZE.unpack_from(self._data, position + 1)[0])
-
-    def _body(self, position: int) -> ReadDataStream:
-        length = self._length(position) or 0
-        return ReadDataStream(
-            BytesIO(self._data[position + RECORD_HEADER.size : position + length])
-        )
+        found = self.found
+        for number in found.counts:
+            if number not in found.channels:
+                found.channels[number] = Channel(number, f"/unknown/channel_{number}", "cdr", {}, 0)
+        for number, channel in list(found.channels.items()):
+            schema = found.schemas.get(channel.schema_id)
+            if schema is None:
+                found.channels[number] = dataclasses.replace(channel, schema_id=0)
+                found.mended += bool(channel.schema_id)
+                continue
+            found.schemas[schema.id] = mended_schema(schema, channel)
+            found.mended += found.schemas[schema.id] != schema
 
     def _report(self, position: int) -> None:
         if self._progress is not None and position - self._reported >= _REPORT_EVERY:
             self._reported = position
             self._progress(position)
+
+
+def _end_of_data(data: Any) -> int:
+    """Return where the zeros begin that the file ends in."""
+    position = len(data)
+    while position:
+        block = bytes(data[max(0, position - _BLOCK) : position])
+        kept = block.rstrip(b"\0")
+        position -= len(block) - len(kept)
+        if kept:
+            break
+    return position

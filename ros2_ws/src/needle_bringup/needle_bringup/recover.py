@@ -13,10 +13,10 @@ from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.options import CommandParser, output_file
 
 _DESCRIPTION = """
-Makes a bag whole again whose recording was cut off: by a crash, kill -9, a power cut or a full
-disk. Every message that was written stays; the index and metadata.yaml are written anew, and what
-could not be read is named. It works in place and needs no room for a copy. A bag that is whole is
-left as it is.
+Makes a bag whole again whose recording was cut off (by a crash, kill -9, a power cut or a full
+disk) or whose files were damaged. What can be read is written into new files, and what could not be
+read is named. What was there stays as FILE.damaged until you delete it, so there must be room for a
+copy. A bag that is whole is left as it is.
 """
 _EXAMPLES = """
 examples:
@@ -88,11 +88,11 @@ def _lines(bag: Path, recovery: BagRecovery) -> list[str]:
     if recovery.was_whole:
         return [f"{bag} is whole: {holds}; nothing to do"]
     lines = [f"recovered {bag}: {holds}"]
-    if recovery.salvaged:
-        lines.append(f"  {recovery.salvaged} of them from a chunk that was being written")
-    lines += [f"  lost: {loss}" for loss in recovery.losses()]
-    if not recovery.losses():
+    lines += [f"  lost: {loss}" for loss in recovery.losses.lines()]
+    if not recovery.losses.lines():
         lines.append("  lost: nothing that had been written")
+    if recovery.kept:
+        lines.append(f"  what was there is kept as {', '.join(recovery.kept)}: delete it when done")
     return lines
 
 
@@ -102,9 +102,10 @@ def _flat(recovery: BagRecovery) -> dict[str, JsonValue]:
         "messages": recovery.messages,
         "topics": recovery.topics,
         "files": len(recovery.files),
-        "salvaged_messages": recovery.salvaged,
+        "lost_messages": sum(recovery.losses.messages.values()),
+        "lost_messages_exact": recovery.losses.is_exact,
         "lost_bytes": recovery.bytes_lost,
-        "chunks_given_back": sum(file.chunks_given_back for file in recovery.files.values()),
+        "lost_files": len(recovery.losses.missing),
     }
 
 

@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bringup import verify_rerun, verify_signals
+from needle_bringup.damage_trials import damage_trials
 from needle_bringup.recording_trials import (
     FullRate,
     Killed,
@@ -29,6 +30,7 @@ from needle_common.errors import UserError
 
 DURATION = 60.0
 MOMENTS = 50
+DAMAGES = 500
 PROCESSOR_SHARE = 0.35
 MEMORY_GROWTH_MB = 5.0
 LAST_SECONDS = 0.5
@@ -101,6 +103,23 @@ def _killed_finding(key: str, what: str, found: list[Killed]) -> Finding:
         + "; ".join(why[:1]),
         not why and age <= LAST_SECONDS and gaps == 0,
     )
+
+
+def damaged(bench: Workbench, count: int = DAMAGES) -> Iterator[Finding]:
+    """Damage bags at random places, recover them, and compare with what was recorded."""
+    found = list(damage_trials(bench.folder / "damage", count, seed=6))
+    faults = [f"{one.what}: {one.faults[0]}" for one in found if one.faults]
+    yield Finding(
+        "damaged",
+        f"{count} bags with wrong bits, zeros, noise, a cut or a missing file, then recover",
+        "readable messages all there, losses told to the message, no bag read for less in silence, "
+        "no file destroyed",
+        f"{len(faults)} not so, {sum(one.lost for one in found)} messages lost and told, "
+        f"{sum(one.was_read for one in found)} bags read in full as they were "
+        + "; ".join(faults[:1]),
+        not faults,
+    )
+    shutil.rmtree(bench.folder / "damage")
 
 
 def disk_full(bench: Workbench) -> Iterator[Finding]:
@@ -249,6 +268,7 @@ def _witness(domain: int, bag: Path) -> subprocess.Popen[bytes]:
 CHECKS: tuple[Check, ...] = (
     full_rate,
     killed,
+    damaged,
     disk_full,
     bag_format,
     *verify_rerun.CHECKS,

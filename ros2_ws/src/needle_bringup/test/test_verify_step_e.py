@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from needle_bringup.damage_trials import damage_trials
 from needle_bringup.recording_trials import record_and_kill, record_full_rate
 from needle_bringup.verify_step_e import bag_findings
 
@@ -25,3 +26,8 @@ def test_what_a_killed_recorder_leaves_is_recovered(tmp_path: Path, images: bool
         assert killed.unreadable == ""
         assert killed.gaps == 0
         assert killed.messages > 10
+
+
+def test_damaged_bags_keep_what_can_be_read(tmp_path: Path) -> None:
+    for trial in damage_trials(tmp_path, 40, seed=3):
+        assert trial.faults == [], trial.what

@@ -216,23 +216,18 @@ class BagDirectory:
                     yield SentMessage(sent, log_time, topic, type_name, plain)
 
     def typestore(self) -> Typestore:
-        """Return the types as the bag defines them; Jazzy's where it defines none."""
-        types = {}
-        with readable(self.path):
-            for topic in self.topics.values():
-                types.update(parsed_types(topic.encoding, topic.definition, topic.type_name))
-            if not types:
-                return get_typestore(Stores.ROS2_JAZZY)
-            store = get_typestore(Stores.EMPTY)
-            store.register(types)
-            for topic in self.topics.values():
-                if topic.type_hash and topic.type_name in types:
-                    seen = store.hash_rihs01(topic.type_name)
-                    if seen != topic.type_hash:
-                        raise UserError(
-                            f"{self.path}: the definition of {topic.type_name} in the bag is not "
-                            f"the one that it was recorded with: {recover_hint(self.path)}"
-                        )
+        """Return the types that the bag defines; Jazzy's if it defines none."""
+        if not any(topic.definition for topic in self.topics.values()):
+            return get_typestore(Stores.ROS2_JAZZY)
+        store = get_typestore(Stores.EMPTY)
+        for topic in self.topics.values():
+            # A text that is no definition, or another type's, makes its own messages unreadable.
+            with contextlib.suppress(Exception):
+                types = parsed_types(topic.encoding, topic.definition, topic.type_name)
+                alone = get_typestore(Stores.EMPTY)
+                alone.register(types)
+                if topic.type_hash in ("", alone.hash_rihs01(topic.type_name)):
+                    store.register(types)
         return store
 
     def deserialize(self, store: Typestore, message: SentMessage) -> Any:
