@@ -13,11 +13,9 @@ from needle_common.errors import UserError
 from needle_controller import conversions
 from needle_controller.joint_history import JointSample
 from needle_controller.parameters import PlaneControllerParameters
-from needle_controller.steering_types import Action, Awaiting, PublishUpdate, SendStep, State
+from needle_controller.steering_types import Action, PublishUpdate, SendStep, State
 
 _STEERING = (State.STEERING.value, State.WAITING_FOR_TIP.value)
-# A controller that is asked at the end of a motion may not have heard its last joints yet [ns].
-_HEARD_LATE = 100_000_000
 
 
 class ControllerStage:
@@ -51,6 +49,7 @@ class ControllerStage:
         self._node = node
         self._unheard = unheard
         self._steering = parameters.make_steering()
+        self._steering.trusts_device = True
         self._sent: int | None = None
         self._recorded_state = ""
         self.tips = 0
@@ -121,7 +120,6 @@ class ControllerStage:
     def _take_status(self, message: Any) -> Iterable[Action]:
         """Start and stop where the recorded controller did: calls of services are in no bag."""
         values = values_of(message)
-        self._ask_as_recorded(values.get("awaiting", ""), values.get("tip_after_ns", ""))
         before, now = self._recorded_state, values.get("state", "")
         self._recorded_state = now
         if now in _STEERING and before not in _STEERING:
@@ -132,13 +130,6 @@ class ControllerStage:
         if before in _STEERING and now == State.IDLE.value and values.get("reason") == "stopped":
             return self._steering.on_stop()[1]
         return ()
-
-    def _ask_as_recorded(self, awaiting: str, tip_after: str) -> None:
-        """Ask for tips after the recorded stamp, where joints that were not heard yet set it."""
-        if awaiting == Awaiting.TIP.value and tip_after.isdigit():
-            late = self._steering.tip_after_ns - int(tip_after)
-            if self._steering.awaiting is Awaiting.TIP and 0 < late <= _HEARD_LATE:
-                self._steering.tip_after_ns = int(tip_after)
 
     def _take_parameters(self, message: Any) -> Iterable[Action]:
         if message.node != self._node:

@@ -97,7 +97,16 @@ def to_device_status(message: DiagnosticStatus) -> DeviceStatus:
         homed=values.get("homed", "").lower() == "true",
         hold_owner=values.get("hold_owner", ""),
         reason=values.get("fault", "") or values.get("reason", "") or message.message,
+        insertion=_number(values.get("insertion_m", "")),
+        rotation=_number(values.get("rotation_rad", "")),
     )
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def to_trajectory(step: SendStep) -> JointTrajectory:
@@ -150,6 +159,7 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         reachable_depth = repr(float(steering.reach.depth))
     values = {
         "state": steering.state.value,
+        "starts": str(steering.starts),
         "step": str(steering.step),
         "insertion_m": repr(steering.insertion),
         "target_offset_m": repr(steering.control.plane.offset),

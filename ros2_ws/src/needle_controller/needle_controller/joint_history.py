@@ -3,8 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import enum
 import math
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator
+
+CONFIRMED_BY = 5
+"""Samples that follow from one another and not from what is kept; so many are the new truth."""
+LARGEST_GAP_NS = 1_000_000_000
+"""Longest time between two samples of which one follows from the other [ns]."""
+_FASTEST_INSERTION, _FASTEST_ROTATION = 0.05, 30.0  # [m/s], [rad/s]: a hand's, a motor's.
+_INSERTION_NOISE, _ROTATION_NOISE = 2e-4, 0.1  # [m], [rad]
+_LONGEST_MOTION = 0.04
+"""Joints are believed to have moved unseen for no longer [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,19 +36,49 @@ class JointSample:
     insertion: float
     rotation: float
 
+    def is_at(self, other: JointSample, insertion: float, rotation: float) -> bool:
+        """Return whether the joints are within tolerances [m], [rad] of where they were."""
+        return (
+            abs(self.insertion - other.insertion) <= insertion
+            and abs(self.rotation - other.rotation) <= rotation
+        )
+
+
+class Heard(enum.Enum):
+    """What became of a sample."""
+
+    TAKEN = "taken"
+    REPEATED = "repeated"
+    DOUBTED = "doubted"
+    JUMPED = "jumped"
+
 
 class JointHistory:
     """The joints of the last seconds.
+
+    A sample counts if it follows from the one before: newer by at most a second, and no farther
+    than joints move meanwhile. Any other is kept back. A single spike is dropped so; where
+    `CONFIRMED_BY` of them follow from one another, the history starts again with them.
 
     Parameters
     ----------
     length : int
         Samples kept; 1000 are 20 s at 50 Hz.
+
+    Attributes
+    ----------
+    doubted : int
+        Samples that did not follow from the one before.
+    complaint : str
+        Why the last sample is kept back; empty where it is not.
     """
 
     def __init__(self, length: int = 1000) -> None:
         self._length = length
         self._samples: list[JointSample] = []
+        self._kept_back: list[JointSample] = []
+        self.doubted = 0
+        self.complaint = ""
 
     @property
     def latest(self) -> JointSample | None:
@@ -49,17 +90,25 @@ class JointHistory:
         """The oldest sample kept, None before the first."""
         return self._samples[0] if self._samples else None
 
-    def add(self, sample: JointSample) -> bool:
-        """Take a sample; return False for one that is not finite or not newer than the last."""
-        if not (math.isfinite(sample.insertion) and math.isfinite(sample.rotation)):
-            return False
-        if self._samples and sample.stamp_ns <= self._samples[-1].stamp_ns:
-            return False
+    def add(self, sample: JointSample) -> Heard:
+        """Take a sample, or say what became of it."""
+        latest = self.latest
+        finite = math.isfinite(sample.insertion) and math.isfinite(sample.rotation)
+        if latest is None or not finite:
+            if finite:
+                self._samples.append(sample)
+            return Heard.TAKEN if finite else Heard.DOUBTED
+        if 0 <= latest.stamp_ns - sample.stamp_ns <= LARGEST_GAP_NS:
+            return Heard.REPEATED
+        if not _follows(latest, sample):
+            return self._doubt(latest, sample)
+        self._kept_back.clear()
+        self.complaint = ""
         self._samples.append(sample)
         # Dropped in bulk, not at each sample: a list shifts all it holds.
         if len(self._samples) >= 2 * self._length:
             del self._samples[: self._length]
-        return True
+        return Heard.TAKEN
 
     def at(self, stamp_ns: int) -> JointSample | None:
         """Return the joints at an instant, linear between samples.
@@ -89,29 +138,36 @@ class JointHistory:
             left.rotation + part * (right.rotation - left.rotation),
         )
 
-    def motion_end_ns(self, insertion_tolerance: float, rotation_tolerance: float) -> int | None:
-        """Return the stamp since which the joints have stood still.
+    def after(self, stamp_ns: int) -> Iterator[JointSample]:
+        """Yield the samples newer than an instant [ns], oldest first."""
+        first = bisect_right(self._samples, stamp_ns, key=lambda sample: sample.stamp_ns)
+        yield from self._samples[first:]
 
-        It depends on the samples alone, not on when the question is asked after the motion.
+    def _doubt(self, latest: JointSample, sample: JointSample) -> Heard:
+        self.doubted += 1
+        kept_back = self._kept_back
+        if kept_back and not _follows(kept_back[-1], sample):
+            kept_back.clear()
+        kept_back.append(sample)
+        if len(kept_back) >= CONFIRMED_BY:
+            self._samples, self._kept_back = kept_back, []
+            self.complaint = ""
+            return Heard.JUMPED
+        self.complaint = (
+            f"joint_states do not follow from the last: {sample.insertion:.4g} m, "
+            f"{sample.rotation:.4g} rad after {latest.insertion:.4g} m, {latest.rotation:.4g} rad, "
+            f"{(sample.stamp_ns - latest.stamp_ns) * 1e-9:.4g} s later"
+        )
+        return Heard.DOUBTED
 
-        Parameters
-        ----------
-        insertion_tolerance, rotation_tolerance : float
-            What still counts as the same place [m], [rad].
 
-        Returns
-        -------
-        int or None
-            Stamp of the first of the last samples that all agree with the newest [ns]; None before
-            the first.
-        """
-        end = None
-        latest = self.latest
-        for sample in reversed(self._samples):
-            if latest is None or (
-                abs(sample.insertion - latest.insertion) > insertion_tolerance
-                or abs(sample.rotation - latest.rotation) > rotation_tolerance
-            ):
-                break
-            end = sample.stamp_ns
-        return end
+def _follows(before: JointSample, sample: JointSample) -> bool:
+    gap_ns = sample.stamp_ns - before.stamp_ns
+    if not 0 < gap_ns <= LARGEST_GAP_NS:
+        return False
+    time = min(gap_ns * 1e-9, _LONGEST_MOTION)
+    return sample.is_at(
+        before,
+        _FASTEST_INSERTION * time + _INSERTION_NOISE,
+        _FASTEST_ROTATION * time + _ROTATION_NOISE,
+    )

@@ -251,8 +251,13 @@ class PlaneControllerNode(Node):
             self.get_logger().info(log.text)
 
     def _report(self) -> None:
-        joints = {"joint_states_refused": str(self._bad_joints)}
-        self._diagnostics.set("joint_states", _health(self._joints_complaint, joints))
+        history = self._steering.intake.joints
+        joints = {
+            "joint_states_refused": str(self._bad_joints),
+            "joint_states_doubted": str(history.doubted),
+        }
+        complaint = self._joints_complaint or history.complaint
+        self._diagnostics.set("joint_states", _health(complaint, joints))
         self._diagnostics.set("target_plane", _health(self._plane_complaint, {}))
         diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
         self._diagnostics.set("steering", diagnostic)

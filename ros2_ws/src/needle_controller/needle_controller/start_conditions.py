@@ -9,7 +9,7 @@ from needle_controller.next_step import DEPTH_TOLERANCE
 from needle_controller.plane_control import PlaneControl
 from needle_controller.steering_types import DeviceStatus, SteeringSettings
 
-_ENABLED_DEVICE = ("HOLDING", "MOVING")
+_SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -24,14 +24,14 @@ class Situation:
         What the driver last said.
     joints : JointSample or None
         Where the joints are.
-    retracted : bool
-        Whether the needle was drawn back and is not out yet.
+    withdrawal : str
+        Why the needle must be drawn out first; empty if it need not be.
     """
 
     steering: bool
     device: DeviceStatus | None
     joints: JointSample | None
-    retracted: bool
+    withdrawal: str
 
 
 def is_out(joints: JointSample, settings: SteeringSettings) -> bool:
@@ -54,21 +54,38 @@ def obstacle(situation: Situation, control: PlaneControl, settings: SteeringSett
     device, joints = situation.device, situation.joints
     if situation.steering:
         return "already steering"
-    if device is None or not device.homed or device.state not in _ENABLED_DEVICE:
-        return _device_obstacle(device)
+    why = _device_obstacle(device)
+    if why or device is None:
+        return why
     if joints is None:
         return "no joint_states have come"
-    if situation.retracted:
-        return "the needle was retracted: draw it out first"
-    return _needle_obstacle(joints, control, settings)
+    if not _agree(device, joints):
+        return (
+            f"waiting for joint_states to say what the device does ({joints.insertion:.4g} m, "
+            f"{joints.rotation:.4g} rad; the device {device.insertion:.4g} m, "
+            f"{device.rotation:.4g} rad)"
+        )
+    return situation.withdrawal or _needle_obstacle(joints, control, settings)
 
 
 def _device_obstacle(device: DeviceStatus | None) -> str:
     if device is None:
         return "no device/status has come"
+    if device.state == "MOVING":
+        return "waiting for the device, which moves"
     if not device.homed:
         return "the device is not homed"
-    return f"the device is not enabled ({device.state})"
+    if device.state != "HOLDING":
+        return f"the device is not enabled ({device.state})"
+    return ""
+
+
+def _agree(device: DeviceStatus, joints: JointSample) -> bool:
+    """Return whether the joints are where the device has them: not those of a motion before."""
+    if device.insertion is None or device.rotation is None:
+        return True
+    there = JointSample(joints.stamp_ns, device.insertion, device.rotation)
+    return joints.is_at(there, _SAME_INSERTION, _SAME_ROTATION)
 
 
 def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: SteeringSettings) -> str:

@@ -7,8 +7,12 @@ happened to arrive.
 
 from __future__ import annotations
 
-from needle_controller.joint_history import JointSample
+import math
+
+from needle_controller.failed_steps import FailedSteps
+from needle_controller.joint_history import Heard, JointSample
 from needle_controller.next_step import next_step
+from needle_controller.patience import Patience
 from needle_controller.plane_control import PlaneControl
 from needle_controller.reachability import Reachability, reachability
 from needle_controller.retraction import RetractionWatch
@@ -24,17 +28,13 @@ from needle_controller.steering_types import (
     State,
     SteeringSettings,
 )
+from needle_controller.step_watch import REST_INSERTION, Followed, StepWatch
 from needle_controller.tip_covariance import TipCovariance
-from needle_controller.tip_gate import STAMP_AHEAD_NS, AcceptedTip, Refusal, TipMeasurement
+from needle_controller.tip_gate import AcceptedTip, Refusal, TipMeasurement
 from needle_controller.tip_intake import TipIntake
 
 PLANE_TOLERANCE = 1e-3
 """Distance from the plane at which the needle counts as in it, [KC09] IV-A [m]."""
-REST_INSERTION = 2e-6
-REST_ROTATION = 1e-4
-"""What a joint at rest may change by [m], [rad]."""
-MOST_REFUSALS = 10
-"""Commands in a row that may end without motion before the controller gives up."""
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
 _DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
 
@@ -55,14 +55,12 @@ class Steering:
         Where the protocol is, and what it needs to go on.
     reason : str
         Why it is there, or what is amiss.
+    starts : int
+        How often somebody has started it.
     step : int
         Steps done.
-    tip_after_ns : int
-        A tip exposed after this is wanted [ns].
     rejection : str
         Why the last tip was refused; empty once one was used.
-    silence : str
-        What of the device has not been heard for long; empty when all is well.
     watchdog_trips : int
         How often the steady clock, not data, decided.
     insertion : float
@@ -71,6 +69,9 @@ class Steering:
         Of the plane, at the last used tip.
     intake : TipIntake
         Tips and joints.
+    trusts_device : bool
+        Whether a step that succeeded is done, wherever the joints are: of a recording, whose device
+        ran other steps, and whose controller has said which tips were exposed after them.
     """
 
     def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
@@ -79,22 +80,31 @@ class Steering:
         self.state = State.IDLE
         self.awaiting = Awaiting.NOTHING
         self.reason = "not started"
+        self.starts = 0
         self.step = 0
-        self.tip_after_ns = 0
         self.rejection = ""
-        self.silence = ""
         self.watchdog_trips = 0
         self.insertion = 0.0
         self.reach: Reachability | None = None
         self.intake = TipIntake()
+        self.trusts_device = False
         self._retraction = RetractionWatch()
         self._device: DeviceStatus | None = None
         self._ready_step: SendStep | None = None
         self._sent: SendStep | None = None
-        self._refusals = 0
-        self._awaited_since: float | None = None
-        self._heard_since: float | None = None
-        self._looked_at: JointSample | None = None
+        self._followed: StepWatch | None = None
+        self._failed = FailedSteps()
+        self._patience = Patience()
+
+    @property
+    def silence(self) -> str:
+        """What of the device has not been heard for long; empty when all is well."""
+        return self._patience.silence
+
+    @property
+    def tip_after_ns(self) -> int:
+        """A tip exposed after this is wanted [ns]."""
+        return self.intake.after_ns
 
     @property
     def tips_rejected(self) -> int:
@@ -107,7 +117,7 @@ class Steering:
         """Begin steering, or say why not."""
         joints = self.intake.joints.latest
         why = obstacle(
-            Situation(self._steering, self._device, joints, self._retraction.retracted),
+            Situation(self._steering, self._device, joints, self._retraction.obstacle),
             self.control,
             self.settings,
         )
@@ -118,7 +128,10 @@ class Steering:
             self.intake.last = None
             self.step = 0
             self._retraction.begin(joints.insertion)
-        self.state, self.reason, self._refusals = State.STEERING, "", 0
+        self.state, self.reason = State.STEERING, ""
+        self.starts += 1
+        self._failed.forget()
+        self.intake.want_any()
         return Reply(True, "steering"), [Log("info", "steering"), *self._ask()]
 
     def on_stop(self) -> tuple[Reply, list[Action]]:
@@ -131,20 +144,26 @@ class Steering:
 
     def on_joints(self, sample: JointSample) -> list[Action]:
         """Take a sample of the joints."""
-        if not self.intake.joints.add(sample):
+        before, complaint = self.intake.joints.latest, self.intake.joints.complaint
+        heard = self.intake.joints.add(sample)
+        if heard is Heard.DOUBTED and not complaint:
+            return [Log("warning", self.intake.joints.complaint, "joints")]
+        if heard in {Heard.DOUBTED, Heard.REPEATED}:
             return []
         actions = self._heard()
-        out = is_out(sample, self.settings)
+        if heard is Heard.JUMPED and before is not None:
+            actions += self._take_jump(before, sample)
+        out_below = self.settings.needle_out_insertion
         tolerance = self.settings.retraction_tolerance
-        if self._retraction.watch(sample.insertion, is_out=out, tolerance=tolerance):
+        if self._retraction.watch(sample.insertion, out_below=out_below, tolerance=tolerance):
             actions += self._end_by_retraction(sample)
-        return actions + self._use_tip()
+        return actions + self._watch_step(sample) + self._use_tip()
 
     def on_tip(self, tip: TipMeasurement) -> list[Action]:
         """Take a measured tip: used, kept until all that belongs to it has come, or refused."""
         wanted = self._steering and self.awaiting is Awaiting.TIP
-        refusal = self.intake.offer(tip, self.tip_after_ns if wanted else None, self.settings)
-        return self._refuse(refusal) if refusal is not None else self._use_tip()
+        refusal = self.intake.offer(tip, self.settings, steering=self._steering, wanted=wanted)
+        return [*(self._refuse(refusal) if refusal is not None else ()), *self._use_tip()]
 
     def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
         """Take what a tip's source says of how well it knows the tip of the same stamp."""
@@ -155,20 +174,18 @@ class Steering:
         """Take the driver's answer to a command; answers to other commands are not ours."""
         if self._sent is None or stamp_ns != self._sent.stamp_ns:
             return []
-        self._sent = None
+        step, self._sent = self._sent, None
         if not self._steering:
             return []
         if text == "succeeded":
-            self.step += 1
-            self._refusals = 0
-            return self._ask()
+            self._followed = StepWatch(step, trusted=self.trusts_device)
+            return [*self._ask(), *self._watch_step(None), *self._use_tip()]
         actions: list[Action] = [Log("warning", f"step {self.step + 1} {text}", "abort")]
         self.reason = f"step {text}"
-        self._refusals = 0 if self._moved_since_command() else self._refusals + 1
-        if self._refusals >= MOST_REFUSALS:
-            why = f"{self._refusals} commands in a row ended without motion, the last {text}"
+        why = self._failed.aborted(text, moved=self._moved_since_command())
+        if why:
             return actions + self._leave(State.FAULT, why, "error")
-        return actions + self._ask()
+        return actions + self._ask() + self._use_tip()
 
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
@@ -196,11 +213,10 @@ class Steering:
             Now, on the steady clock [s].
         """
         if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
-            self._awaited_since = self._heard_since = None
+            self._patience.restart()
             return []
-        if self._awaited_since is None or (self.awaiting is Awaiting.RESULT and self._is_moving()):
-            self._awaited_since = steady
-        waited = steady - self._awaited_since
+        moving = self.awaiting is Awaiting.RESULT and self._is_moving()
+        waited = self._patience.waited(steady, moving=moving)
         if self.awaiting is Awaiting.RESULT:
             return self._watch_result(waited, steady)
         return self._watch_tip(waited, steady)
@@ -213,27 +229,22 @@ class Steering:
 
     def _is_moving(self) -> bool:
         """Return whether the device says so, or the joints do since the last look."""
-        latest, before = self.intake.joints.latest, self._looked_at
-        self._looked_at = latest
-        says_so = self._device is not None and self._device.state == "MOVING"
-        return says_so or (
-            latest is not None
-            and before is not None
-            and abs(latest.insertion - before.insertion) > REST_INSERTION
-        )
+        has_moved = self._patience.has_moved(self.intake.joints.latest)
+        return has_moved or (self._device is not None and self._device.state == "MOVING")
 
     def _watch_tip(self, waited: float, steady: float) -> list[Action]:
         actions: list[Action] = []
-        refusal = self.intake.watch(steady, self.settings.tip_timeout)
-        if refusal is not None:
+        if (refusal := self.intake.watch(steady, self.settings.tip_timeout)) is not None:
             self.watchdog_trips += 1
-            actions = self._refuse(refusal)
+            actions = [*self._refuse(refusal), *self._use_tip()]
         if waited < self.settings.tip_timeout or self.state is State.WAITING_FOR_TIP:
             return actions
         self.state = State.WAITING_FOR_TIP
         self.watchdog_trips += 1
         self.reason = f"no good tip for {self.settings.tip_timeout:g} s"
-        if self.rejection:
+        if self._followed is not None:
+            self.reason = f"joint_states do not show the end of step {self.step + 1}"
+        elif self.rejection:
             self.reason += f"; the last one was refused: {self.rejection}"
         return [*actions, Log("warning", f"WAITING_FOR_TIP: {self.reason}")]
 
@@ -247,55 +258,64 @@ class Steering:
                 "not move: the command or its answer is lost"
             )
             return self._leave(State.FAULT, why, "error")
-        if self._heard_since is None:
-            self._heard_since = steady
-        if steady - self._heard_since < timeout or self.silence:
+        if self._patience.unheard(steady) < timeout or self.silence:
             return []
         # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
-        self.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        self._patience.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
         return [Log("warning", self.silence)]
 
     def _heard(self) -> list[Action]:
-        self._heard_since = None
-        if not self.silence:
-            return []
-        self.silence = ""
-        return [Log("info", "the device is heard again")]
+        return [Log("info", "the device is heard again")] if self._patience.heard() else []
 
     def _ask(self) -> list[Action]:
         """Ask for a tip of the needle at rest, or for the hold that must come first."""
-        intake = self.intake
-        intake.forget_pending()
         self._ready_step = None
         if self._device is None or not self._device.hold_owner:
             self.awaiting = Awaiting.HOLD
             return []
-        rest = intake.joints.motion_end_ns(REST_INSERTION, REST_ROTATION)
-        stamps = [self.tip_after_ns, rest or 0, intake.last.tip.stamp_ns if intake.last else 0]
-        idle = self.awaiting in {Awaiting.HOLD, Awaiting.NOTHING}
-        if idle and intake.newest_ns is not None:
-            # The needle stood and nobody held it: the driver wants a younger tip than those.
-            stamps.append(intake.newest_ns)
-        self.tip_after_ns = max(stamps)
+        latest = self.intake.joints.latest
+        if not (self.trusts_device or self._followed is not None or latest is None):
+            # Wherever a motion ended, it was over by then.
+            self.intake.want_after(latest.stamp_ns)
         self.awaiting = Awaiting.TIP
-        self._awaited_since = None
+        self._patience.restart()
         return []
+
+    def _watch_step(self, sample: JointSample | None) -> list[Action]:
+        """Look whether the joints have followed the step that succeeded."""
+        watch = self._followed
+        if watch is None:
+            return []
+        if (followed := watch.look(self.intake.joints, sample)) is Followed.NOT_YET:
+            return []
+        self._followed = None
+        self.intake.want_after(watch.end_ns)
+        if followed is Followed.ARRIVED or sample is None:
+            self.step += 1
+            self._failed.forget()
+            return []
+        why, is_enough = self._failed.unfollowed(watch.step, sample)
+        if is_enough:
+            return self._leave(State.FAULT, why, "error")
+        self.reason = why
+        return [Log("warning", why, "unfollowed")]
 
     def _refuse(self, refusal: Refusal) -> list[Action]:
         self.rejection = refusal.text
         if self._steering:
             self.reason = f"tip refused: {refusal.text}"
-        stamp_ns, latest = refusal.tip.stamp_ns, self.intake.joints.latest
-        horizon = latest.stamp_ns + STAMP_AHEAD_NS if latest is not None else 0
-        if self._steering and self.awaiting is Awaiting.TIP and stamp_ns <= horizon:
-            self.tip_after_ns = max(self.tip_after_ns, stamp_ns)
         return [Log("warning", f"tip refused: {refusal.text}", f"tip {refusal.fault.value}")]
 
     def _use_tip(self) -> list[Action]:
-        taken = self.intake.take(self.settings)
-        if taken is None:
-            return []
-        return self._refuse(taken) if isinstance(taken, Refusal) else self._step_from(taken)
+        actions: list[Action] = []
+        while self._steering and self.awaiting is Awaiting.TIP and self._followed is None:
+            taken = self.intake.take(self.settings)
+            if taken is None:
+                break
+            if isinstance(taken, AcceptedTip):
+                return actions + self._step_from(taken)
+            actions += self._refuse(taken)
+        return actions
 
     def _step_from(self, accepted: AcceptedTip) -> list[Action]:
         tip, joints, settings = accepted.tip, accepted.joints, self.settings
@@ -331,9 +351,13 @@ class Steering:
         if device.state != "HOLDING":
             self.awaiting = Awaiting.DEVICE
             return []
+        if self.intake.has_moved_on(self.settings.step_length):
+            self._ready_step = None
+            self.awaiting = Awaiting.TIP
+            return self._use_tip()
         self._ready_step, self._sent = None, step
         self.awaiting = Awaiting.RESULT
-        self._awaited_since = self._heard_since = None
+        self._patience.restart()
         return [step]
 
     def _moved_since_command(self) -> bool:
@@ -343,6 +367,21 @@ class Steering:
             and last is not None
             and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
         )
+
+    def _take_jump(self, before: JointSample, sample: JointSample) -> list[Action]:
+        """Take that the joints are in another place, or time, without a way there."""
+        settings, gap = self.settings, (sample.stamp_ns - before.stamp_ns) * 1e-9
+        tolerance = settings.retraction_tolerance
+        if gap > 0.0 and sample.is_at(before, settings.step_length + tolerance, math.inf):
+            # They were silent, no more.
+            return []
+        if gap < 0.0:
+            self.intake.forget_stamps()
+        away = self._retraction.jump(before, sample, tolerance)
+        why = self._retraction.obstacle if away else f"the clock of joint_states went {gap:.4g} s"
+        if not self._steering:
+            return [Log("warning", why)]
+        return self._leave(State.IDLE, why, "warning")
 
     def _end_by_retraction(self, sample: JointSample) -> list[Action]:
         self.control.restart()
@@ -355,7 +394,7 @@ class Steering:
     def _leave(self, state: State, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason
         self.awaiting = Awaiting.NOTHING
-        self.silence = ""
-        self.intake.forget_pending()
-        self._ready_step = self._sent = None
+        self._patience.silence = ""
+        self.intake.forget_waiting()
+        self._ready_step = self._sent = self._followed = None
         return [Log(severity, f"{state.value}: {reason}" if reason else state.value)]

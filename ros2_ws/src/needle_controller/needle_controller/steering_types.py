@@ -72,12 +72,22 @@ class SteeringSettings:
 
 @dataclasses.dataclass(frozen=True)
 class DeviceStatus:
-    """What the driver says of itself."""
+    """What the driver says of itself.
+
+    Attributes
+    ----------
+    state, homed, hold_owner, reason : str, bool, str, str
+        As in `device/status`.
+    insertion, rotation : float or None
+        Where it has the joints [m], [rad]; None where it does not say.
+    """
 
     state: str
     homed: bool
     hold_owner: str
     reason: str = ""
+    insertion: float | None = None
+    rotation: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -258,7 +258,7 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
     bench.start()
     stamps = [bench.tip([0.0, 0.0, 0.0])]
     intake = bench.node._steering.intake
-    bench.until(lambda: intake.newest_ns == stamps[0] and intake.joints.latest is not None)
+    bench.until(lambda: bool(intake._waiting) and intake.joints.at(stamps[0]) is not None)
     assert not bench.commands
     # That of another tip says that this one's will not come.
     pose = PoseWithCovarianceStamped()

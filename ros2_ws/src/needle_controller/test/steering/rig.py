@@ -29,6 +29,8 @@ class Rig:
         held: bool = True,
         tip_covariance: str = "configured",
         preset: str = "best",
+        insertion: float = 0.0,
+        rotation: float = 0.0,
     ) -> None:
         parameters = PlaneControllerParameters(
             preset=preset, depth=depth, target_offset=0.003, tip_covariance=tip_covariance
@@ -36,8 +38,8 @@ class Rig:
         control = PlaneControl(parameters.control(), offset_plane(0.003))
         self.steering = Steering(parameters.steering(), control)
         self.now = TICK
-        self.insertion = 0.0
-        self.rotation = 0.0
+        self.insertion = insertion
+        self.rotation = rotation
         self.steering.on_device(HELD if held else FREE)
         self.joints()
         if started:
@@ -46,6 +48,14 @@ class Rig:
 
     def joints(self) -> list[Action]:
         return self.steering.on_joints(JointSample(self.now, self.insertion, self.rotation))
+
+    def settle(self, count: int = 6) -> list[Action]:
+        """Let joint_states say several times where the needle is."""
+        actions: list[Action] = []
+        for _ in range(count):
+            self.now += TICK
+            actions += self.joints()
+        return actions
 
     def measured(self, x: float = 0.0) -> TipMeasurement:
         return TipMeasurement(self.now, "rig", np.array([x, 0.0, self.insertion]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.steering import MOST_REFUSALS
+from needle_controller.failed_steps import MOST_REFUSALS
 from needle_controller.steering_types import Awaiting, DeviceStatus, State
 
 from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
@@ -70,21 +70,21 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     rig = Rig()
     for _ in range(5):
         rig.run(sent(rig.expose()))
-    rig.now += TICK
+    rig.settle()
     rig.insertion -= 0.0001
-    assert rig.joints() == []
+    assert rig.settle() == []
     rig.now += TICK
     rig.insertion -= 0.0002
-    assert "retracted" in logged(rig.joints())
+    assert "retracted" in logged(rig.settle())
     assert where(rig) == (State.IDLE, Awaiting.NOTHING)
     assert "retracted" in rig.steering.on_start()[0].message
-    rig.now += TICK
-    rig.insertion = 0.01
-    rig.joints()
+    rig.insertion = 0.004
+    rig.settle()
     assert not rig.steering.on_start()[0].success
-    rig.now += TICK
-    rig.insertion, rig.rotation = 0.0, 0.0
-    rig.joints()
+    while rig.insertion > 0.0:
+        rig.insertion = max(rig.insertion - 0.0005, 0.0)
+        rig.settle(1)
+    rig.settle()
     assert rig.steering.on_start()[0].success
     assert sent(rig.expose()).insertion == pytest.approx(0.001)
 

@@ -85,7 +85,7 @@ def test_a_stamp_far_ahead_is_refused_and_does_not_block() -> None:
 
 def test_a_tip_older_than_the_joints_kept_is_refused() -> None:
     rig = Rig()
-    rig.steering.tip_after_ns = 0
+    rig.steering.intake.after_ns = 0
     assert "older" in logged(rig.steering.on_tip(TipMeasurement(1, "rig", np.zeros(3))))
 
 

@@ -8,7 +8,7 @@ import pytest
 from needle_controller.steering import Steering
 from needle_controller.steering_types import Awaiting, DeviceStatus, State
 
-from .rig import HELD, TICK, Rig, sent, where
+from .rig import HELD, MOVING, Rig, sent, where
 
 
 @pytest.mark.parametrize(
@@ -38,20 +38,14 @@ def test_start_needs_joints() -> None:
 
 
 def test_start_refuses_a_needle_it_did_not_follow() -> None:
-    rig = Rig(started=False)
-    rig.insertion = 0.05
-    rig.now += TICK
-    rig.joints()
+    rig = Rig(started=False, insertion=0.05)
     reply, _ = rig.steering.on_start()
     assert not reply.success
     assert "0.05 m in" in reply.message
 
 
 def test_start_refuses_a_roll_its_coordinates_cannot_say() -> None:
-    rig = Rig(started=False, preset="paper")
-    rig.rotation = 2.0
-    rig.now += TICK
-    rig.joints()
+    rig = Rig(started=False, preset="paper", rotation=2.0)
     reply, _ = rig.steering.on_start()
     assert not reply.success
     assert "roll" in reply.message
@@ -59,10 +53,7 @@ def test_start_refuses_a_roll_its_coordinates_cannot_say() -> None:
 
 @pytest.mark.parametrize("turned", [2.0, np.pi, -8.0])
 def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
-    rig = Rig(started=False)
-    rig.rotation = turned
-    rig.now += TICK
-    rig.joints()
+    rig = Rig(started=False, rotation=turned)
     assert rig.steering.on_start()[0].success
     assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
 
@@ -78,3 +69,25 @@ def test_start_twice_and_stop_twice() -> None:
 def test_tips_move_nothing_while_idle() -> None:
     rig = Rig(started=False)
     assert rig.expose() == []
+
+
+@pytest.mark.parametrize(
+    ("device", "said"),
+    [
+        (MOVING, "waiting for the device, which moves"),
+        (DeviceStatus("MOVING", False, ""), "waiting for the device, which moves"),
+        (DeviceStatus("HOLDING", True, "", "", 0.0, 0.0), "waiting for joint_states"),
+    ],
+)
+def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) -> None:
+    """The joints lag behind the device: homing has ended there, and not here."""
+    rig = Rig(started=False, insertion=0.0015)
+    rig.steering.on_device(device)
+    reply, _ = rig.steering.on_start()
+    assert not reply.success
+    assert reply.message.startswith(said)
+    rig.insertion = 0.0
+    rig.settle()
+    rig.steering.on_device(DeviceStatus("HOLDING", True, "operator", "", 0.0, 0.0))
+    assert rig.steering.on_start()[0].success
+    sent(rig.expose())
