@@ -34,6 +34,8 @@ DISABLE = ServiceCall("device/enable", False)
 # A rig that has not found all its partners yet refuses with this beginning: ask again.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
+# What device/home answers when it has begun; anything else: there is nothing to wait for.
+HOMING = "homing"
 # Any other refusal may rest on news that are still under way (joints, the answer before this one).
 REFUSAL_PATIENCE = 2.0
 # A press that the device has not taken, or has forgotten because messages came late, counts again
@@ -97,7 +99,10 @@ class OperatorSequence:
         self._simulated = False
         self._speaker = ""
         self._devices: Sequence[str] = ()
+        self._homed_since_call = False
         self._steered = False
+        self._starts = 0
+        self._starts_before = 0
         self._said_since_start: Mapping[str, str] | None = None
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
@@ -138,7 +143,9 @@ class OperatorSequence:
         if call.service == "device/enable" and not self._homed:
             return None
         self._pending = True
+        self._homed_since_call = False
         self._said_since_start = None
+        self._starts_before = self._starts
         return call
 
     def take_answer(self, success: bool, message: str, now: float) -> None:
@@ -149,12 +156,15 @@ class OperatorSequence:
         call = PREPARATION[self._prepared]
         if success:
             self._prepared += 1
+            if message == HOMING:
+                # What was heard before the call is no news of this homing.
+                self._homed = self._homed_since_call
             self._refusal = ""
             self._refused_since = None
             self._deadline = now + self._wait_timeout
             self._progress_at = self._press_since = now
             said = self._said_since_start or {}
-            if self.steering and said.get("state") == "FAULT":
+            if self.steering and (said.get("state") == "FAULT" or "starts" in said):
                 # The controller's status can overtake its answer.
                 self._judge(said)
             return
@@ -183,7 +193,8 @@ class OperatorSequence:
                 "false): there a person holds, no stand-in"
             )
             return
-        self._homed = values.get("homed") == "true"
+        self._homed = values.get("homed") == "true" and values.get("state") != "MOVING"
+        self._homed_since_call = self._homed
         counts = bool(values.get("hold_owner"))
         if self._hold_counts and not counts:
             self._press_since = now
@@ -197,6 +208,7 @@ class OperatorSequence:
         self.depth = _number(values.get("depth_m"))
         waits = values.get("state") == "WAITING_FOR_TIP"
         self.waits_because = values.get("reason", "") if waits else ""
+        self._starts = int(_number(values.get("starts")) or 0)
         progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
@@ -207,6 +219,11 @@ class OperatorSequence:
 
     def _judge(self, values: Mapping[str, str]) -> None:
         state = values.get("state", "")
+        if "starts" in values:
+            if int(_number(values["starts"]) or 0) <= self._starts_before:
+                # Of an earlier run.
+                return
+            self._steered = True
         if state == "DONE":
             self.outcome = Outcome(
                 True, f"inserted {self.insertion * 1e3:.1f} mm in {values.get('step')} steps"

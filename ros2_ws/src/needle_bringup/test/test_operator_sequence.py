@@ -252,3 +252,66 @@ def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> No
     sequence.see_devices(["/device_driver", "/sim_rig"])
     assert sequence.outcome is not None
     assert "more than one device: /device_driver, /sim_rig" in sequence.outcome.reason
+
+
+def test_a_homing_under_way_is_waited_for_whatever_was_heard_before_it() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    sequence.next_call(1.0)
+    sequence.take_answer(True, "needle out", 1.0)
+    assert sequence.next_call(1.0) == ServiceCall("device/home")
+    sequence.take_answer(True, "homing", 1.0)
+    assert sequence.next_call(1.0) is None
+    # A device may say that it is homed, from last time, while it looks for its switches.
+    for homed in ("false", "true"):
+        see(sequence, {"homed": homed, "state": "MOVING"}, 2.0)
+        assert sequence.next_call(2.0) is None
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 3.0)
+    assert sequence.next_call(3.0) == ServiceCall("device/enable", True)
+
+
+def test_the_end_of_a_homing_may_overtake_its_answer() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    sequence.next_call(1.0)
+    sequence.take_answer(True, "needle out", 1.0)
+    sequence.next_call(1.0)
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    sequence.take_answer(True, "homing", 1.0)
+    assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
+
+
+def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
+    """STEERING, then IDLE: a latched status of depth 1 may show the second alone."""
+    for overtakes in (False, True):
+        sequence = fresh()
+        sequence.see_controller(steering(state="IDLE", starts="1", reason="stopped"), 0.5)
+        sequence.see_missing([])
+        see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+        for _ in PREPARATION[:-1]:
+            sequence.next_call(1.0)
+            sequence.take_answer(True, "", 1.0)
+        sequence.next_call(1.0)
+        ended = steering(state="IDLE", starts="2", reason="the needle was drawn back")
+        if overtakes:
+            sequence.see_controller(ended, 1.0)
+        sequence.take_answer(True, "", 1.0)
+        if not overtakes:
+            sequence.see_controller(ended, 1.0)
+        assert sequence.outcome is not None
+        assert "the needle was drawn back" in sequence.outcome.reason
+
+
+def test_what_was_said_before_this_start_is_of_another_run() -> None:
+    for state in ("DONE", "FAULT", "IDLE"):
+        sequence = fresh()
+        old = steering(state=state, starts="1")
+        sequence.see_controller(old, 0.5)
+        prepare(sequence)
+        sequence.see_controller(old, 2.0)
+        assert outcome(sequence) is None
+        sequence.see_controller(steering(starts="2"), 2.0)
+        sequence.see_controller(steering(state="DONE", starts="2"), 3.0)
+        assert sequence.outcome is not None
+        assert sequence.outcome.done
