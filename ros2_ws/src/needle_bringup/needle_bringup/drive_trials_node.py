@@ -1,7 +1,7 @@
 """Trials of the device driver against the emulated drives, each printed as one JSON object.
 
 `python -m needle_bringup.drive_trials_node steps 10000`, `... faults 50 cut_bus unplug`,
-`... kills 50 operator`, `... two_rigs 50`.
+`... kills 50 operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each).
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import rclpy
 from needle_bringup.drive_faults_node import FAULTS, fault_trials
 from needle_bringup.drive_steps_node import random_steps
 from needle_bringup.graph_kills_node import KILLED, kill_trials
+from needle_bringup.nuisance_node import KINDS
+from needle_bringup.nuisance_trials_node import nuisance_trials
 from needle_bringup.two_rigs_node import two_rigs_trials
 from needle_common.cli import EXIT_DONE, run_command
 from needle_common.options import CommandParser
@@ -28,7 +30,7 @@ from needle_common.ros_domain import own_domain
 def main() -> int:
     """Run trials; returns the exit code."""
     parser = CommandParser("drive_trials", __doc__ or "", "")
-    parser.add_argument("trial", choices=("steps", "faults", "kills", "two_rigs"))
+    parser.add_argument("trial", choices=("steps", "faults", "kills", "two_rigs", "nuisances"))
     parser.add_argument("count", type=int)
     parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
     parser.add_argument("--seed", type=int, default=1)
@@ -56,6 +58,8 @@ def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Iterator[
         yield from fault_trials(
             folder, domain, kinds, given.count, given.seed, watchdog=given.watchdog
         )
+    elif given.trial == "nuisances":
+        yield from nuisance_trials(folder, domain, given.kinds or KINDS, float(given.count))
     elif given.trial == "two_rigs":
         yield from two_rigs_trials(folder, domain, given.count, given.seed)
     else:

@@ -60,6 +60,14 @@ BOUNDS = {
     "hang": _SILENT,
     "emcy": _TOLD,
 }
+NUISANCES = {
+    "points": "trajectories of 1,000,000 points",
+    "name": "holds with a name of 1 MB",
+    "parameters": "set_parameters with 20,000 names",
+    "flood": "10,000 messages/s on each topic that the driver hears",
+}
+# The drives' watchdog, and the copy of a message of 56 MB [s].
+DRIVES_WAIT, LONGEST_COPY = 0.1, 0.5
 # A rotation that does not follow is noticed when it is so far off [rad]; then come the patience of
 # the drive, a cycle and a ramp [s].
 _FOLLOWING = 0.1
@@ -175,6 +183,23 @@ def two_rigs(_: Workbench, starts: int = MOMENTS) -> Iterator[Finding]:
     )
 
 
+def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
+    """Hold up neither cycle nor emergency stop by anything that others send."""
+    for outcome in _trials("nuisances", seconds, *NUISANCES):
+        kind, longest = outcome["nuisance"], float(outcome["longest_cycle_s"])
+        heard = float(outcome["estop_heard_s"])
+        # What copying the longest message takes is what is left; no more than this one is seen.
+        bound = LONGEST_COPY if kind == "points" else DRIVES_WAIT
+        yield Finding(
+            f"nuisance_{kind}",
+            f"{NUISANCES[kind]}, a step under way: longest cycle; emergency stop heard after",
+            f"at most {bound:g} s each",
+            f"{longest:.3f} s, {heard:.3f} s"
+            + (f"; step {outcome['step_ended_by']}" if outcome["step_ended_by"] else ""),
+            max(longest, heard) <= bound,
+        )
+
+
 CHECKS: tuple[Check, ...] = (
     drive_level,
     same_joints,
@@ -182,6 +207,7 @@ CHECKS: tuple[Check, ...] = (
     faults,
     killed_nodes,
     two_rigs,
+    nuisances,
 )
 
 

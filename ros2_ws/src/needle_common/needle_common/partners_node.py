@@ -11,14 +11,16 @@ from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-from rcl_interfaces.srv import GetParameters
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from rclpy.task import Future
+from type_description_interfaces.srv import GetTypeDescription
 
 RECORDER = "recorder"
+# A question that any node answers at once: there is no such type.
+_NO_TYPE = GetTypeDescription.Request(type_name="none/msg/None", type_hash="RIHS01_" + "0" * 64)
 # What the graph calls a node whose endpoint has come and whose name has not.
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
@@ -100,6 +102,23 @@ def publishers_of(node: Node, topic: str) -> list[str]:
     ]
 
 
+def one_too_many(node: Node, subscription: Subscription[Any]) -> str:
+    """Return who else publishes what only one may: a message does not say whose it is.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks.
+    subscription : Subscription
+        Its own.
+    """
+    if subscription.get_publisher_count() <= 1:
+        return ""
+    topic = subscription.topic_name
+    names = sorted(publishers_of(node, topic))
+    return f"{len(names)} nodes publish {topic}, wanted 1: {', '.join(names)}"
+
+
 def _listeners(node: Node, topic: str) -> set[str]:
     infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     return {info.node_name for info in infos}
@@ -130,13 +149,15 @@ class AnsweringNodes:
         for name in names - self._answered:
             if name not in self._clients:
                 self._clients[name] = self._node.create_client(
-                    GetParameters, f"{name}/get_parameters"
+                    # every node has it in its own process
+                    GetTypeDescription,
+                    f"{name}/get_type_description",
                 )
             now = time.monotonic()
             due = now - self._asked.get(name, -self.ASK_AGAIN) >= self.ASK_AGAIN
             if due and self._clients[name].service_is_ready():
                 self._asked[name] = now
-                future = self._clients[name].call_async(GetParameters.Request())
+                future = self._clients[name].call_async(_NO_TYPE)
                 future.add_done_callback(partial(self._take_answer, name))
         return names <= self._answered
 

@@ -27,11 +27,21 @@ class CycleSchedule:
         self._period = period
         self._slack = slack
         self._due: float | None = None
+        self._begun: float | None = None
+        self._longest = 0.0
         self.late = 0
 
     def begin(self, now: float) -> float:
         """Take that a cycle begins now, steady clock [s]; return how long until the next [s]."""
+        if self._begun is not None:
+            self._longest = max(self._longest, now - self._begun)
+        self._begun = now
         due = now if self._due is None else min(self._due, now)
         self.late += now > due + self._slack
         self._due = max(due, now - self._slack) + self._period
         return self._due - now
+
+    def take_longest(self) -> float:
+        """Return the longest time between two cycles since the last call [s]; 0 without any."""
+        longest, self._longest = self._longest, 0.0
+        return longest

@@ -11,6 +11,7 @@ from typing import Any
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
@@ -20,11 +21,19 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import EndRequest
 from needle_common.errors import UserError
 from needle_common.life_signs_node import LifeSigns
+from needle_common.parameter_desk_node import ParameterDesk
 from needle_common.parameters import NodeParameters
-from needle_common.partners_node import AnsweringNodes, unheard, unpublished, unrecorded
+from needle_common.partners_node import (
+    AnsweringNodes,
+    one_too_many,
+    unheard,
+    unpublished,
+    unrecorded,
+)
 from needle_common.reach import DISCOVERY, is_open
 from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
+from needle_device_driver.cycle_clock import CycleClock
 from needle_device_driver.cycle_schedule import CycleSchedule
 from needle_device_driver.device_interface_node import DeviceInterface
 from needle_device_driver.drive_cycle import DriveCycle
@@ -49,11 +58,13 @@ It is a lifecycle node: `autostart` (default) configures and activates it, waiti
 Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
 """
 
+PARAMETERS = "needle_device_driver.parameters:DeviceDriverParameters"
 PERIOD_NS = 20_000_000
 PERIOD = PERIOD_NS / NANOSECONDS
 # On a running clock the next cycle must come; a simulated one waits for this one's answers.
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
+_DESK_LOOK = 0.1
 _HELD_UP = 2.5 * PERIOD
 _SLACK = 0.1 * PERIOD
 
@@ -68,7 +79,8 @@ class DeviceDriverNode(LifecycleNode):
     """
 
     def __init__(self, **node_arguments: Any) -> None:
-        super().__init__("device_driver", **node_arguments)
+        # A long request would hold the cycle up: `ParameterDesk` answers.
+        super().__init__("device_driver", start_parameter_services=False, **node_arguments)
         values = NodeParameters(self, DeviceDriverParameters).values
         self._settings = values
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
@@ -98,7 +110,7 @@ class DeviceDriverNode(LifecycleNode):
         self._ends_if_refused = False
         self._give_up_at = time.monotonic() + values.connect_timeout
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
-        self._cycle_ns: int | None = None
+        self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
         self._timed_at: float | None = None
         self._diagnostics = DiagnosticsPublisher(self)
@@ -119,9 +131,12 @@ class DeviceDriverNode(LifecycleNode):
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
         self._sources = [self._device.commands]
+        self._clocks: Subscription[Clock] | None = None
         if self._sim_time:
-            clock = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
-            self._sources.append(clock)
+            self._clocks = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
+            self._sources.append(self._clocks)
+            self._deferred = self.create_timer(PERIOD, self._cycle_when_due, clock=STEADY_CLOCK)
+            self._deferred.cancel()
         self._partners = AnsweringNodes(self)
 
     def _why_not_ready(self) -> str:
@@ -131,6 +146,8 @@ class DeviceDriverNode(LifecycleNode):
     def _missing(self) -> list[str]:
         if not self._active:
             return [self._waiting_for]
+        if self._clocks is not None and one_too_many(self, self._clocks):
+            return [f"one /clock: {one_too_many(self, self._clocks)}"]
         missing = []
         publishers = [self._device.joint_states, self._device.results, self._device.statuses]
         if self._settings.lock_step:
@@ -145,7 +162,9 @@ class DeviceDriverNode(LifecycleNode):
     def _on_timer(self) -> None:
         self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
         self._timer.reset()
-        if self._supervisor.state is State.UNCONFIGURED:
+        state = self._supervisor.state
+        # A fault from before the configuration, such as another device: the start names it.
+        if state is State.UNCONFIGURED or (self._autostart and state is State.FAULT):
             self._start_by_itself()
             return
         if self._sim_time:
@@ -165,20 +184,33 @@ class DeviceDriverNode(LifecycleNode):
             self._drives.hear(now, 2.0 * PERIOD)
 
     def _on_clock(self, message: Clock) -> None:
-        ros_ns = to_nanoseconds(message.clock)
         if self._supervisor.state is State.UNCONFIGURED:
             return
-        if self._cycle_ns is not None and ros_ns < self._cycle_ns:
-            # Time was set back: another simulation.
-            self._cycle_ns = None
-        if self._cycle_ns is None or ros_ns >= self._cycle_ns + PERIOD_NS:
-            self._cycle_ns = ros_ns
-            self._cycle(ros_ns, self._settings.reply_age_limit)
+        assert self._clocks is not None
+        too_many = one_too_many(self, self._clocks)
+        if too_many:
+            self._supervisor.fail(too_many)
+            self._device.report()
             return
-        self._supervisor.note_time(ros_ns, time.monotonic())
-        if ros_ns == self._cycle_ns:
+        ros_ns = to_nanoseconds(message.clock)
+        if ros_ns < 0:
+            # rclpy's own ear refuses it by name.
+            return
+        if self._cycle_clock.tell(ros_ns):
             # A clock that stands still is repeated for whoever comes late; so are the joints.
             self._device.publish_joint_states(ros_ns)
+        self._supervisor.note_time(ros_ns, time.monotonic())
+        self._cycle_when_due()
+
+    def _cycle_when_due(self) -> None:
+        now = time.monotonic()
+        self._deferred.cancel()
+        ros_ns = self._cycle_clock.take(now)
+        if ros_ns is not None:
+            self._cycle(ros_ns, self._settings.reply_age_limit)
+        elif self._cycle_clock.waits:
+            self._deferred.timer_period_ns = int(self._cycle_clock.wait(now) * NANOSECONDS) + 1
+            self._deferred.reset()
 
     def _cycle(self, ros_ns: int, wait: float) -> None:
         now = time.monotonic()
@@ -199,6 +231,8 @@ class DeviceDriverNode(LifecycleNode):
             "frames_received": str(link.frames_received),
             "bus_errors": str(link.errors),
             "late_cycles": str(self._schedule.late),
+            # since the last word on it
+            "longest_cycle_s": f"{self._schedule.take_longest():.4f}",
             "unanswered_syncs": str(self._drives.unanswered),
         }
         level, message = Level.OK, "connected"
@@ -241,11 +275,14 @@ class DeviceDriverNode(LifecycleNode):
             # A fault from before the configuration; an emergency stop that is pressed stays.
             self._supervisor.reset(now)
         why_not = self._drives.probe()
+        simulated = not why_not and self._is_simulated()
+        if self._settings.lock_step and not (why_not or simulated):
+            why_not = "lock_step: a drive does not say that it is emulated; a real motor would turn"
         if not why_not:
             reply = self._supervisor.configure(time.monotonic())
             why_not = "" if reply.success else reply.message
         if not why_not:
-            self._device.simulated = self._is_simulated()
+            self._device.simulated = simulated
         elif self._ends_if_refused:
             # Its last words are these.
             self._refusal = why_not
@@ -335,14 +372,19 @@ def main() -> int:
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DeviceDriverNode)
         executor = executor_of(node, node.fail)
+        desk = ParameterDesk(node, PARAMETERS)
         # What is there stays: no collection need look through it while the drives wait.
         gc.freeze()
         try:
+            # Its start takes the processor: not once the drives wait for a heartbeat.
+            while not (end.wanted or desk.ready(_DESK_LOOK)):
+                pass
             while not (end.wanted or node.ended):
                 executor.spin_once(timeout_sec=0.1)
         finally:
             node.close()
             executor.shutdown()
+            desk.close()
         return EXIT_DONE
 
     return run_node(

@@ -15,8 +15,16 @@ from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.base_node import STEADY_CLOCK, DiagnosticsPublisher
+from needle_common.bounded_node import listen
 from needle_common.claim import WAY_OUT, Claim
-from needle_common.conversions import HOLD, JOINT_STATES, LATCHED, RELIABLE, to_stamp
+from needle_common.conversions import (
+    ESTOPS_HEARD,
+    HOLDS_HEARD,
+    JOINT_STATES,
+    LATCHED,
+    RELIABLE,
+    to_stamp,
+)
 from needle_common.errors import UserError
 from needle_common.partners_node import publishers_of, signature
 from needle_device_driver.conversions import (
@@ -93,11 +101,21 @@ class DeviceInterface:
         self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
         self.results = node.create_publisher(Header, "device/result", RELIABLE)
         self.statuses = node.create_publisher(DiagnosticStatus, "device/status", LATCHED)
-        self.commands = node.create_subscription(
-            JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
+        too_long = diagnostics.refuse
+        self.commands = listen(
+            node,
+            JointTrajectory,
+            "device/joint_trajectory",
+            self._on_commands,
+            RELIABLE,
+            refuse=too_long,
         )
-        self.holds = node.create_subscription(Joy, "device/hold", self._on_hold, HOLD)
-        self.estops = node.create_subscription(Bool, "device/estop", self._on_estop, RELIABLE)
+        self.holds = listen(
+            node, Joy, "device/hold", self._on_holds, HOLDS_HEARD, refuse=too_long, at_once=100
+        )
+        self.estops = listen(
+            node, Bool, "device/estop", self._on_estops, ESTOPS_HEARD, refuse=too_long, at_once=1000
+        )
         now = time.monotonic
         self._service("home", lambda: supervisor.home(now()))
         self._service("retract", lambda: supervisor.retract(now()))
@@ -169,20 +187,23 @@ class DeviceInterface:
             why = f" ({status.reason})" if status.reason else ""
             self._node.get_logger().debug(f"device: {status.state.value}{why}")
 
-    def _on_command(self, message: JointTrajectory) -> None:
+    def _on_commands(self, messages: list[JointTrajectory]) -> None:
         self._supervisor.see_others(self.others)
-        self._supervisor.submit(
-            to_command(message), time.monotonic(), self.commands.get_publisher_count()
-        )
+        for message in messages:
+            self._supervisor.submit(
+                to_command(message), time.monotonic(), self.commands.get_publisher_count()
+            )
         self.report()
 
-    def _on_hold(self, message: Joy) -> None:
+    def _on_holds(self, messages: list[Joy]) -> None:
         self._supervisor.see_others(self.others)
-        self._supervisor.receive_hold(to_hold_message(message), time.monotonic())
+        for message in messages:
+            self._supervisor.receive_hold(to_hold_message(message), time.monotonic())
         self.report()
 
-    def _on_estop(self, message: Bool) -> None:
-        self._supervisor.receive_estop(bool(message.data))
+    def _on_estops(self, messages: list[Bool]) -> None:
+        for message in messages:
+            self._supervisor.receive_estop(bool(message.data))
         self.report()
 
     def _service(self, name: str, call: Callable[[], Reply], *, always: bool = False) -> None:

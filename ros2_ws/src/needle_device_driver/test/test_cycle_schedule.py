@@ -45,3 +45,13 @@ def test_a_callback_before_its_time_begins_anew() -> None:
     schedule = CycleSchedule(PERIOD, SLACK)
     schedule.begin(0.0)
     assert schedule.begin(0.01) == pytest.approx(PERIOD)
+
+
+def test_the_longest_cycle_is_told_once() -> None:
+    schedule = CycleSchedule(PERIOD, SLACK)
+    for now in (0.0, 0.02, 0.12, 0.14):
+        schedule.begin(now)
+    assert schedule.take_longest() == pytest.approx(0.1)
+    assert schedule.take_longest() == 0.0
+    schedule.begin(0.16)
+    assert schedule.take_longest() == pytest.approx(0.02)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 import can
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
@@ -84,6 +84,7 @@ class Partner(Node):
         self.joints: list[JointState] = []
         self.results: list[Header] = []
         self.status: dict[str, str] = {}
+        self.refused: dict[str, int] = {}
         self.clock = self.create_publisher(Clock, "/clock", RELIABLE)
         self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
         self.holds = self.create_publisher(Joy, "device/hold", HOLD)
@@ -91,6 +92,7 @@ class Partner(Node):
         self.create_subscription(JointState, "joint_states", self.joints.append, JOINT_STATES)
         self.create_subscription(Header, "device/result", self.results.append, RELIABLE)
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, RELIABLE)
         self.device: dict[str, Any] = {
             name: self.create_client(kind, f"device/{name}")
             for kind, names in (
@@ -105,6 +107,15 @@ class Partner(Node):
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)
 
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == "device_driver: input":
+                self.refused = {
+                    key.removeprefix("refused "): int(value)
+                    for key, value in values_of(status).items()
+                    if key.startswith("refused ")
+                }
+
 
 class Rig:
     """Driver, drives and partner on one executor; time is what the test says."""
@@ -116,6 +127,7 @@ class Rig:
             "link": "virtual",
             "channel": channel,
             "use_sim_time": True,
+            "lock_step": parameters.get("use_sim_time", True),
             # A machine under load is no reason to stop.
             "reply_age_limit": 0.5,
             "hold_timeout": 0.5,

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -15,6 +16,8 @@ import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import Transition
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
@@ -28,7 +31,8 @@ from .node_bench import Rig
 
 
 @pytest.fixture
-def make_rig() -> Iterator[Callable[..., Rig]]:
+def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
+    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: True)
     with own_context() as context:
         rigs: list[Rig] = []
 
@@ -121,6 +125,29 @@ def test_the_last_stamp_that_there_is_is_refused_and_answered(make_rig: Make) ->
     assert answer.stamp == message.header.stamp
 
 
+def test_a_long_command_or_hold_is_refused_unread(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.ready()
+    rig.partner.commands.publish(rig.message(points=10_000))
+    long_name = Joy(axes=[1.0], buttons=[1])
+    long_name.header.frame_id = "n" * 1_000_000
+    rig.partner.holds.publish(long_name)
+    rig.until(lambda: set(rig.partner.refused) == {"device/joint_trajectory", "device/hold"}, "two")
+    assert rig.send(rig.message()).frame_id == "succeeded"
+    assert rig.partner.status["commands_refused"] == "0"
+
+
+def test_the_node_of_the_cycle_has_no_service_that_takes_long_requests(make_rig: Make) -> None:
+    rig = make_rig()
+    names = [name.rpartition("/")[2] for name in _services_of(rig)]
+    assert "change_state" in names
+    assert not [name for name in names if "parameter" in name]
+
+
+def _services_of(rig: Rig) -> list[str]:
+    return [service.srv_name for service in rig.driver.services]
+
+
 def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:
     rig = make_rig()
     rig.ready()
@@ -178,13 +205,61 @@ def test_simulated_is_what_has_emulated_drives_and_simulated_time(
     use_sim_time: bool,
     simulated: str,
 ) -> None:
-    if emulated:
-        monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: True)
-    rig = make_rig(autostart=False, use_sim_time=use_sim_time)
+    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: emulated)
+    rig = make_rig(autostart=False, use_sim_time=use_sim_time, lock_step=False)
     rig.until(rig.partner.change.service_is_ready, "the driver")
     assert rig.partner.status.get("simulated", "") == ""
     assert rig.transition(Transition.TRANSITION_CONFIGURE)
     rig.until(lambda: rig.partner.status.get("simulated") == simulated, "what it is")
+
+
+def test_lock_step_is_refused_where_a_drive_does_not_say_that_it_is_emulated(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: False)
+    rig = make_rig(lock_step=True)
+    with pytest.raises(UserError, match="lock_step: a drive does not say that it is emulated"):
+        rig.until(lambda: False, "the refusal")
+    assert all(drive.objects.get((0x1016, 1), bytes(4)) == bytes(4) for drive in rig.peer.drives)
+
+
+def test_a_clock_that_is_too_fast_makes_no_motion_faster(make_rig: Make) -> None:
+    rig = make_rig(lock_step=False)
+    rig.ready()
+    rig.partner.commands.publish(rig.message(duration=0.3))
+    rig.until(lambda: rig.partner.status["state"] == "MOVING", "step")
+    begun, syncs, end = time.monotonic(), rig.peer.syncs, len(rig.partner.results)
+
+    def hurry() -> bool:
+        rig.time_ns += 20_000_000
+        rig.tell_time()
+        return len(rig.partner.results) > end
+
+    rig.until(hurry, "the end of the step")
+    assert rig.partner.results[-1].frame_id == "succeeded"
+    assert (rig.peer.syncs - syncs) * 0.02 <= time.monotonic() - begun + 0.04
+
+
+def test_a_second_clock_is_named_and_stops_both_axes(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.ready()
+    rig.partner.commands.publish(rig.message(duration=1.0))
+    rig.until(lambda: rig.partner.status["state"] == "MOVING", "step")
+    rig.tick(5)
+    second = rclpy.create_node("second", context=rig.driver.context)
+    second.create_publisher(Clock, "/clock", RELIABLE)
+    rig.until(lambda: rig.driver.count_publishers("/clock") == 2, "second")
+    rig.tell_time()
+    rig.until(lambda: rig.partner.status["state"] == "FAULT", "the fault")
+    assert rig.partner.status["fault"] == "2 nodes publish /clock, wanted 1: /partner, /second"
+    at = rig.positions
+    assert "2 nodes publish /clock" in rig.call("reset").message
+    second.destroy_node()
+    rig.until(lambda: rig.driver.count_publishers("/clock") == 1, "one again")
+    rig.hold(False)
+    rig.until(lambda: bool(rig.call("reset").success), "reset")
+    rig.tick(3)
+    assert rig.positions == at
 
 
 def test_the_emergency_stop_stops_both_drives_and_its_reset_moves_nothing(make_rig: Make) -> None:
