@@ -25,8 +25,10 @@ from needle_bringup.figure_style import (
 )
 from needle_bringup.run_summary import (
     GOAL,
+    commanded_rotation,
     finite_tips,
     reduced_states,
+    rerun_of,
     target_offset,
     tip_error,
 )
@@ -72,7 +74,9 @@ def states_figure(run: Run) -> Figure:
                 lw=1.5,
                 label="base of the needle, measured",
             )
-        if len(run.control_input):
+        if rerun_of(run):
+            _draw_not_steered(rotation, run)
+        elif len(run.control_input):
             rotation.plot(
                 _insertion_mm(run, run.control_input),
                 np.degrees(run.control_input.values[:, 2]),
@@ -87,6 +91,20 @@ def states_figure(run: Run) -> Figure:
         for axes in (r2, r3):
             axes.axhline(0.0, color=GREY, lw=0.8)
         return figure
+
+
+def _draw_not_steered(axes: Any, run: Run) -> None:
+    """Draw what a rerun would have commanded: a stick for each step, from where the base was."""
+    insertion, begin, end = commanded_rotation(run).T
+    step = run.commands.values[:, 0]
+    gap = np.full(len(begin), np.nan)
+    axes.plot(
+        np.stack([insertion, step, gap], axis=1).ravel() * MM,
+        np.degrees(np.stack([begin, end, gap], axis=1).ravel()),
+        color=ESTIMATE,
+        lw=1.2,
+        label=f"{run.parameter('plane_controller', 'preset')} would have turned it, step by step",
+    )
 
 
 def path_figure(run: Run) -> Figure:

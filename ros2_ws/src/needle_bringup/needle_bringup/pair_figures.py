@@ -10,11 +10,22 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 
 from needle_bringup.bag_reader import Run
-from needle_bringup.figure_style import ESTIMATE, GOAL_BAND, GREY, MEASURED, MM, STYLE, WIDTH
+from needle_bringup.figure_style import (
+    ESTIMATE,
+    GOAL_BAND,
+    GREY,
+    MEASURED,
+    MM,
+    STYLE,
+    TRUTH,
+    WIDTH,
+)
 from needle_bringup.run_summary import (
     GOAL,
+    commanded_rotation,
     finite_tips,
     reduced_states,
+    rerun_of,
     target_offset,
     tip_error,
 )
@@ -27,7 +38,8 @@ _ROWS = (
     ("Distance from the wanted plane  (r1)", "mm"),
     ("Pitch  (r2)", "deg"),
     ("Roll  (r3)", "deg"),
-    ("Accumulated rotation", "deg"),
+    ("Accumulated rotation, measured", "deg"),
+    ("Turn commanded for each step", "deg"),
 )
 
 
@@ -40,26 +52,51 @@ def pair_figures(first: Run, second: Run) -> dict[str, Figure]:
     return figures
 
 
+def is_same_needle(runs: tuple[Run, Run]) -> bool:
+    """Return whether both runs are of one insertion: at least one is a rerun of it."""
+    first, second = (run.joints.values for run in runs)
+    return any(rerun_of(run) for run in runs) and np.array_equal(first, second)
+
+
+def _needles(runs: tuple[Run, Run]) -> list[tuple[str, str, Run]]:
+    """Return (letter, colour, run) of each needle: one where both runs are of the same."""
+    if is_same_needle(runs):
+        return [("A and B", TRUTH, runs[0])]
+    return list(zip(LETTERS, _COLORS, runs, strict=True))
+
+
 def _states(runs: tuple[Run, Run]) -> Figure:
-    """Draw figure 3's rows: truth drawn through (the estimate without one), estimate dashed."""
+    """Draw figure 3's rows: truth drawn through, estimate dashed; and what was commanded."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 8.4), layout="constrained")
-        rows = figure.subplots(4, 1, sharex=True)
+        figure = Figure(figsize=(WIDTH, 10.4), layout="constrained")
+        rows = figure.subplots(5, 1, sharex=True)
         rows[0].axhspan(-GOAL * MM, GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
-        for letter, color, run in zip(LETTERS, _COLORS, runs, strict=True):
+        for letter, color, run in _needles(runs):
             truth = reduced_states(run.truth, target_offset(run))
             _draw_states(rows, run, truth, run.truth.stamps, color=color, label=f"{letter}, truth")
-            estimate = run.reduced_state
-            style = {"color": color, "ls": (0, (3, 2)), "lw": 1.1, "label": f"{letter}, estimate"}
-            _draw_states(rows, run, estimate.values, estimate.stamps, **style)
             if len(run.joints):
                 insertion, rotation = run.joints.values.T
                 rows[3].plot(insertion * MM, np.degrees(rotation), color=color, lw=1.4)
+        for letter, color, run in zip(LETTERS, _COLORS, runs, strict=True):
+            estimate = run.reduced_state
+            style = {"color": color, "ls": (0, (3, 2)), "lw": 1.1, "label": f"{letter}, estimate"}
+            _draw_states(rows, run, estimate.values, estimate.stamps, **style)
+            insertion, begin, end = commanded_rotation(run).T
+            words = "would have commanded" if rerun_of(run) else "commanded"
+            rows[4].plot(
+                insertion * MM,
+                np.degrees(end - begin),
+                color=color,
+                lw=1.1,
+                label=f"{letter} {words}",
+            )
         for axes, (title, unit) in zip(rows, _ROWS, strict=True):
             axes.set(title=title, ylabel=unit)
-        rows[3].set_xlabel("insertion [mm]")
-        handles, labels = rows[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=4)
+        rows[4].set_xlabel("insertion [mm]")
+        handles = [
+            line for axes in (rows[0], rows[4]) for line in axes.get_legend_handles_labels()[0]
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=3)
         return figure
 
 
@@ -78,7 +115,7 @@ def _path(runs: tuple[Run, Run]) -> Figure:
         figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
         side, above = figure.subplots(2, 1, sharex=True)
         side.axhspan(-GOAL * MM, GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
-        for letter, color, run in zip(LETTERS, _COLORS, runs, strict=True):
+        for letter, color, run in _needles(runs):
             path = (run.truth.values[:, :3] if len(run.truth) else finite_tips(run).values) * MM
             offset = target_offset(run) * MM
             side.plot(path[:, 2], path[:, 0] - offset, color=color, lw=1.5, label=letter)

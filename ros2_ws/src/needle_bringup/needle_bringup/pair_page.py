@@ -8,11 +8,17 @@ from typing import Any
 
 from needle_bringup import html_page
 from needle_bringup.bag_reader import Run
+from needle_bringup.pair_figures import is_same_needle
 from needle_bringup.report_page import TILES, verdict_text
 from needle_common.cli import JsonValue
 
 Summary = Mapping[str, JsonValue]
 
+_SAME_NEEDLE = (
+    "State over insertion",
+    "Black: the needle, as it was steered once; dashed: the estimates of A (blue) and B (orange). "
+    "The last row is what each controller commands for the next step: a rerun only would have.",
+)
 _CAPTIONS = {
     "pair_states": (
         "State over insertion",
@@ -44,15 +50,18 @@ def build_pair_page(
         HTML without references to other files.
     """
     names = [run.path.absolute().name for run in runs]
+    same = is_same_needle(runs)
+    captions = {**_CAPTIONS, "pair_states": _SAME_NEEDLE} if same else _CAPTIONS
+    note = "Of one insertion: what the needle did is the same in both." if same else ""
     return html_page.page(
         f"{names[0]} and {names[1]}",
         [
             _verdict(names, summaries),
-            "<h2>Figures</h2>",
+            "<h2>Figures</h2>" + (html_page.note(note) if note else ""),
             html_page.table(("", "A", "B", "B - A"), _figures(summaries)),
             *(
                 html_page.figure(*caption, images[name])
-                for name, caption in _CAPTIONS.items()
+                for name, caption in captions.items()
                 if name in images
             ),
             _differences("How they were made", runs[0].run_info, runs[1].run_info),
@@ -79,7 +88,8 @@ def _verdict(names: list[str], summaries: tuple[Summary, Summary]) -> str:
         f"{letter}: {verdict_text(summary)[1]}"
         for letter, summary in zip("AB", summaries, strict=True)
     )
-    good = all(summary["converged"] is True for summary in summaries)
+    steered = [summary for summary in summaries if summary["rerun_of"] is None]
+    good = bool(steered) and all(summary["converged"] is True for summary in steered)
     return html_page.banner(words, sentence, f"A is {names[0]} · B is {names[1]}", good=good)
 
 

@@ -107,6 +107,13 @@ def build_page(
 
 def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
     """Return the result in a few words, and the sentence that explains it."""
+    if summary["rerun_of"] is not None:
+        by = summary["steered_by"] or "another controller"
+        return "Rerun", (
+            f"Nothing was steered here: joints and truth are those of {summary['rerun_of']}, which "
+            f"{by} steered. Estimates and commands are what {summary['controller'] or 'it'} would "
+            "have said there."
+        )
     final = summary["r1_final_mm"]
     depth = html_page.number(summary["insertion_final_mm"], "{:.0f} mm")
     if final is None:
@@ -127,7 +134,7 @@ def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> str:
     words, sentence = verdict_text(summary)
     about = [run.path.absolute().name]
     about += [f"{key} {summary[key]}" for key in _ABOUT if summary[key] is not None]
-    good = summary["converged"] is True
+    good = summary["converged"] is True and summary["rerun_of"] is None
     return html_page.banner(words, sentence, " · ".join(about), good=good)
 
 

@@ -18,6 +18,7 @@ from needle_bringup.bag_rigs import CALIBRATION
 from needle_bringup.provenance import commit
 from needle_bringup.rerun import TIP_TOPICS, TYPES, Output
 from needle_bringup.rerun_text import outputs_table
+from needle_bringup.run_summary import steered_by
 
 TABLE = "outputs.txt"
 
@@ -88,6 +89,8 @@ def _changed(
     document = {name: {"ros__parameters": values} for name, values in every.items()}
     presets = {v["preset"] for v in parameters.values() if "preset" in v}
     info = {**run.run_info, "rerun_of": run.path.absolute().name}
+    if steered_by(run) is not None:
+        info["steered_by"] = steered_by(run)
     if presets:
         info["controller"] = presets.pop()
     return {

@@ -44,9 +44,9 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     insertion = run.joints.values[:, 0]
     summary: dict[str, JsonValue] = {
         "level": _text(run.run_info.get("level"), run.parameter("sim_rig", "level")),
-        "controller": _text(
-            run.run_info.get("controller"), run.parameter("plane_controller", "preset")
-        ),
+        "controller": _controller(run),
+        "steered_by": steered_by(run),
+        "rerun_of": rerun_of(run),
         "seed": _whole(run.run_info.get("seed"), run.parameter("sim_rig", "seed")),
         "steps": steps,
         "converged": final is not None and abs(final) <= GOAL and done,
@@ -71,6 +71,16 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "bag": str(run.path),
     }
     return {key: finite_or_none(value) for key, value in summary.items()}
+
+
+def rerun_of(run: Run) -> str | None:
+    """Return the name of the bag that this one is a rerun of: nothing was steered in it."""
+    return _text(run.run_info.get("rerun_of"))
+
+
+def steered_by(run: Run) -> str | None:
+    """Return the controller that turned the needle; in a rerun it is that of the first run."""
+    return _text(run.run_info.get("steered_by")) if rerun_of(run) else _controller(run)
 
 
 def target_offset(run: Run) -> float:
@@ -114,6 +124,17 @@ def reduced_states(poses: Series, offset: float = 0.0) -> Floats:
     r13 = 2 * (x * z + y * w)
     beta = np.arcsin(np.clip(r13, -1.0, 1.0))
     return np.stack([poses.values[:, 0] - offset, beta, np.arctan2(-r12, r11)], axis=1)
+
+
+def commanded_rotation(run: Run) -> Floats:
+    """Return each step's insertion [m] and rotation [rad], and the commanded rotation, (N, 3)."""
+    stamps = run.commands.stamps
+    if not len(run.joints) or not len(stamps):
+        return np.empty((0, 3))
+    start = run.joints.stamps[0]
+    at, known = (x.astype(np.float64) for x in (stamps - start, run.joints.stamps - start))
+    rotation = np.interp(at, known, run.joints.values[:, 1])
+    return np.stack([run.insertion_at(stamps), rotation, run.commands.values[:, 1]], axis=1)
 
 
 def reached_depth(run: Run) -> bool:
@@ -192,6 +213,10 @@ def _p95(values: Floats) -> float | None:
 
 def _mm(metres: float | None) -> float | None:
     return None if metres is None else metres * 1e3
+
+
+def _controller(run: Run) -> str | None:
+    return _text(run.run_info.get("controller"), run.parameter("plane_controller", "preset"))
 
 
 def _text(*candidates: object) -> str | None:

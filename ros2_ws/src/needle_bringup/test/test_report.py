@@ -6,14 +6,17 @@ import re
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from needle_bringup import report
 from needle_bringup.bag_reader import HealthEvent, Result, Status, read_run
 from needle_bringup.event_figure import lanes_of
+from needle_bringup.pair_figures import is_same_needle, pair_figures
 from needle_bringup.report_page import verdict_text
+from needle_bringup.rerun_bag import write_rerun
 from needle_bringup.run_events import troubles
-from needle_bringup.run_summary import summarize
+from needle_bringup.run_summary import commanded_rotation, summarize
 
 MakeRun = Callable[..., Path]
 
@@ -81,6 +84,44 @@ def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path) -> None:
     assert values["a_steps"] == 120
     assert values["difference_steps"] == -10
     assert values["difference_r1_initial_mm"] == 0.0
+
+
+def test_a_rerun_says_that_nothing_was_steered(make_run: MakeRun, tmp_path: Path) -> None:
+    bag = make_run("steered")
+    run, again = read_run(bag), tmp_path / "again"
+    write_rerun(run, again, [], {"/plane_controller": {"preset": "best"}}, "")
+    rerun = read_run(again)
+    summary = summarize(rerun)
+    assert (summary["rerun_of"], summary["steered_by"]) == ("steered", "paper")
+    assert summary["controller"] == "best"
+    words, sentence = verdict_text(summary)
+    assert words == "Rerun"
+    assert "those of steered, which paper steered" in sentence
+    assert "what best would have said" in sentence
+    third = tmp_path / "third"
+    write_rerun(rerun, third, [], {"/plane_controller": {"preset": "open_loop"}}, "")
+    assert summarize(read_run(third))["steered_by"] == "paper"
+    # Both in one page: one needle, and what each commanded, or only would have.
+    assert is_same_needle((run, rerun))
+    states = pair_figures(run, rerun)["pair_states"].axes
+    labels = [line.get_label() for axes in states for line in axes.lines]
+    assert labels.count("A and B, truth") == 3
+    assert "A, truth" not in labels
+    assert {"A commanded", "B would have commanded"} < set(labels)
+    assert not is_same_needle((run, run))
+    assert report.main([str(bag), str(again)]) == 0
+    page = (again / "compared_with_steered.html").read_text()
+    assert "Converged / Rerun" in page
+    assert "what the needle did is the same in both" in page
+
+
+def test_turns_are_from_where_the_base_was(make_run: MakeRun) -> None:
+    run = read_run(make_run())
+    commands = run.joints.values + np.array([1e-3, 0.25])
+    run = dataclasses.replace(run, commands=dataclasses.replace(run.joints, values=commands))
+    insertion, begin, end = commanded_rotation(run).T
+    np.testing.assert_allclose(insertion, run.joints.values[:, 0])
+    np.testing.assert_allclose(end - begin, 0.25)
 
 
 def test_lanes_show_what_was_when(make_run: MakeRun) -> None:
