@@ -315,3 +315,12 @@ def test_what_was_said_before_this_start_is_of_another_run() -> None:
         sequence.see_controller(steering(state="DONE", starts="2"), 3.0)
         assert sequence.outcome is not None
         assert sequence.outcome.done
+
+
+def test_before_it_acts_another_device_has_time_to_show_itself() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0, look_around=2.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, {}, 0.1)
+    assert sequence.next_call(1.9) is None
+    assert sequence.next_call(2.0) == PREPARATION[0]

@@ -194,6 +194,19 @@ def test_a_driver_that_finds_another_device_does_not_start(make_rig: Make) -> No
     other.destroy_node()
 
 
+@pytest.mark.parametrize("opened", [False, True])
+def test_on_an_open_network_it_looks_for_another_device_before_it_begins(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch, opened: bool
+) -> None:
+    monkeypatch.setattr(device_driver_node, "is_open", lambda: opened)
+    monkeypatch.setattr(device_driver_node, "DISCOVERY", 0.5)
+    begin = time.monotonic()
+    rig = make_rig()
+    rig.until(lambda: rig.driver._link.is_open, "the first word to the drives")
+    # It was made before: at the earliest half a second after this test began.
+    assert not opened or time.monotonic() - begin >= 0.5
+
+
 @pytest.mark.parametrize(
     ("emulated", "use_sim_time", "simulated"),
     [(True, True, "true"), (True, False, "false"), (False, True, "false")],
