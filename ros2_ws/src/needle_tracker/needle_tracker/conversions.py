@@ -18,6 +18,7 @@ from needle_tracker.pair_answers import Frame
 from needle_tracker.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
+LEFT_FRAME = "left_camera_optical"
 INSERTION_JOINT = "insertion_joint"
 _ENCODINGS = ("mono8", "8UC1")
 
@@ -119,9 +120,10 @@ def roll_sigma_of(covariance: npt.ArrayLike, axis: NDArray[np.float64]) -> float
 
 
 def to_image(pixels: NDArray[np.uint8], stamp: int) -> Image:
-    """Return the message of an RGB picture of what was exposed at `stamp` [ns]."""
+    """Return the message of an RGB picture of what was exposed at `stamp` [ns], left view first."""
     message = Image()
     message.header.stamp = to_stamp(stamp)
+    message.header.frame_id = LEFT_FRAME
     message.height, message.width = pixels.shape[:2]
     message.encoding, message.step = "rgb8", 3 * pixels.shape[1]
     message.data = array.array("B", pixels.tobytes())

@@ -8,6 +8,7 @@ import numpy as np
 
 from needle_tracker.annotation import annotate, describe
 from needle_tracker.calibration import StereoCalibration
+from needle_tracker.conversions import to_image
 from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import TrackerSettings
 
@@ -46,3 +47,9 @@ def test_without_a_tip_the_reason_is_given(
     assert describe(measured) == "SEARCHING: left image is black"
     picture = annotate(dark, dark, measured)
     assert not np.ptp(picture[:384].astype(int), axis=2).any()
+
+
+def test_the_picture_has_the_frame_of_its_first_view() -> None:
+    message = to_image(np.zeros((2, 4, 3), np.uint8), 5)
+    assert message.header.frame_id == "left_camera_optical"
+    assert message.header.stamp.nanosec == 5
