@@ -483,3 +483,18 @@ def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Wor
     workspace.tidy_executables("needle_one")
     assert [path.name for path in folder.iterdir()] == ["kept"]
     assert subprocess.check_output([folder / "kept"], text=True) == "kept\n"
+
+
+def test_a_phase_shows_that_it_goes_on(
+    workspace: Workspace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(workspace, "TICK_OF_LINES", 0.01)
+    phase = workspace.Phase("unpacking")
+    said = capsys.readouterr().err
+    while said.count("\n") < 3:
+        said += capsys.readouterr().err
+    phase.done()
+    first, second, *_ = said.splitlines()
+    assert first == "setup: unpacking ..."
+    assert second == "setup: unpacking ... 0 s"
+    assert capsys.readouterr().err.endswith("setup: unpacking: 0 s\n")

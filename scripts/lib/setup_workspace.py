@@ -16,6 +16,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -57,6 +58,11 @@ def say(text: str) -> None:
     print(f"setup: {text}", file=sys.stderr, flush=True)
 
 
+# How often progress is shown on a terminal, and where each time is a line of its own [s].
+TICK = 1.0
+TICK_OF_LINES = 30.0
+
+
 class Phase:
     """One line of progress, updated in place on a terminal."""
 
@@ -64,21 +70,46 @@ class Phase:
         self._text = text
         self._start = time.monotonic()
         self._live = sys.stderr.isatty()
+        self._detail = ""
         self._print(" ...", "" if self._live else "\n")
+        self._over = threading.Event()
+        self._ticks = threading.Thread(target=self._tick, daemon=True)
+        self._ticks.start()
 
     def update(self, detail: str) -> None:
         """Show how far it is."""
+        self._detail = detail
         if self._live:
-            self._print(f" ... {detail}")
+            self._show()
 
     def done(self) -> None:
         """Show how long it took."""
-        self._print(f": {time.monotonic() - self._start:.0f} s", "\n")
+        self._stop()
+        self._print(f": {self._seconds()} s", "\n")
 
     def end_line(self) -> None:
         """Leave the line as it is, before something else is printed."""
+        self._stop()
         if self._live:
             print(file=sys.stderr)
+
+    def _tick(self) -> None:
+        """Show that it goes on while pip and compilers are silent, for minutes on slow machines."""
+        while not self._over.wait(TICK if self._live else TICK_OF_LINES):
+            self._show()
+
+    def _show(self) -> None:
+        self._print(
+            " ... " + ", ".join(filter(None, (self._detail, f"{self._seconds()} s"))),
+            "" if self._live else "\n",
+        )
+
+    def _seconds(self) -> str:
+        return f"{time.monotonic() - self._start:.0f}"
+
+    def _stop(self) -> None:
+        self._over.set()
+        self._ticks.join()
 
     def _print(self, rest: str, end: str = "") -> None:
         start = "\r\033[K" if self._live else ""
@@ -425,7 +456,9 @@ def compile_key(mode: str) -> str:
     digest = hashlib.sha256(LOCKS[mode].read_bytes() + str(ROOT).encode())
     for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/*.py")):
         source = path.read_bytes()
-        if re.search(rb"^(@compiled|@inlined|# Read by compiled code\.)$", source, re.MULTILINE):
+        marks = rb"^(@compiled|@inlined|# Read by compiled code\.)$"
+        # compiled.py says where the outcome is kept
+        if path.name == "compiled.py" or re.search(marks, source, re.MULTILINE):
             digest.update(source)
     return digest.hexdigest()
 

@@ -5,6 +5,7 @@ import pytest
 import yaml
 
 from needle_bringup.rig_configuration import (
+    PACKAGES,
     command_line_parameters,
     merge,
     nodes_of,
@@ -14,6 +15,7 @@ from needle_bringup.rig_configuration import (
 )
 from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
+from needle_common.parameter_files import NODES
 from needle_controller.parameters import PlaneControllerParameters
 
 
@@ -120,3 +122,7 @@ def test_by_hand_is_the_rig_that_simulate_runs() -> None:
     defaults = PlaneControllerParameters()
     assert defaults.tip_covariance == "from_tip_pose"
     assert SimulateOptions().depth_mm == pytest.approx(defaults.depth * 1e3)
+
+
+def test_the_nodes_of_a_run_are_known_by_hand_too() -> None:
+    assert set(PACKAGES) <= set(NODES)

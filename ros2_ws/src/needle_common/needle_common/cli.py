@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -18,6 +19,8 @@ EXIT_MISSED = 1
 EXIT_BAD_INPUT = 2
 EXIT_INTERNAL_ERROR = 3
 EXIT_INTERRUPTED = 130
+# In place of a file's name.
+STANDARD_OUTPUT = "-"
 
 JsonValue = str | int | float | bool | None
 
@@ -37,7 +40,7 @@ def run_command(command: Callable[[], int]) -> int:
         SIGINT, SIGTERM or SIGHUP.
     """
     try:
-        with interruptible():
+        with interruptible(), contextlib.redirect_stdout(sys.stdout):
             code = command()
             # a reader that has left shows here, and not when the interpreter ends
             sys.stdout.flush()
@@ -86,7 +89,7 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
     Parameters
     ----------
     path : Path
-        File to write; its folder must exist.
+        File to write; its folder must exist. `-` is standard output.
     values : mapping
         Flat key to value; keys end in their unit.
 
@@ -96,6 +99,9 @@ def write_json(path: Path, values: Mapping[str, JsonValue]) -> None:
         If the file cannot be written.
     """
     text = json.dumps({key: finite_or_none(value) for key, value in values.items()}, indent=2)
+    if str(path) == STANDARD_OUTPUT:
+        print(text, file=sys.__stdout__)
+        return
     try:
         path.write_text(text + "\n", encoding="utf-8")
     except OSError as error:

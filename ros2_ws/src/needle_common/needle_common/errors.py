@@ -23,7 +23,8 @@ class OutOfBoundsError(UserError, ValueError):
     """
 
     def __init__(self, name: str, value: float, lower: float, upper: float, unit: str) -> None:
-        super().__init__(f"{name} = {value:g} {unit} is outside [{lower:g}, {upper:g}] {unit}")
+        sign = "" if unit == "-" else f" {unit}"
+        super().__init__(f"{name} = {value:g}{sign} is outside [{lower:g}, {upper:g}]{sign}")
         self.name = name
         self.value = value
         self.lower = lower

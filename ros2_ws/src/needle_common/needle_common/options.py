@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn, overload
+from typing import Any, NoReturn, overload
 
+from needle_common.cli import STANDARD_OUTPUT
 from needle_common.errors import OutOfBoundsError, UserError
 
 
@@ -30,6 +32,13 @@ class CommandParser(argparse.ArgumentParser):
             formatter_class=argparse.RawDescriptionHelpFormatter,
             allow_abbrev=False,
         )
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; with `--json -`, standard output is for the JSON alone, words go to stderr."""
+        given = super().parse_known_args(args, namespace)
+        if str(getattr(given[0], "json", None)) == STANDARD_OUTPUT:
+            sys.stdout = sys.stderr
+        return given
 
     def error(self, message: str) -> NoReturn:
         """Raise what argparse would print before it ends the process."""
@@ -80,7 +89,7 @@ def output_file(name: str, text: None) -> None: ...
 @overload
 def output_file(name: str, text: str | Path) -> Path: ...
 def output_file(name: str, text: str | Path | None) -> Path | None:
-    """Return the file that an option names to be written; None where it was not given.
+    """Return the file that an option names to be written; None where it was not given, `-` as is.
 
     Raises
     ------
@@ -90,6 +99,8 @@ def output_file(name: str, text: str | Path | None) -> Path | None:
     if text is None:
         return None
     path = Path(text).expanduser()
+    if str(path) == STANDARD_OUTPUT:
+        return path
     if path.is_dir() or not path.parent.is_dir():
         raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
     return path

@@ -72,9 +72,10 @@ class NodeParameters(Generic[P]):
                 ) from error
             except InvalidParameterValueException as error:
                 given = node._parameter_overrides[name].value
+                sign = "" if spec.unit == "-" else f" {spec.unit}"
                 raise UserError(
                     f"{node.get_fully_qualified_name()}: {name} = {given!r} is outside "
-                    f"[{spec.lower:g}, {spec.upper:g}] {spec.unit}"
+                    f"[{spec.lower:g}, {spec.upper:g}]{sign}"
                 ) from error
             values[name] = _plain(node.get_parameter(name).value)
         try:

@@ -77,3 +77,26 @@ def test_a_reader_that_leaves_is_no_error(lines: int) -> None:
     process.stdin = process.stdout = None
     _, said = process.communicate(timeout=60.0)
     assert (process.returncode, said) == (0, "")
+
+
+def test_json_dash_is_all_there_is_on_standard_output() -> None:
+    code = """
+import sys
+from needle_common.cli import run_command, write_json
+from needle_common.options import CommandParser, output_file
+def command():
+    parser = CommandParser("c", "", "")
+    parser.add_argument("--json")
+    file = output_file("--json", parser.parse_args(["--json", "-"]).json)
+    print("words")
+    write_json(file, {"a": 1})
+    return 0
+code = run_command(command)
+print("after")
+sys.exit(code)
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True
+    )
+    assert (result.returncode, result.stderr) == (0, "words\n")
+    assert result.stdout == '{\n  "a": 1\n}\nafter\n'

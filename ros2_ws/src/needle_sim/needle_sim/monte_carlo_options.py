@@ -114,9 +114,10 @@ def _parser() -> CommandParser:
     add = parser.add_argument
     add(
         "--controller",
-        required=True,
+        default="best",
         metavar="NAME",
-        help="best, paper, open_loop, kalman, measured_pitch, extended_kalman or orientation_fit",
+        help="best, paper, open_loop, kalman, measured_pitch, extended_kalman or orientation_fit "
+        "(default: best)",
     )
     add(
         "--grid",

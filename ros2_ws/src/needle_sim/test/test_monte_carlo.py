@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from needle_sim.monte_carlo import main
+from needle_sim.monte_carlo_options import parse
 
 KEYS = {
     "runs",
@@ -57,7 +58,6 @@ def test_the_same_seed_gives_the_same_figures(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "--controller"),
         (["--controller", "nobody"], "nobody"),
         (["--controller", "paper", "--grid", "hexagonal"], "hexagonal"),
         (["--controller", "paper", "--draws", "0"], "--draws = 0"),
@@ -95,3 +95,7 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     assert all(f"--{name}" in text for name in ("grid", "kappa-patches", "flips", "csv"))
     assert np.all([len(line) <= 100 for line in text.splitlines()])
+
+
+def test_the_default_controller_is_the_best() -> None:
+    assert parse([]).controller == "best"

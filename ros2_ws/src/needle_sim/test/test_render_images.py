@@ -126,7 +126,7 @@ def test_truth_s_angles_give_the_directions_back() -> None:
     ("words", "named"),
     [
         (["--scenario", "fog"], "scenario 'fog' is not one of clean"),
-        (["--frames", "0"], "--frames = 0 - is outside [1, 999999] -"),
+        (["--frames", "0"], "--frames = 0 is outside [1, 999999]"),
         (["--frames", "many"], "--frames 'many' is not a whole number"),
         (["--seed", "-1"], "--seed"),
         (["--depth-mm", "nan"], "--depth-mm 'nan' is not finite"),
