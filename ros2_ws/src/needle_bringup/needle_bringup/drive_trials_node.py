@@ -1,7 +1,8 @@
 """Trials of the device driver against the emulated drives, each printed as one JSON object.
 
 `python -m needle_bringup.drive_trials_node steps 10000`, `... faults 50 cut_bus unplug`,
-`... kills 50 operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each).
+`... kills 50 operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each),
+`... fuzz 900` (seconds).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import rclpy
 
 from needle_bringup.drive_faults_node import FAULTS, fault_trials
 from needle_bringup.drive_steps_node import random_steps
+from needle_bringup.fuzz_trials_node import fuzz_trials
 from needle_bringup.graph_kills_node import KILLED, kill_trials
 from needle_bringup.nuisance_node import KINDS
 from needle_bringup.nuisance_trials_node import nuisance_trials
@@ -26,11 +28,15 @@ from needle_common.cli import EXIT_DONE, run_command
 from needle_common.options import CommandParser
 from needle_common.ros_domain import own_domain
 
+TRIALS = ("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
+
 
 def main() -> int:
     """Run trials; returns the exit code."""
     parser = CommandParser("drive_trials", __doc__ or "", "")
-    parser.add_argument("trial", choices=("steps", "faults", "kills", "two_rigs", "nuisances"))
+    parser.add_argument(
+        "trial", choices=("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
+    )
     parser.add_argument("count", type=int)
     parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
     parser.add_argument("--seed", type=int, default=1)
@@ -60,6 +66,8 @@ def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Iterator[
         )
     elif given.trial == "nuisances":
         yield from nuisance_trials(folder, domain, given.kinds or KINDS, float(given.count))
+    elif given.trial == "fuzz":
+        yield from fuzz_trials(folder, domain, float(given.count), given.seed)
     elif given.trial == "two_rigs":
         yield from two_rigs_trials(folder, domain, given.count, given.seed)
     else:

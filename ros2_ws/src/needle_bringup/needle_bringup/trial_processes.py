@@ -100,11 +100,15 @@ class TrialProcesses:
 
     def memory(self) -> int:
         """Return the memory that all take [bytes]."""
+        return sum(self.memories().values())
+
+    def memories(self) -> dict[str, int]:
+        """Return the memory that each takes [bytes]."""
         page = os.sysconf("SC_PAGE_SIZE")
-        return page * sum(
-            int(Path(f"/proc/{process.pid}/statm").read_text("ascii").split()[1])
-            for process in self._processes.values()
-        )
+        return {
+            name: page * int(Path(f"/proc/{process.pid}/statm").read_text("ascii").split()[1])
+            for name, process in self._processes.items()
+        }
 
     def stop(self) -> None:
         """End the driver, then the rest."""

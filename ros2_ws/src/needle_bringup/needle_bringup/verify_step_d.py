@@ -68,6 +68,8 @@ NUISANCES = {
 }
 # The drives' watchdog, and the copy of a message of 56 MB [s].
 DRIVES_WAIT, LONGEST_COPY = 0.1, 0.5
+# How long every node is fuzzed [s], and what each may grow by [MB].
+FUZZ, FUZZ_GROWTH = 900, 50.0
 # A rotation that does not follow is noticed when it is so far off [rad]; then come the patience of
 # the drive, a cycle and a ramp [s].
 _FOLLOWING = 0.1
@@ -200,6 +202,21 @@ def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
         )
 
 
+def fuzz(_: Workbench, seconds: int = FUZZ) -> Iterator[Finding]:
+    """End, swell and move by nothing that every node of a rig is sent at random."""
+    for outcome in _trials("fuzz", seconds):
+        growth = float(outcome["memory_growth_MB"])
+        yield Finding(
+            f"fuzz_{outcome['fuzz'].partition(' ')[0]}",
+            f"{outcome['sent']} random messages and requests on {outcome['topics']} topics and "
+            f"{outcome['services']} services, {outcome['fuzz']}",
+            f"no node ends, none grows by more than {FUZZ_GROWTH:g} MB, no motor turns",
+            f"none ended; {outcome['most_grown']} {growth:+.1f} MB; "
+            + ("a motor turned" if outcome["moved"] else "none turned"),
+            growth <= FUZZ_GROWTH and not outcome["moved"] and outcome["sent"] > 0,
+        )
+
+
 CHECKS: tuple[Check, ...] = (
     drive_level,
     same_joints,
@@ -208,6 +225,7 @@ CHECKS: tuple[Check, ...] = (
     killed_nodes,
     two_rigs,
     nuisances,
+    fuzz,
 )
 
 

@@ -49,6 +49,12 @@ def test_nothing_real_moves_beside_a_simulation(tmp_path: Path) -> None:
     assert [finding for finding in findings if not finding.passed] == []
 
 
+def test_nothing_that_every_node_is_sent_ends_or_moves_one(tmp_path: Path) -> None:
+    findings = list(verify_step_d.fuzz(Workbench(["simulate"], tmp_path), 10))
+    assert len(findings) == 2
+    assert [finding for finding in findings if not finding.passed] == []
+
+
 @pytest.mark.parametrize(
     ("change", "missed"),
     [

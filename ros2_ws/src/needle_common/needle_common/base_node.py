@@ -24,7 +24,7 @@ from needle_common.cli import (
     internal_error,
     run_command,
 )
-from needle_common.conversions import RELIABLE, to_diagnostic_status
+from needle_common.conversions import RELIABLE, to_diagnostic_status, to_stamp
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.end_request import GRACE, EndRequest
 from needle_common.errors import UserError
@@ -106,7 +106,7 @@ class DiagnosticsPublisher:
     def _publish(self, parts: list[str]) -> None:
         name = signature(self._node)
         message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
+        message.header.stamp = to_stamp(self._node.get_clock().now().nanoseconds)
         message.status = [
             to_diagnostic_status(f"{name}: {part}", name, self._parts[part]) for part in parts
         ]

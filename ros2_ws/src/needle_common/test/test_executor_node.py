@@ -153,6 +153,15 @@ def test_a_negative_clock_is_refused_and_time_goes_on(bench: Bench) -> None:
     bench.until(lambda: bench.listener.get_clock().now().nanoseconds == 7_000_000_000, "the time")
 
 
+def test_the_last_time_that_a_clock_can_tell_ends_nothing(bench: Bench) -> None:
+    clock = bench.publisher(Clock, "/clock")
+    clock.publish(Clock(clock=Time(sec=2**31 - 1, nanosec=2**32 - 1)))
+    last_ns = to_nanoseconds(Time(sec=2**31 - 1, nanosec=2**32 - 1))
+    bench.until(lambda: bench.listener.get_clock().now().nanoseconds == last_ns, "the time")
+    bench.listener.diagnostics.refuse("a", "b", "c")
+    bench.until(lambda: bench.input.get("refused a") == "1", "what is said then")
+
+
 def test_a_service_that_fails_is_named_and_ends_nothing(bench: Bench) -> None:
     client = bench.sender.create_client(Trigger, "fail")
     bench.until(client.service_is_ready, "the service")

@@ -193,8 +193,7 @@ class DeviceDriverNode(LifecycleNode):
             self._device.report()
             return
         ros_ns = to_nanoseconds(message.clock)
-        if ros_ns < 0:
-            # rclpy's own ear refuses it by name.
+        if ros_ns < 0:  # rclpy's own ear refuses it by name
             return
         if self._cycle_clock.tell(ros_ns):
             # A clock that stands still is repeated for whoever comes late; so are the joints.
