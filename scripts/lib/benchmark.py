@@ -16,6 +16,7 @@ import drive_benchmark
 import recording_benchmark
 import reference_loop
 import tracker_benchmark
+from needle_bringup.descendants import ending_descendants
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
 from needle_common.options import CommandParser, output_file
@@ -93,17 +94,18 @@ def _bench(arguments: Sequence[str]) -> int:
         raise UserError(f"--only {given.only!r} is in none of {', '.join(BENCHES)}")
     values: dict[str, JsonValue] = {}
     print(f"{'':34}{'here':>12}  {'reference':>12}  {'ratio':>8}")
-    for row in itertools.chain.from_iterable(bench() for bench in benches.values()):
-        print(
-            f"{row.what:34}{row.value:10.4g} {row.unit:2} {row.reference:10.4g} {row.unit:2} "
-            f"{row.ratio:7.3g}x  {row.against}",
-            flush=True,
-        )
-        unit = row.unit.replace("%", "percent")
-        values[f"{row.key}_{unit}"] = row.value
-        name = row.against.replace(" ", "_").replace("-", "_").replace(",", "").lower()
-        values[f"{row.key}_{name}_{unit}"] = row.reference
-        values[f"{row.key}_{name}_ratio"] = row.ratio
+    with ending_descendants():
+        for row in itertools.chain.from_iterable(bench() for bench in benches.values()):
+            print(
+                f"{row.what:34}{row.value:10.4g} {row.unit:2} {row.reference:10.4g} {row.unit:2} "
+                f"{row.ratio:7.3g}x  {row.against}",
+                flush=True,
+            )
+            unit = row.unit.replace("%", "percent")
+            values[f"{row.key}_{unit}"] = row.value
+            name = row.against.replace(" ", "_").replace("-", "_").replace(",", "").lower()
+            values[f"{row.key}_{name}_{unit}"] = row.reference
+            values[f"{row.key}_{name}_ratio"] = row.ratio
     if file is not None:
         write_json(file, values)
     return EXIT_DONE

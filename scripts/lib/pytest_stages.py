@@ -18,6 +18,12 @@ FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").spl
 _left: list[str] = []
 
 
+def pytest_configure() -> None:
+    """Let what ends scripts/test end the tests as Ctrl-C does: with their own cleaning up."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)
+
+
 def processes_of_run() -> dict[int, str]:
     """Return the command lines, by process id, of what this run started and did not end."""
     found = {}

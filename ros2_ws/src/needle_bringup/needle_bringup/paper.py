@@ -9,19 +9,22 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+from needle_bringup.descendants import ending_descendants
 from needle_common.cli import EXIT_DONE, run_command, write_json
 from needle_common.errors import UserError
 from needle_common.options import CommandParser, output_file
 
 PAGE = "paper.md"
 IMAGES = "images"
+OUT = "bags/paper"
 DESCRIPTION = """\
 Run every figure and number of [KC09] section IV and write them beside the paper's values: paper.md
 and its figures under images/. Trials go through the whole node graph, studies through monte_carlo.
 """
 EPILOG = """\
 examples:
-  scripts/paper                    all of it, into docs/ (about ten minutes)
+  scripts/paper                    all of it, into bags/paper/ (about ten minutes)
+  scripts/paper --out docs         the same, into the page that goes with this checkout
   scripts/paper --quick --out /tmp/paper
       three trials in place of nine, 1,000 runs in place of 10,000
 
@@ -37,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _paper(arguments: Sequence[str]) -> int:
     parser = CommandParser("paper", DESCRIPTION, EPILOG)
     parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
-    parser.add_argument("--out", metavar="DIR", help="where to write (default: docs/)")
+    parser.add_argument("--out", metavar="DIR", help=f"where to write (default: {OUT}/)")
     parser.add_argument("--runs", metavar="DIR", help="keep bags and studies there and use them")
     parser.add_argument("--seed", default="1", metavar="N", help="seed of all noise (default: 1)")
     parser.add_argument("--json", metavar="FILE", help="write the figures as a flat JSON object")
@@ -46,7 +49,7 @@ def _paper(arguments: Sequence[str]) -> int:
         raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
     file = output_file("--json", given.json)
     checkout = _checkout()
-    out = checkout / "docs" if given.out is None else Path(given.out).expanduser().absolute()
+    out = checkout / OUT if given.out is None else Path(given.out).expanduser().absolute()
     _make(out / IMAGES, "--out")
     # They take a second to import: not for a command line that is refused.
     from needle_bringup.figure_style import save  # noqa: PLC0415
@@ -55,7 +58,7 @@ def _paper(arguments: Sequence[str]) -> int:
     from needle_bringup.paper_results import collect  # noqa: PLC0415
     from needle_bringup.paper_runs import Laboratory  # noqa: PLC0415
 
-    with _folder(given.runs) as folder:
+    with _folder(given.runs) as folder, ending_descendants():
         laboratory = Laboratory([str(checkout / "scripts" / "simulate")], folder)
         results = collect(laboratory, int(given.seed), quick=given.quick)
     for name, figure in figures_of(results).items():

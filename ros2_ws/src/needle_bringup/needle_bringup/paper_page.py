@@ -27,7 +27,7 @@ Row = tuple[str, str, str, str]
 INTRODUCTION = """\
 # The paper's results, run again
 
-Made by `scripts/paper`; do not edit. V. Kallem, N. J. Cowan, "Image Guidance of Flexible
+Made by `scripts/paper --out docs`; do not edit. V. Kallem, N. J. Cowan, "Image Guidance of Flexible
 Tip-Steerable Needles" (IEEE Trans. Robotics 25(1), 2009), section IV. Everything is simulated with
 the controller `paper`; what the paper measured on a bench runs here through rendered camera images,
 the tracker and the whole node graph.

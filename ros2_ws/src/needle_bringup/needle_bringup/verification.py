@@ -19,6 +19,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from needle_bringup.descendants import processes_with
 from needle_common.errors import UserError
 from needle_common.ros_domain import ports_of
 from needle_common.shared_memory import ports_left
@@ -223,22 +224,6 @@ class Workbench:
         if name not in self._runs:
             self._runs[name] = self.start(name, *arguments).wait()
         return self._runs[name]
-
-
-def processes_with(name: str, value: str) -> list[tuple[int, str]]:
-    """Return (pid, command) of every process with a variable of this value in its environment."""
-    wanted = f"{name}={value}".encode()
-    found = []
-    for entry in Path("/proc").iterdir():
-        if not entry.name.isdigit():
-            continue
-        try:
-            if wanted in (entry / "environ").read_bytes().split(b"\0"):
-                command = (entry / "cmdline").read_bytes().replace(b"\0", b" ").decode()
-                found.append((int(entry.name), command.strip()))
-        except OSError:
-            continue  # ended meanwhile, or another user's
-    return found
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:

@@ -20,6 +20,7 @@ from needle_bringup import (
     verify_step_d,
     verify_step_e,
 )
+from needle_bringup.descendants import ending_descendants
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.errors import UserError
@@ -67,7 +68,11 @@ def _verify(arguments: Sequence[str]) -> int:
     begin = time.monotonic()
     findings: list[tuple[str, Finding]] = []
     tqdm.monitor_interval = 0  # its thread would outlive the bar
-    with _folder(given.keep) as folder, _progress(len(checks)) as bar:
+    with (
+        _folder(given.keep) as folder,
+        ending_descendants(),
+        _progress(len(checks)) as bar,
+    ):
         bench = Workbench([str(_checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
             bar.set_description(f"{step} {check.__name__}")

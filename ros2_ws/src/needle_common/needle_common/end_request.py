@@ -7,18 +7,19 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from needle_common.exit_timer import ExitTimer
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # From the signal to the end [s]: a node that is still busy then ends there.
-GRACE = 0.8
+GRACE = 0.6
 # For what is left when nothing is left to save: a DDS participant once hung in there.
-TAKE_APART = 0.5
+TAKE_APART = 0.3
 _SAME_WISH = 1.0
+_Handler = Callable[[int, FrameType | None], None]
 _DEFAULTS = (signal.SIG_DFL, signal.default_int_handler)
 
 
@@ -50,11 +51,7 @@ class EndRequest:
         self._code = code
         self._timer = ExitTimer()
         self._latest = math.inf
-        self._before = {
-            number: signal.signal(number, self._take)
-            for number in ENDING_SIGNALS
-            if not (number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN)
-        }
+        self._before = _handle(self._take)
 
     def __enter__(self) -> EndRequest:
         return self
@@ -100,12 +97,19 @@ class LeaveAtOnce:
     def __init__(self, code: int) -> None:
         LeaveAtOnce.began = True
         self._code = code
-        for number in ENDING_SIGNALS:
-            if signal.getsignal(number) in _DEFAULTS:
-                signal.signal(number, self._take)
+        _handle(self._take)
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
         os._exit(self._code)
+
+
+def _handle(take: _Handler) -> dict[signal.Signals, Any]:
+    """Take the signals, also a SIGINT that a shell's background ignores; return who did before."""
+    return {
+        number: signal.signal(number, take)
+        for number in ENDING_SIGNALS
+        if not (number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN)
+    }
 
 
 @contextlib.contextmanager

@@ -139,6 +139,19 @@ executables.{kind}("nothing")()
     assert run(code) == (expected, "")
 
 
+def test_a_node_in_a_shells_background_is_heard_while_it_is_loaded() -> None:
+    code = """
+import importlib
+from needle_common import executables
+def load(name):
+    send(signal.SIGINT)
+    time.sleep(60)
+importlib.import_module = load
+executables.node("nothing")()
+"""
+    assert run(code, ignored=signal.SIGINT) == (0, "")
+
+
 @pytest.mark.parametrize("kind", ["node", "command"])
 def test_the_exit_code_and_the_last_words_come_through(kind: str) -> None:
     code = f"""
