@@ -24,6 +24,7 @@ from needle_bringup.stage_timing import StageTiming, stage_timings
 from needle_bringup.step_figures import innovation_figure, timing_figure
 from needle_common.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
+from needle_common.file_access import replace_file
 from needle_common.options import CommandParser
 
 PAGE = "report.html"
@@ -113,7 +114,7 @@ def _write(directory: Path, files: Mapping[str, bytes]) -> Path:
         directory.mkdir(parents=True, exist_ok=True)
         for name, data in files.items():
             path = directory / name
-            path.write_bytes(data)
+            replace_file(path, data)
     except OSError as error:
         raise UserError(f"cannot write the report into {directory}: {error.strerror}") from error
     return path

@@ -19,6 +19,8 @@ from needle_bringup.provenance import commit
 from needle_bringup.rerun import TIP_TOPICS, TYPES, Output
 from needle_bringup.rerun_text import outputs_table
 from needle_bringup.run_summary import steered_by
+from needle_common.errors import UserError
+from needle_common.file_access import replace_file
 
 TABLE = "outputs.txt"
 
@@ -78,7 +80,10 @@ def write_rerun(
         new = standard_topic(run.namespace + output.topic, TYPES[output.topic])
         copy.put(new, output.data, output.log_time, output.log_time)
     copy.close()
-    (target / TABLE).write_text(outputs_table(run, outputs), encoding="utf-8")
+    try:
+        replace_file(target / TABLE, outputs_table(run, outputs).encode())
+    except OSError as error:
+        raise UserError(f"cannot write {target / TABLE}: {error.strerror}") from error
 
 
 def _changed(

@@ -102,6 +102,7 @@ def write_run(
     calibration: str = "",
     namespace: str = "/",
     bad_tip: int | None = None,
+    image_height: int | None = None,
 ) -> Path:
     """A needle that goes from r1 = -3 mm to FINAL_R1 on a cosine, measured TIP_ERROR off."""
     out = SyntheticBag(directory, namespace)
@@ -142,6 +143,19 @@ def write_run(
             effort=np.empty(0),
         )
         out.put("joint_states", "sensor_msgs/msg/JointState", joints)
+        if image_height is not None:
+            for side in ("left", "right"):
+                image = message(
+                    "sensor_msgs/msg/Image",
+                    header=header(time),
+                    height=image_height,
+                    width=4,
+                    encoding="mono8",
+                    is_bigendian=0,
+                    step=4,
+                    data=np.zeros(12, np.uint8),
+                )
+                out.put(f"stereo/{side}/image_raw", "sensor_msgs/msg/Image", image)
         if truth:
             content = message(
                 "geometry_msgs/msg/PoseStamped", header=header(time), pose=pose(tip, slope)
