@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections import deque
 from collections.abc import Iterable
 from typing import Any
 
@@ -15,6 +16,7 @@ from geometry_msgs.msg import (
     Vector3Stamped,
 )
 from rclpy.context import Context
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
@@ -58,6 +60,7 @@ Services    ~/start, ~/stop
 
 # Steady time between two lines of log of one kind [s]: never every cycle.
 _LOG_PERIOD = 2.0
+_PLANES_SEEN = 32
 
 
 class PlaneControllerNode(Node):
@@ -111,7 +114,17 @@ class PlaneControllerNode(Node):
             self.create_subscription(Header, "device/result", self._on_result, RELIABLE),
             self.create_subscription(PointStamped, "needle/tip", self._on_tip, RELIABLE),
         ]
-        self.create_subscription(PoseStamped, "target_plane", self._on_plane, LATCHED)
+        # A latched plane reaches whoever comes late; DDS gives a latched subscription nothing of a
+        # plain publisher (`ros2 topic pub`, RViz), a plain one what both send from now on.
+        self._planes_seen: deque[int] = deque(maxlen=_PLANES_SEEN)
+        for qos in (LATCHED, RELIABLE):
+            self.create_subscription(
+                PoseStamped,
+                "target_plane",
+                self._on_plane,
+                qos,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=qos is RELIABLE),
+            )
         tip_poses = self.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip_pose, RELIABLE
         )
@@ -198,7 +211,12 @@ class PlaneControllerNode(Node):
     def _on_device(self, message: DiagnosticStatus) -> None:
         self._do(self._steering.on_device(conversions.to_device_status(message)))
 
-    def _on_plane(self, message: PoseStamped) -> None:
+    def _on_plane(self, message: PoseStamped, info: dict[str, int]) -> None:
+        sent_at = info["source_timestamp"]
+        if sent_at in self._planes_seen:
+            # Of the other subscription.
+            return
+        self._planes_seen.append(sent_at)
         try:
             plane = conversions.to_plane(message)
             self._settings.values.check_plane(plane)

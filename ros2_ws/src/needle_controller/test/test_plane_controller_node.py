@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -349,6 +350,32 @@ def test_a_plane_given_at_run_time_and_planes_refused(bench: Bench) -> None:
     bench.until(lambda: bench.health("target_plane")[0] == Level.WARN)
     assert "not finite" in bench.health("target_plane")[1]
     assert bench.status["target_offset_m"] == "0.005"
+
+
+def at_offset(bench: Bench, offset: float) -> bool:
+    return bench.status["target_offset_m"] == str(offset)
+
+
+def test_a_plane_from_a_plain_publisher_is_taken_and_each_plane_once(
+    bench: Bench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    plain = bench.outside.create_publisher(PoseStamped, "target_plane", RELIABLE)
+    bench.until(lambda: plain.get_subscription_count() == 1)
+    message = PoseStamped()
+    message.header.frame_id = "rig"
+    message.pose.orientation.w = 1.0
+    # Of the latched publisher both subscriptions hear: a plane that came before must not come back.
+    for offset, publisher in ((0.001, bench._planes), (0.002, plain), (0.004, bench._planes)):
+        message.pose.position.x = offset
+        publisher.publish(message)
+        bench.until(partial(at_offset, bench, offset))
+    message.pose.position.x = 0.005
+    plain.publish(message)
+    bench.until(partial(at_offset, bench, 0.005))
+    said = capfd.readouterr().err
+    assert said.count("target_plane at offset") == 4
+    ours = [line for line in said.splitlines() if "[plane_controller]" in line]
+    assert not any("incompatible" in line for line in ours)
 
 
 def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
