@@ -179,6 +179,9 @@ def _run(
         code = spin(node, end)
     except (UserError, ParameterException) as error:
         code = _refuse(error)
+        if end.wanted:
+            # Others end on the same signal: what was missed from them is no bad input.
+            code = EXIT_DONE
     except Exception as error:  # noqa: BLE001
         code = internal_error(error)
     finally:

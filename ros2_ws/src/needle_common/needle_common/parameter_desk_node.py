@@ -23,7 +23,7 @@ from needle_common.base_node import executor_of
 from needle_common.parameters import NodeParameters
 
 _LOOK_PERIOD = 0.1
-_LONGEST_END = 2.0
+_LONGEST_END = 0.3
 
 
 class ParameterDesk:
@@ -57,11 +57,11 @@ class ParameterDesk:
         return bool(select.select([self._process.stdout], [], [], wait)[0])
 
     def close(self) -> None:
-        """End it."""
+        """End it; one that is still being loaded has nothing to take leave of."""
         assert self._process.stdin is not None and self._process.stdout is not None
         self._process.stdin.close()
         try:
-            self._process.wait(_LONGEST_END)
+            self._process.wait(_LONGEST_END if self.ready(0.0) else 0.0)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

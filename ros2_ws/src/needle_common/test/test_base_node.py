@@ -59,6 +59,19 @@ class Refuses(Node):
         raise UserError("rate = 0 Hz, must be > 0")
 
 
+class MissesAnother(Node):
+    """Misses what ended on the same signal."""
+
+    def __init__(self) -> None:
+        super().__init__("misses_another")
+        os.kill(os.getpid(), signal.SIGINT)
+        raise UserError("the link is lost")
+
+
+def test_what_is_missed_after_a_signal_is_no_bad_input() -> None:
+    assert run(MissesAnother) == EXIT_DONE
+
+
 def test_signals_in_a_callback_and_at_the_end_are_a_clean_end() -> None:
     assert run(Signalled) == EXIT_DONE
 
