@@ -64,6 +64,9 @@ REAL_TIME_WATCHDOG = 0.5
 
 Parameters = dict[str, dict[str, Any]]
 
+# Parameters of the recorder that leave something out of the bag.
+_CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
+
 
 def read_parameters(path: Path) -> Parameters:
     """Return a ROS parameter file as node name -> parameter name -> value.
@@ -181,7 +184,8 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
     Raises
     ------
     UserError
-        If the file sets what an option sets, or a node that this level does not run.
+        If the file sets what an option sets, a node that this level does not run, or what the
+        recorder leaves out.
     """
     reserved = command_line_parameters(options, Path())
     for node, values in given.items():
@@ -192,6 +196,10 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
                 option = OPTIONS.get(name)
                 hint = f"use {option}" if option else "simulate sets it itself"
                 raise UserError(f"{path}: {node}: {name} does not go into the file, {hint}")
+    chosen = [name for name in given.get("recorder", {}) if name in _CHOICES]
+    if chosen:
+        why = "simulate waits for a recorder of everything and reports the whole run"
+        raise UserError(f"{path}: recorder: {chosen[0]} does not go into the file: {why}")
 
 
 def run_info(options: SimulateOptions) -> dict[str, Any]:

@@ -82,6 +82,8 @@ def test_a_file_may_not_contradict_the_command_line() -> None:
         refuse_reserved(path, {"plane_controller": {"depth": 0.1}}, options)
     with pytest.raises(UserError, match="does not run at level tip"):
         refuse_reserved(path, {"stereo_tracker": {}}, options)
+    with pytest.raises(UserError, match="recorder: topics does not go into the file: simulate wa"):
+        refuse_reserved(path, {"recorder": {"topics": ["/needle/tip"]}}, options)
     refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
 
 
