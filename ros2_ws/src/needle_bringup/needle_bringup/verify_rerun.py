@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
@@ -15,6 +16,8 @@ from needle_bringup.bag_reader import read_run
 from needle_bringup.verification import Check, Finding, Workbench
 from needle_common.errors import UserError
 
+REAL_TIME_BAGS = 30
+LOAD = 15
 _COMMAND = (sys.executable, "-m", "needle_bringup.rerun_node")
 
 
@@ -58,7 +61,43 @@ def rerun_changed(bench: Workbench) -> Iterator[Finding]:
     yield _red(camera, "sign", "one sign of a camera's orientation turned", "stereo_tracker", sign)
 
 
-CHECKS: tuple[Check, ...] = (rerun_untouched, rerun_changed)
+def rerun_real_time(bench: Workbench, bags: int = REAL_TIME_BAGS) -> Iterator[Finding]:
+    """Run real-time bags again, a third of them recorded on a machine that is busy."""
+    red, unfinished = [], []
+    for number in range(bags):
+        loaded = number % 3 == 2
+        name = f"rerun_real_time_{number}"
+        speed = ("--level", "tip", "--real-time-factor", "4", "--depth-mm", "20")
+        with busy(LOAD if loaded else 0):
+            run = bench.run(name, *speed, "--seed", str(100 + number))
+        if not (run.bag / "metadata.yaml").is_file():
+            unfinished.append(name)
+        elif _rerun(run.bag)[0] != 0:
+            red.append(name)
+    yield Finding(
+        "rerun_real_time_bags",
+        f"rerun of {bags} untouched real-time bags, a third recorded beside {LOAD} busy processes",
+        "0 falsely red",
+        f"{len(red)} red {', '.join(red)}"
+        + (f"; {len(unfinished)} without a bag" if unfinished else ""),
+        not red and not unfinished,
+    )
+
+
+CHECKS: tuple[Check, ...] = (rerun_untouched, rerun_changed, rerun_real_time)
+
+
+@contextlib.contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Keep the processors busy with so many processes."""
+    idle = "while True: pass"
+    processes = [subprocess.Popen([sys.executable, "-c", idle]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
 
 
 def _red(bag: Path, key: str, what: str, node: str, values: Mapping[str, Any]) -> Finding:
