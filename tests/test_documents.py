@@ -19,7 +19,7 @@ from typed_pages import PAGES, ROOT, PageError, Session, blocks
 
 SHORT_MM = 6
 FREE_VIEWS = 12
-SHARED = (".venv", "README.md", "docs", "ros2_ws", "scripts")
+SHARED = ("README.md", "docs", "ros2_ws")
 
 
 @pytest.fixture
@@ -29,6 +29,12 @@ def checkout(tmp_path: Path) -> Path:
     (folder / "bags").mkdir(parents=True)
     for name in SHARED:
         (folder / name).symlink_to(ROOT / name)
+    (folder / "scripts").mkdir()
+    for path in (ROOT / "scripts").iterdir():
+        (folder / "scripts" / path.name).symlink_to(path)
+    # Under another path, numerical code would be compiled anew.
+    (folder / "scripts" / "env.sh").unlink()
+    (folder / "scripts" / "env.sh").write_text(f". '{ROOT}/scripts/env.sh'\n")
     (folder / "bags" / "README.md").symlink_to(ROOT / "bags" / "README.md")
     return folder
 

@@ -203,12 +203,12 @@ class Session:
             said = self._run(command)
 
     def _shell(self, command: str) -> list[str]:
-        command = self._change(command)
         self._say(command)
         before = "" if "scripts/setup" in command else "source scripts/env.sh\n"
         return ["bash", "-c", f"{before}{command}"]
 
     def _run(self, command: str) -> str:
+        command = self._change(command)
         wanted = re.search(r"exit code (\d+)", command)
         try:
             result = subprocess.run(
@@ -232,7 +232,7 @@ class Session:
     def _start_node(self, name: str, command: str) -> None:
         log = self._logs / name
         # Without job control a background process would ignore Ctrl-C.
-        shell = self._shell(f"exec {command}")
+        shell = self._shell(f"exec {self._change(command)}")
         with log.open("wb") as output:
             process = subprocess.Popen(
                 shell,
