@@ -47,6 +47,8 @@ class AxisSnapshot:
         Whether an order (move, homing) is under way.
     at_home_switch : bool
         Whether the home switch is touched.
+    at_inner_switch : bool
+        Whether the limit switch at the far end is touched.
     fault : str
         Why the axis refuses to move; empty: no fault.
     fault_rule : Rule
@@ -69,6 +71,7 @@ class AxisSnapshot:
     moving: bool
     at_home_switch: bool
     fault: str
+    at_inner_switch: bool = False
     fault_rule: Rule = Rule.ONE_FAULT_STOPS_BOTH
     ready: bool = True
     answered: bool = True

@@ -13,7 +13,7 @@ import can
 import canopen
 
 from needle_common.errors import UserError
-from needle_device_driver.objects import HEARTBEAT, MASTER_NODE_ID, NMT_OPERATIONAL
+from needle_device_driver.objects import HEARTBEAT, MASTER_NODE_ID, NMT, NMT_OPERATIONAL, SYNC
 from needle_device_driver.sdo_client import PatientSdoClient
 from needle_device_driver.slcan_bus import SlcanBus
 from needle_device_driver.socketcand_bus import SocketcandBus
@@ -24,6 +24,13 @@ _JOIN_WAIT = 1.0
 # An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
 _SILENCE = 0.4
 _HEARTBEAT_PERIOD = 0.02
+
+# What only a master sends, whom an adapter does not let hear itself.
+_OF_MASTERS = {
+    NMT: "NMT commands",
+    SYNC: "SYNC",
+    HEARTBEAT + MASTER_NODE_ID: f"the heartbeat of node {MASTER_NODE_ID}, the computer's own",
+}
 
 Callback = Callable[[bytes, float], None]
 
@@ -147,6 +154,13 @@ class CanLink:
         Steady time [s].
     open_bus : callable
         Opens the adapter.
+
+    Attributes
+    ----------
+    lost : str
+        How the link was lost; empty: it is not.
+    other_master : str
+        What another master was heard to send; empty: nobody's.
     """
 
     def __init__(
@@ -159,6 +173,7 @@ class CanLink:
         self.clock = clock
         self.arrival = threading.Condition()
         self.lost = ""
+        self.other_master = ""
         self.openings = 0
         self.frames_sent = 0
         self.frames_received = 0
@@ -208,7 +223,7 @@ class CanLink:
         self._network = _Network(self)
         self._sdo = {}
         self._bus = bus
-        self.lost = ""
+        self.lost = self.other_master = ""
         self._heard_at = self.clock()
         self.openings += 1
         self._thread = threading.Thread(
@@ -315,6 +330,10 @@ class CanLink:
             return
         now = self._heard_at = self.clock()
         self.frames_received += 1
+        if message.arbitration_id in _OF_MASTERS:
+            self.other_master = (
+                f"another master is on the bus: it sends {_OF_MASTERS[message.arbitration_id]}"
+            )
         data = bytearray(message.data)
         for callback in self._callbacks.get(message.arbitration_id, ()):
             callback(bytes(data), now)

@@ -185,6 +185,7 @@ class Cia402Axis(Axis):
         self._homing = None
         try:
             self._link.open()
+            self._link.other_master = ""
             survived = (
                 await_operational(self._link, self.monitor, self._period)
                 and not self.monitor.rebooted
@@ -214,6 +215,7 @@ class Cia402Axis(Axis):
             homed=self._homed and not self.monitor.rebooted,
             moving=self._homing is not None,
             at_home_switch=bool(machine.at.inputs & self._outer_switches),
+            at_inner_switch=bool(machine.at.inputs & self._inner_switch),
             fault="" if fault is None else fault[1],
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
@@ -329,11 +331,18 @@ class Cia402Axis(Axis):
         return limit | od.HOME_SWITCH
 
     @property
+    def _inner_switch(self) -> int:
+        reverse = self._settings.reverse
+        return od.NEGATIVE_LIMIT_SWITCH if reverse else od.POSITIVE_LIMIT_SWITCH
+
+    @property
     def _fault(self) -> Fault | None:
         if not self._configured:
             return None
         if self._link.lost:
             return Rule.LINK_LOSS, self._link.lost
+        if self._link.other_master:
+            return Rule.ONE_MASTER, self._link.other_master
         return drive_fault(self.monitor, self._machine, self._homing, actuated=self.actuated)
 
     def _refuse_fault(self) -> None:

@@ -113,6 +113,7 @@ class DeviceDriverNode(LifecycleNode):
         self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
         self._timed_at: float | None = None
+        self._told_unanswered = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
             self,
@@ -239,6 +240,10 @@ class DeviceDriverNode(LifecycleNode):
             level, message = Level.ERROR, link.lost
         elif not link.is_open:
             level, message = Level.WARN, f"waiting for {self._waiting_for}"
+        elif self._drives.unanswered > self._told_unanswered:
+            count = self._drives.unanswered - self._told_unanswered
+            level, message = Level.WARN, f"{count} SYNCs were not answered in their cycle"
+        self._told_unanswered = self._drives.unanswered
         self._diagnostics.set("can", Diagnostic(level, message, values))
 
     # ---- lifecycle ----------------------------------------------------------------------------

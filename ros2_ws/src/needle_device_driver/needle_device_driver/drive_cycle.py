@@ -9,6 +9,10 @@ from needle_device_driver.can_link import CanLink, LinkError
 from needle_device_driver.cia402_axis import Cia402Axis
 from needle_device_driver.objects import SYNC
 
+# How long a pause for answers that are late lasts, in cycles without any, and each of them [s].
+_PAUSE = 2
+_PAUSE_WAIT = 0.015
+
 
 class DriveCycle:
     """Sends the cycle's frames and takes the answers.
@@ -19,12 +23,19 @@ class DriveCycle:
         The bus.
     axes : sequence of Cia402Axis
         All its drives.
+
+    Attributes
+    ----------
+    unanswered : int
+        How many SYNCs a drive did not answer in their cycle.
     """
 
     def __init__(self, link: CanLink, axes: Sequence[Cia402Axis]) -> None:
         self._link = link
         self._axes = tuple(axes)
         self.unanswered = 0
+        self._outstanding = 0
+        self._paused = 0
 
     @property
     def lacking(self) -> tuple[str, ...]:
@@ -81,20 +92,40 @@ class DriveCycle:
             self._link.beat()
             for axis in self._axes:
                 axis.transmit()
-            for axis in self._axes:
-                axis.monitor.expect_answer()
-            self._link.send(SYNC)
+            if self._must_pause():
+                wait = min(wait, _PAUSE_WAIT)
+            else:
+                for axis in self._axes:
+                    axis.monitor.expect_answer()
+                self._link.send(SYNC)
         except LinkError:
             return
         with self._link.arrival:
-            self._link.arrival.wait_for(
-                lambda: (
-                    bool(self._link.lost) or all(axis.monitor.answered() for axis in self._axes)
-                ),
-                wait,
-            )
+            self._link.arrival.wait_for(lambda: bool(self._link.lost) or self._answered(), wait)
+            self.unanswered += not self._answered()
         for axis in self._axes:
             axis.update()
+
+    def _must_pause(self) -> bool:
+        """Return whether answers are so late that another SYNC would mix them up.
+
+        What has not come by the end of the pause is taken for lost.
+        """
+        before, self._outstanding = (
+            self._outstanding,
+            sum(axis.monitor.outstanding for axis in self._axes),
+        )
+        if self._outstanding < before:
+            self._paused = 0
+        if not self._outstanding:
+            return False
+        self._paused += 1
+        if self._paused <= _PAUSE:
+            return True
+        self._paused = self._outstanding = 0
+        for axis in self._axes:
+            axis.monitor.give_up()
+        return False
 
     def _answered(self) -> bool:
         return all(axis.monitor.answered() for axis in self._axes)

@@ -16,6 +16,11 @@ from needle_device_driver.objects import (
     STATUS_WITHOUT_INPUTS,
 )
 
+_ANSWER = (STATUS.function_code, POSITION.function_code)
+# One answer may be lost; with more missing, what comes may be an answer to a SYNC of long ago.
+_MAY_LACK = 1
+_FORGIVEN_AFTER = 25
+
 _LENGTH_WITHOUT_INPUTS = len(STATUS_WITHOUT_INPUTS.pack(0, 0))
 
 
@@ -47,6 +52,10 @@ class DriveMonitor:
     nothing newer was asked for, and a heartbeat keeps it fresh. So positions do not grow stale
     while a simulation's time stands still, and do as soon as a SYNC stays unanswered.
 
+    An answer does not say which SYNC it answers, so they are counted: one that comes while two
+    earlier SYNCs are unanswered is taken for a late one, which keeps nothing fresh, until a pause
+    has shown that what is missing does not come any more.
+
     Parameters
     ----------
     link : CanLink
@@ -61,6 +70,8 @@ class DriveMonitor:
         self._number = 0
         self._statusword = self._mode = self._inputs = self._position = 0
         self._answers: set[int] = set()
+        self._syncs = 0
+        self._received = dict.fromkeys(_ANSWER, 0)
         self._fresh_time = -math.inf
         self._heartbeat_time = -math.inf
         self._heartbeats = 0
@@ -102,15 +113,29 @@ class DriveMonitor:
             return self._heartbeats > 0
 
     def answered(self) -> bool:
-        """Return whether all process data arrived since the last SYNC."""
+        """Return whether all process data arrived since the last SYNC, and in its time."""
         with self._lock:
             return not self._awaited()
+
+    @property
+    def outstanding(self) -> int:
+        """How many SYNCs are unanswered, if too many before the last are; else 0."""
+        with self._lock:
+            return self._syncs - min(self._received.values()) if self._is_behind() else 0
+
+    def give_up(self) -> None:
+        """Take what is outstanding for lost."""
+        with self._lock:
+            self._count_anew()
 
     def expect_answer(self) -> None:
         """Take note that a SYNC goes out now."""
         with self._lock:
             self._fresh_time = self._age_base()
             self._answers.clear()
+            if self._syncs >= _FORGIVEN_AFTER and not self._is_behind():
+                self._count_anew()
+            self._syncs += 1
 
     def begin_set_up(self) -> None:
         """Forget what was; the node is set up from the start."""
@@ -134,7 +159,8 @@ class DriveMonitor:
         with self._lock:
             self._statusword, self._mode, self._inputs = statusword, mode, inputs
             self._position = position
-            self._answers = {STATUS.function_code, POSITION.function_code}
+            self._answers = set(_ANSWER)
+            self._count_anew()
             self._number += 1
             self._outdated = True
             self._fresh_time = self._link.clock()
@@ -146,8 +172,17 @@ class DriveMonitor:
             self._lock.wait_for(lambda: self._heartbeats > before, timeout)
             return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
-    def _awaited(self) -> set[int]:
-        return {STATUS.function_code, POSITION.function_code} - self._answers
+    def _awaited(self) -> bool:
+        return len(self._answers) < len(_ANSWER) or self._is_behind()
+
+    def _is_behind(self) -> bool:
+        outstanding = self._syncs - min(self._received.values())
+        # The answer to the last SYNC may be on its way.
+        return outstanding - (len(self._answers) < len(_ANSWER)) > _MAY_LACK
+
+    def _count_anew(self) -> None:
+        self._syncs = 0
+        self._received = dict.fromkeys(_ANSWER, 0)
 
     def _age_base(self) -> float:
         if self._awaited() or self._nmt_state != NMT_OPERATIONAL:
@@ -156,6 +191,8 @@ class DriveMonitor:
 
     def _answer(self, function_code: int, time: float) -> None:
         self._answers.add(function_code)
+        # Some drives say more than they are asked.
+        self._received[function_code] = min(self._received[function_code] + 1, self._syncs)
         if not self._awaited():
             self._number += not self._outdated
             self._outdated = False

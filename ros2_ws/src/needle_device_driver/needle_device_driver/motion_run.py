@@ -12,6 +12,8 @@ from needle_device_driver.states import Activity
 
 Problem = tuple[Rule, str]
 
+INNER_SWITCH = "the insertion axis is at its inner limit switch"
+
 
 class MotionRun:
     """Leads both axes along one straight way.
@@ -75,6 +77,8 @@ class MotionRun:
     def problem(self, at: PairSnapshot) -> Problem | None:
         """Return the rule that the motion breaks, and how."""
         limits = self._limits
+        if self.activity is Activity.STEP and at.insertion.at_inner_switch:
+            return Rule.INNER_LIMIT_SWITCH, INNER_SWITCH
         if self._settling > limits.settling_time:
             return (
                 Rule.SETTLING_TIME,

@@ -12,6 +12,7 @@ from needle_device_driver.command_stamps import CommandStamps
 from needle_device_driver.device_core import DeviceCore
 from needle_device_driver.hold import Hold, HoldMessage, HoldRefusals
 from needle_device_driver.limits import SafetyLimits
+from needle_device_driver.motion_run import INNER_SWITCH
 from needle_device_driver.reports import DeviceStatus, Event, JointSample, Reply
 from needle_device_driver.rules import Rule
 from needle_device_driver.states import Activity, State, Trigger
@@ -411,6 +412,8 @@ class MotionSupervisor:
             return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
         if not at.powered:
             return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
+        if at.insertion.at_inner_switch:
+            return Refusal(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
         return at
 
     def _refuse(self, command: Command, refusal: Refusal) -> None:

@@ -28,6 +28,7 @@ class FakeAxis(Axis):
         self.homed = False
         self.homing = False
         self.switch: bool | None = None
+        self.inner_switch = False
         self.fault = ""
         self.unplugged = False
         self.silent_since: float | None = None
@@ -79,6 +80,7 @@ class FakeAxis(Axis):
             homed=self.homed,
             moving=self.homing,
             at_home_switch=switch,
+            at_inner_switch=self.inner_switch,
             fault=self.fault,
         )
 

@@ -44,6 +44,10 @@ class ScriptedDrive:
         # Answers to a SYNC with what it sampled at the one before.
         self.tells_late = False
         self.told: list[tuple[int, bytes]] = []
+        # So many of the computer's heartbeats pass before an answer; so many answers are lost.
+        self.answers_late = 0
+        self.loses = 0
+        self.held_back: list[tuple[int, list[tuple[int, bytes]]]] = []
         self.state = "disabled"
         self.mode = 0
         self.inputs = 0
@@ -90,6 +94,8 @@ class ScriptedDrive:
             self.nmt = {0x01: 0x05, 0x80: 0x7F}[data[0]]
         elif cob_id == 0x77F:
             self.say(0x700, bytes([self.nmt]))
+            self.held_back = [(count - 1, frames) for count, frames in self.held_back]
+            self.answer()
         elif self.nmt != 0x05:
             return
         elif cob_id == 0x200 + self.node:
@@ -107,8 +113,11 @@ class ScriptedDrive:
             (0x180, status[: self.status_size]),
             (0x280, self.position.to_bytes(4, "little", signed=True)),
         ]
-        for function, data in self.told if self.tells_late else now:
-            self.say(function, data)
+        if self.loses:
+            self.loses -= 1
+        else:
+            self.held_back.append((self.answers_late, self.told if self.tells_late else now))
+        self.answer()
         self.told = now
         self.target = self.next_target
         if self.homing_for >= 0:
@@ -119,6 +128,12 @@ class ScriptedDrive:
                 self.more_status = 0x1400
         else:
             self.follow()
+
+    def answer(self) -> None:
+        """Say what is not held back any more."""
+        while self.held_back and self.held_back[0][0] <= 0:
+            for function, data in self.held_back.pop(0)[1]:
+                self.say(function, data)
 
     def follow(self) -> None:
         """With power, also in a quick stop, the motor goes to the demand."""

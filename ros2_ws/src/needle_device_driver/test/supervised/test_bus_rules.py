@@ -125,6 +125,44 @@ def test_reply_age_a_heartbeat_keeps_positions_fresh_only_while_no_sync_is_unans
     assert bench.notices[-1].rule is Rule.REPLY_AGE
 
 
+def in_real_time(bench: DriveBench, cycles: int) -> None:
+    bench.wait = 0.005
+    for _ in range(cycles):
+        bench.skipped += bench.period
+        bench.cycle(1, holding=True)
+
+
+@pytest.mark.parametrize("which", ["insertion", "rotation"])
+@pytest.mark.parametrize("late", [2, 3, 4])
+def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(
+    drive_bench: DriveBench, which: str, late: int
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    getattr(bench, which).answers_late = late
+    for _ in range(40):
+        in_real_time(bench, 1)
+        joints = bench.supervisor.joints(bench.clock())
+        if joints is not None:
+            # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
+            assert abs(joints.insertion - bench.insertion.position / 20e6) <= 0.0001201
+    assert bench.drives.unanswered > 10
+
+
+def test_reply_age_one_lost_answer_is_counted_and_holds_nothing_up(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    for _ in range(3):
+        bench.insertion.loses = 1
+        in_real_time(bench, 30)
+    assert bench.drives.unanswered == 3
+    bench.wait = 2.0
+    bench.cycle(30, holding=True)
+    assert bench.outcomes[-1] == "succeeded"
+
+
 def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fresh(
     drive_bench: DriveBench,
 ) -> None:
@@ -228,3 +266,25 @@ def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
         bench.cycle(cycles, holding=True)
         drawn_out -= bench.insertion.position
     assert drawn_out == pytest.approx(depth, abs=4000)
+
+
+@pytest.mark.parametrize(
+    ("cob_id", "data", "what"),
+    [
+        (0x000, b"\x01\x00", "NMT"),
+        (0x080, b"", "SYNC"),
+        (0x77F, b"\x05", "the heartbeat of node 127"),
+    ],
+)
+def test_one_master_another_on_the_bus_is_named_and_stops_both(
+    drive_bench: DriveBench, cob_id: int, data: bytes, what: str
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    heard = bench.link.frames_received
+    bench.bus.put(cob_id, data)
+    with bench.link.arrival:
+        assert bench.link.arrival.wait_for(lambda: bench.link.frames_received > heard, 5.0)
+    bench.cycle(1, holding=True)
+    failed(bench, Rule.ONE_MASTER, f"another master is on the bus: it sends {what}")
+    recovers(bench)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
 from needle_device_driver.rules import Rule
@@ -156,3 +158,38 @@ def test_one_fault_stops_both_a_drive_that_switches_itself_off(drive_bench: Driv
     bench.cycle(1, holding=True)
     failed(bench, Rule.ONE_FAULT_STOPS_BOTH, "by itself")
     assert bench.insertion.state == "disabled"
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+def test_inner_limit_switch_stops_both_axes_at_once_and_leaves_the_way_out(
+    make_drive_bench: Callable[..., DriveBench], reverse: bool
+) -> None:
+    bench = make_drive_bench(insertion_reverse=reverse)
+    bench.ready()
+    bench.cycle(1, holding=True)
+    bench.step(0.002, 0.2, 1.0)
+    bench.cycle(10, holding=True)
+    # Its drive stops at the switch by itself, and says no more than that.
+    bench.insertion.inputs = 1 if reverse else 2
+    bench.insertion.blocked = True
+    before = bench.rotation.position
+    bench.cycle(2, holding=True)
+    failed(bench, Rule.INNER_LIMIT_SWITCH, "inner limit switch")
+    turned = (
+        abs(bench.rotation.position - before) / bench.settings.drive("rotation").counts_per_unit
+    )
+    # Set-points of two cycles: 0.2 rad/s.
+    assert turned <= 0.0081
+    bench.insertion.blocked = False
+    bench.hold(False)
+    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.supervisor.enable(True, bench.clock()).success
+    bench.cycle(12)
+    bench.hold(False)
+    bench.cycle(1, holding=True)
+    bench.step(0.001)
+    assert bench.notices[-1].rule is Rule.INNER_LIMIT_SWITCH
+    assert bench.supervisor.retract(bench.clock()).success
+    at = abs(bench.insertion.position)
+    bench.cycle(3, holding=True)
+    assert abs(bench.insertion.position) < at
