@@ -1,7 +1,8 @@
-"""A pytest plugin of scripts/test: names failed stages, finds processes that tests left.
+"""A pytest plugin of scripts/test: two lanes, failed stages by name, processes that tests left.
 
 scripts/test sets NEEDLE_TEST_RUN, unique to the run and inherited by every process that a test
-starts, and NEEDLE_FAILED_STAGES, with commas between the names.
+starts, and NEEDLE_FAILED_STAGES, with commas between the names. pytest-xdist runs the test files in
+lanes, each a process of its own; nodes of one lane must not hear those of another.
 """
 
 from __future__ import annotations
@@ -18,10 +19,18 @@ FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").spl
 _left: list[str] = []
 
 
-def pytest_configure() -> None:
-    """Let what ends scripts/test end the tests as Ctrl-C does: with their own cleaning up."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Give each lane a ROS domain of its own, and end as Ctrl-C does: with all cleaning up."""
+    if in_lane(config):
+        lane = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
+        os.environ["ROS_DOMAIN_ID"] = str(int(os.environ["ROS_DOMAIN_ID"]) + lane)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
+
+
+def in_lane(config: pytest.Config) -> bool:
+    """Return whether this process runs tests for another one that collects the results."""
+    return hasattr(config, "workerinput")
 
 
 def processes_of_run() -> dict[int, str]:
@@ -44,7 +53,8 @@ def processes_of_run() -> dict[int, str]:
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
     """Fail the session, and end them, when processes are left."""
-    if not RUN:
+    # One lane may end while the other's processes are at work.
+    if not RUN or in_lane(session.config):
         return
     limit = time.monotonic() + 2.0
     # What was just told to end may need a moment.
