@@ -123,12 +123,12 @@ def write_run(
         slope = -(-3e-3 - FINAL_R1) * np.pi / 2 * np.sin(np.pi * phase) / (STEPS * 1e-3)
         tip = np.array([OFFSET + r1, 1e-3 * phase, depth])
         controller = {
-            "state": "DONE" if done and number == steps else "STEERING",
+            "state": "STEERING" if number < steps else "DONE" if done else "WAITING_FOR_TIP",
             "step": number,
             "insertion_m": depth,
             "target_offset_m": OFFSET,
             "depth_m": STEPS * 1e-3,
-            "reason": "" if done else "no tip for 2 s",
+            "reason": "" if done or number < steps else "no tip for 2 s",
             "watchdog_trips": 2,
         }
         if number:

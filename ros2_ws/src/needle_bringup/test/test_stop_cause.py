@@ -20,24 +20,16 @@ def stopped(make_run: Callable[..., Path]) -> Run:
     """Return a run that was steered to 30 mm and then waited for a tip."""
     run = read_run(make_run(steps=30, done=False))
     last = run.controller_status[-1]
-    steered = [
-        dataclasses.replace(s, values={**s.values, "reason": ""}) for s in run.controller_status
-    ]
-    later = [
-        Status(last.log_time + 10, {**last.values, "state": "WAITING_FOR_TIP", "reason": "no tip"}),
-        Status(
-            last.log_time + 30, {**last.values, "state": "IDLE", "reason": "device is DISABLED"}
-        ),
-    ]
-    return dataclasses.replace(run, controller_status=steered + later)
+    off = Status(last.log_time + 20, {**last.values, "state": "IDLE", "reason": "device is off"})
+    return dataclasses.replace(run, controller_status=[*run.controller_status, off])
 
 
 def test_the_first_cause_is_kept(stopped: Run) -> None:
-    assert stop_cause(stopped) == "no tip"
+    assert stop_cause(stopped) == "no tip for 2 s"
     summary = summarize(stopped)
     assert (summary["converged"], summary["reached_depth"]) == (False, False)
     said = describe(summary, Path("bags/run")).splitlines()
-    assert said[0] == "NOT FINISHED: stopped at 30.0 mm: no tip"
+    assert said[0] == "NOT FINISHED: stopped at 30.0 mm: no tip for 2 s"
     assert said[1].startswith("  r1 there ")
 
 
