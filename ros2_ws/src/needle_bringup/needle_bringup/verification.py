@@ -22,7 +22,7 @@ from rosbags.typesys import Stores, get_typestore
 from needle_bringup.descendants import processes_with
 from needle_common.errors import UserError
 from needle_common.ros_domain import ports_of
-from needle_common.shared_memory import ports_left
+from needle_common.shared_memory import dead_ports
 
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
@@ -93,11 +93,11 @@ class Run:
 
     @property
     def left_in_memory(self) -> list[str]:
-        """Shared-memory ports that the nodes left behind."""
+        """Shared-memory ports that the nodes left behind; a domain may have new users by now."""
         domain = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
         if domain is None:
             return []
-        return ports_left(ports_of(int(domain[1])))
+        return dead_ports(ports_of(int(domain[1])))
 
     @property
     def last_line(self) -> str:

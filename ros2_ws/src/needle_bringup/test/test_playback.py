@@ -142,7 +142,7 @@ def test_options() -> None:
     ("arguments", "words"),
     [
         ("", "required: BAG"),
-        ("bag --rate 0", "rate = 0 - is outside"),
+        ("bag --rate 0", "rate = 0 is outside"),
         ("bag --rate nan", "rate = nan"),
         ("bag --start 3 --end 3", "--end 3 s is not after --start 3 s"),
         ("bag --remap a:b", "not of the form A:=B"),

@@ -38,8 +38,8 @@ def make_private(folder: Path = SHARED_MEMORY, maps: Path = Path("/proc/self/map
             Path(path).chmod(0o600)
 
 
-def ports_left(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
-    """Return the names of the shared-memory ports that are there, used or not.
+def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
+    """Return the names of the shared-memory ports on which no living process listens.
 
     Parameters
     ----------
@@ -48,7 +48,11 @@ def ports_left(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:
     folder : Path
         Where shared memory is mounted.
     """
-    return [name for name in map(_name, ports) if (folder / name).exists()]
+    return [
+        name
+        for name in map(_name, ports)
+        if any(path.exists() for path in _files(folder, name)) and not _is_held(folder, name)
+    ]
 
 
 def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> None:
@@ -61,21 +65,23 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
     folder : Path
         Where shared memory is mounted.
     """
-    for name in map(_name, ports):
-        lock = folder / f"{name}_el"
-        if _is_held(lock):
-            continue
-        for path in (folder / name, lock, folder / f"sem.{name}_mutex"):
+    for name in dead_ports(ports, folder):
+        for path in _files(folder, name):
             with contextlib.suppress(OSError):
                 path.unlink()
+
+
+def _files(folder: Path, name: str) -> tuple[Path, Path, Path]:
+    return folder / name, folder / f"{name}_el", folder / f"sem.{name}_mutex"
 
 
 def _name(port: int) -> str:
     return f"{_PREFIX}port{port}"
 
 
-def _is_held(lock: Path) -> bool:
+def _is_held(folder: Path, name: str) -> bool:
     """Return whether a process listens: it holds this lock until it ends, however it ends."""
+    _, lock, _ = _files(folder, name)
     try:
         with lock.open("rb") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -4,7 +4,7 @@ import fcntl
 from pathlib import Path
 
 from needle_common.ros_domain import own_domain, ports_of
-from needle_common.shared_memory import ports_left, remove_dead_ports
+from needle_common.shared_memory import dead_ports, remove_dead_ports
 
 PORTS = range(7400, 7410)
 
@@ -23,10 +23,12 @@ def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
     make_port(tmp_path, 7410)
     with listener.open("rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
+        assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7400"]
         remove_dead_ports(PORTS, tmp_path)
-        assert ports_left(PORTS, tmp_path) == ["fastrtps_port7401"]
+        assert dead_ports(PORTS, tmp_path) == []
+        assert (tmp_path / "fastrtps_port7401").exists()
+    assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7401"]
     remove_dead_ports(PORTS, tmp_path)
-    assert ports_left(PORTS, tmp_path) == []
     assert {path.name for path in tmp_path.iterdir()} == {
         "fastrtps_port7410",
         "fastrtps_port7410_el",
@@ -42,7 +44,7 @@ def test_a_port_whose_lock_is_gone_goes_too(tmp_path: Path) -> None:
 
 def test_a_domain_is_left_as_clean_as_it_is_found() -> None:
     with own_domain() as domain:
-        assert ports_left(ports_of(domain)) == []
+        assert dead_ports(ports_of(domain)) == []
         port = Path("/dev/shm") / f"fastrtps_port{ports_of(domain)[11]}"
         port.write_bytes(b"")
     assert not port.exists()

@@ -97,6 +97,7 @@ class DeviceInterface:
             )
         except UserError as error:
             raise UserError(f"another device is there: {error}; {WAY_OUT}") from None
+        node.context.on_shutdown(self._claim.release)
         node.create_timer(_LOOK_PERIOD, self._look_around, clock=STEADY_CLOCK)
         self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
         self.results = node.create_publisher(Header, "device/result", RELIABLE)
