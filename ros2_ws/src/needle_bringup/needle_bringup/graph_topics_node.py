@@ -98,13 +98,13 @@ class GraphTopics:
         """How many messages of which topic did not arrive."""
         return {name: topic.lost for name, topic in self._topics.items() if topic.lost}
 
-    def poll(self) -> bool:
-        """Look at the graph; return whether there was time for all of it."""
+    def poll(self) -> None:
+        """Look at the graph, as far as there is time."""
         until = time.monotonic() + GRAPH_TIME
         for name, types in self._node.get_topic_names_and_types():
             # What waits on the topics that are there comes first; the rest at the next poll.
             if time.monotonic() > until:
-                return False
+                return
             if name not in self._choice or name in self.refused:
                 continue
             # Names and types are whatever another participant of the graph says.
@@ -113,7 +113,6 @@ class GraphTopics:
                 self._subscribe(topic)
             except Exception as error:  # noqa: BLE001
                 self._refuse(name, f"{name} is not recorded: {error}")
-        return True
 
     def describe_all(self) -> None:
         """Describe the topics that have had no message."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -10,13 +9,9 @@ from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.task import Future
 
 from needle_common import partners_node
-
-GIVE_UP_AFTER = 30.0
-# An answer can be lost when the node that gives it does not know the client yet [s].
-ASK_AGAIN = 0.5
+from needle_common.question_node import Question
 
 _FIELDS = {
     ParameterType.PARAMETER_BOOL: "bool_value",
@@ -68,10 +63,7 @@ class ParameterSnapshots:
     def __init__(self, node: Node, on_snapshot: Callable[[str, dict[str, Any]], None]) -> None:
         self._node = node
         self._on_snapshot = on_snapshot
-        self._first_seen: dict[str, float] = {}
-        self._asked: dict[str, float] = {}
-        self._settled: set[str] = set()
-        self._clients: dict[str, tuple[Client, Client]] = {}
+        self._questions: dict[str, _Questions] = {}
         self._values: dict[str, dict[str, Any]] = {}
         self._now: dict[str, dict[str, Any]] = {}
         self.changes: list[dict[str, Any]] = []
@@ -104,58 +96,34 @@ class ParameterSnapshots:
         return changes
 
     def poll(self) -> None:
-        """Ask nodes that have appeared since the last call and can answer now."""
+        """Ask the nodes of the graph whose parameters have not come yet."""
+        there = set()
         for name, namespace in self._node.get_node_names_and_namespaces():
             if name.startswith("_"):
                 continue
             full_name = partners_node.full_name(namespace, name)
+            there.add(full_name)
             if full_name == self._node.get_fully_qualified_name():
                 self._take_own(full_name)
-            elif full_name in self._settled:
-                self._drop_clients(full_name)
-            else:
-                self._ask_when_ready(full_name)
+            elif full_name not in self._values:
+                self._ask(full_name)
+        # Not from an answer's callback: its client is in use there.
+        for full_name in [n for n in self._questions if n in self._values or n not in there]:
+            self._questions.pop(full_name).close()
 
     def _take_own(self, full_name: str) -> None:
         if full_name not in self._values:
             own = self._node.get_parameters_by_prefix("")
             self._take(full_name, {name: p.value for name, p in own.items()})
 
-    def _ask_when_ready(self, full_name: str) -> None:
-        now = time.monotonic()
-        if full_name not in self._clients:
-            self._first_seen[full_name] = now
-            self._clients[full_name] = (
-                self._node.create_client(ListParameters, f"{full_name}/list_parameters"),
-                self._node.create_client(GetParameters, f"{full_name}/get_parameters"),
+    def _ask(self, full_name: str) -> None:
+        questions = self._questions.get(full_name)
+        if questions is None:
+            questions = _Questions(
+                self._node, full_name, lambda values: self._take(full_name, values)
             )
-        names_of, values_of = self._clients[full_name]
-        if now - self._first_seen[full_name] > GIVE_UP_AFTER:
-            self._settled.add(full_name)
-        elif (
-            now - self._asked.get(full_name, -ASK_AGAIN) >= ASK_AGAIN
-            and names_of.service_is_ready()
-            and values_of.service_is_ready()
-        ):
-            self._asked[full_name] = now
-            future = names_of.call_async(ListParameters.Request())
-            future.add_done_callback(lambda answer: self._ask_values(full_name, answer))
-
-    def _ask_values(self, full_name: str, answer: Future) -> None:
-        response = answer.result()
-        if response is None or full_name not in self._clients:
-            return
-        names = list(response.result.names)
-        future = self._clients[full_name][1].call_async(GetParameters.Request(names=names))
-        future.add_done_callback(lambda values: self._take_values(full_name, names, values))
-
-    def _take_values(self, full_name: str, names: list[str], answer: Future) -> None:
-        response = answer.result()
-        if response is None or full_name in self._settled:
-            return
-        values = [plain_value(value) for value in response.values]
-        self._settled.add(full_name)
-        self._take(full_name, dict(zip(names, values, strict=False)))
+            self._questions[full_name] = questions
+        questions.ask()
 
     def _take(self, full_name: str, values: dict[str, Any]) -> None:
         self._values[full_name] = {
@@ -164,6 +132,36 @@ class ParameterSnapshots:
         self._now[full_name] = dict(self._values[full_name])
         self._on_snapshot(full_name, self._values[full_name])
 
-    def _drop_clients(self, full_name: str) -> None:
-        for client in self._clients.pop(full_name, ()):
+
+class _Questions:
+    """Asks one node for the names of its parameters, then for their values, as often as needed."""
+
+    def __init__(self, node: Node, full_name: str, take: Callable[[dict[str, Any]], None]) -> None:
+        self._node = node
+        self._take = take
+        self._names: list[str] | None = None
+        names_of = node.create_client(ListParameters, f"{full_name}/list_parameters")
+        values_of = node.create_client(GetParameters, f"{full_name}/get_parameters")
+        self._clients: tuple[Client, ...] = (names_of, values_of)
+        self._names_of = Question(names_of, self._take_names)
+        self._values_of = Question(values_of, self._take_values)
+
+    def ask(self) -> None:
+        """Ask what is not answered yet, when it is time to."""
+        if self._names is None:
+            self._names_of.ask(ListParameters.Request())
+        else:
+            self._values_of.ask(GetParameters.Request(names=self._names))
+
+    def close(self) -> None:
+        """Drop the clients."""
+        for client in self._clients:
             self._node.destroy_client(client)
+
+    def _take_names(self, response: ListParameters.Response) -> None:
+        self._names = list(response.result.names)
+        self.ask()
+
+    def _take_values(self, response: GetParameters.Response) -> None:
+        values = [plain_value(value) for value in response.values]
+        self._take(dict(zip(self._names or [], values, strict=False)))

@@ -138,7 +138,8 @@ class Recorder(Node):
     def _poll_graph(self) -> None:
         if self.recording.error is not None:
             self._topics.leave()
-        elif self._topics.poll():
+        else:
+            self._topics.poll()
             self._snapshots.poll()
 
     def _take_topic(self, topic: BagTopic) -> None:

@@ -6,7 +6,6 @@ yet gets nothing, and neither side can tell. So whoever makes things happen asks
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable
 from functools import partial
 from typing import Any
@@ -15,8 +14,9 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 from type_description_interfaces.srv import GetTypeDescription
+
+from needle_common.question_node import Question
 
 RECORDER = "recorder"
 # A question that any node answers at once: there is no such type.
@@ -136,12 +136,10 @@ class AnsweringNodes:
         The node that asks, after it has created its publishers and subscriptions.
     """
 
-    ASK_AGAIN = 0.5
-
     def __init__(self, node: Node) -> None:
         self._node = node
         self._clients: dict[str, Client[Any, Any]] = {}
-        self._asked: dict[str, float] = {}
+        self._questions: dict[str, Question] = {}
         self._answered: set[str] = set()
 
     def all_of(self, names: set[str]) -> bool:
@@ -153,12 +151,10 @@ class AnsweringNodes:
                     GetTypeDescription,
                     f"{name}/get_type_description",
                 )
-            now = time.monotonic()
-            due = now - self._asked.get(name, -self.ASK_AGAIN) >= self.ASK_AGAIN
-            if due and self._clients[name].service_is_ready():
-                self._asked[name] = now
-                future = self._clients[name].call_async(_NO_TYPE)
-                future.add_done_callback(partial(self._take_answer, name))
+                self._questions[name] = Question(
+                    self._clients[name], partial(self._take_answer, name)
+                )
+            self._questions[name].ask(_NO_TYPE)
         return names <= self._answered
 
     def unaware_sources(self, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
@@ -189,6 +185,7 @@ class AnsweringNodes:
         for client in self._clients.values():
             self._node.destroy_client(client)
         self._clients.clear()
+        self._questions.clear()
 
-    def _take_answer(self, name: str, _: Future[Any]) -> None:
+    def _take_answer(self, name: str, _: Any) -> None:
         self._answered.add(name)
