@@ -159,6 +159,19 @@ def test_parameters_are_read_and_set(ros2: type[Ros2]) -> None:
     assert ros2("param", "get", "--hide-type", "/rig/partner", "speed").out == "0.25\n"
 
 
+def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> None:
+    context = Context()
+    rclpy.init(context=context, domain_id=domain)
+    deaf = Node("deaf", context=context)  # never spun
+    deaf.create_service(SetBool, "deaf/enable", lambda _, response: response)
+    call = ros2("service", "call", "/deaf/enable", "std_srvs/srv/SetBool", "{data: true}")
+    assert (call.code, call.err) == (1, "no answer from /deaf/enable\n")
+    get = ros2("param", "get", "/deaf", "speed")
+    assert (get.code, get.err) == (1, "no answer from /deaf\n")
+    deaf.destroy_node()
+    rclpy.try_shutdown(context=context)
+
+
 def test_hz_prints_once_a_second(domain: int, partner: Partner) -> None:
     del partner
     with subprocess.Popen(

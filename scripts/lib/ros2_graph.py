@@ -28,7 +28,7 @@ from rclpy.qos import (
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from ros2_messages import BadMessageError, fill, find_type, parse
-from ros2_spinning import PATIENCE, SPIN_TIME, GraphError, spin_until
+from ros2_spinning import ANSWER, PATIENCE, SPIN_TIME, GraphError, spin_until
 from ros2_topics import KEEP_ALIVE, TRUNCATE, WINDOW, echo, hz, pub
 
 HIDDEN = "_"
@@ -80,9 +80,8 @@ def call(node: Node, options: argparse.Namespace) -> None:
         print("waiting for service to become available...", flush=True)
         spin_until(node, client.service_is_ready, float("inf"))
     print(f"requester: making request: {request!r}\n", flush=True)
-    future = client.call_async(request)
-    rclpy.spin_until_future_complete(node, future)
-    print(f"response:\n{future.result()!r}\n")
+    response = _answer(node, options.service_name, client.call_async(request))
+    print(f"response:\n{response!r}\n")
 
 
 def _node_names(node: Node, hidden: bool) -> list[str]:
@@ -122,8 +121,9 @@ def _parameters_of(node: Node, name: str, timeout: float) -> AsyncParameterClien
     return client
 
 
-def _answer(node: Node, future: Any) -> Any:
-    rclpy.spin_until_future_complete(node, future)
+def _answer(node: Node, asked: str, future: Any) -> Any:
+    if not spin_until(node, future.done, ANSWER):
+        raise GraphError(f"no answer from {asked}")
     return future.result()
 
 
@@ -133,7 +133,7 @@ def list_parameters(node: Node, options: argparse.Namespace) -> None:
         spin_until(node, lambda: False, options.spin_time)
     for name in [options.node_name] if options.node_name else _node_names(node, False):
         client = _parameters_of(node, name, PATIENCE)
-        names = sorted(_answer(node, client.list_parameters()).result.names)
+        names = sorted(_answer(node, name, client.list_parameters()).result.names)
         if names and not options.node_name:
             print(f"{name}:")
         for parameter in names:
@@ -143,7 +143,8 @@ def list_parameters(node: Node, options: argparse.Namespace) -> None:
 def get_parameter(node: Node, options: argparse.Namespace) -> None:
     """Print a parameter's value."""
     client = _parameters_of(node, options.node_name, options.timeout)
-    values = _answer(node, client.get_parameters([options.parameter_name])).values
+    asked = client.get_parameters([options.parameter_name])
+    values = _answer(node, options.node_name, asked).values
     if not values:
         raise GraphError("Parameter not set")
     label = LABELS.get(Parameter.Type(values[0].type))
@@ -159,7 +160,7 @@ def set_parameter(node: Node, options: argparse.Namespace) -> None:
     client = _parameters_of(node, options.node_name, options.timeout)
     value = parameter_value_to_python(get_parameter_value(options.value))
     parameter = Parameter(options.parameter_name, value=value)
-    (result,) = _answer(node, client.set_parameters([parameter])).results
+    (result,) = _answer(node, options.node_name, client.set_parameters([parameter])).results
     reason = f": {result.reason}" if result.reason else ""
     if result.successful:
         print(f"Set parameter successful{reason}")

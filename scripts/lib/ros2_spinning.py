@@ -12,6 +12,8 @@ from rclpy.node import Node
 # How long nodes may take to be found [s]: those of a list, and one that is asked for by name.
 SPIN_TIME = 0.5
 PATIENCE = 5.0
+# How long a service may take: an answer that is lost is lost for good [s].
+ANSWER = 10.0
 
 
 class GraphError(Exception):
