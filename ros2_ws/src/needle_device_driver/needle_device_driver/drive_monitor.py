@@ -107,10 +107,10 @@ class DriveMonitor:
             return self._watching and self._nmt_state != NMT_OPERATIONAL
 
     @property
-    def heard(self) -> bool:
-        """Whether a heartbeat came since the last set-up began."""
+    def heartbeats(self) -> int:
+        """How many heartbeats came since the last set-up began."""
         with self._lock:
-            return self._heartbeats > 0
+            return self._heartbeats
 
     def answered(self) -> bool:
         """Return whether all process data arrived since the last SYNC, and in its time."""
@@ -165,10 +165,9 @@ class DriveMonitor:
             self._outdated = True
             self._fresh_time = self._link.clock()
 
-    def await_operational(self, timeout: float) -> bool:
-        """Return whether a heartbeat comes within `timeout` [s] and says: operational."""
+    def await_operational(self, before: int, timeout: float) -> bool:
+        """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
         with self._lock:
-            before = self._heartbeats
             self._lock.wait_for(lambda: self._heartbeats > before, timeout)
             return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 

@@ -22,8 +22,10 @@ def await_operational(
     """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
     until = link.clock() + timeout
     while link.clock() < until:
+        # It may come at once.
+        before = monitor.heartbeats
         link.beat()
-        if monitor.await_operational(period):
+        if monitor.await_operational(before, period):
             return True
     return False
 
@@ -41,7 +43,7 @@ def await_start(
         If the link is lost.
     """
     if not await_operational(link, monitor, period, _START_WAIT):
-        what = "did not become operational" if monitor.heard else "sends no heartbeat (0x1017)"
+        what = "did not become operational" if monitor.heartbeats else "sends no heartbeat (0x1017)"
         raise DriveError(f"node {settings.node_id} {what}")
 
 

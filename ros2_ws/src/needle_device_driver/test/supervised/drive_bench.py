@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import time
+import threading
+from collections.abc import Callable
 from typing import Any
 
 from needle_device_driver.axis import AxisError
@@ -20,20 +21,37 @@ from needle_device_driver.supervisor import MotionSupervisor
 from .ideal_axes import PERIOD, Bench
 from .scripted_drives import ScriptedBus, ScriptedDrive
 
+# On the bus [s].
+FRAME_TIME = 0.0005
+
+
+class BenchCondition(threading.Condition):
+    """Waits in the bench's time: what is not there, nobody brings, and the time passes."""
+
+    def __init__(self, bench: DriveBench) -> None:
+        super().__init__()
+        self.bench = bench
+
+    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
+        if not predicate():
+            self.bench.now += timeout or 0.0
+        return predicate()
+
 
 class DriveBench:
-    """Driver and supervisor on two scripted drives, cycle by cycle."""
+    """Driver and supervisor on two scripted drives, cycle by cycle, in a time of their own."""
 
     period = PERIOD
     command = staticmethod(Bench.step_command)
 
     def __init__(self, **parameters: Any) -> None:
         self.insertion, self.rotation = ScriptedDrive(1), ScriptedDrive(2)
-        self.skipped = 0.0
+        self.now = 1000.0
         self.buses: list[ScriptedBus] = []
         self.no_adapter = False
         self.settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
         self.link = CanLink(self.settings.link_settings, self.clock, self.open)
+        self.link.arrival = BenchCondition(self)
         self.axes = [
             Cia402Axis(
                 name,
@@ -55,15 +73,17 @@ class DriveBench:
         self.ros_ns = 1_000_000_000
         self.stamps = itertools.count(1)
         self.events: list[Event] = []
-        self.wait = 2.0
 
     def clock(self) -> float:
-        return time.monotonic() + self.skipped
+        return self.now
+
+    def pass_frame(self) -> None:
+        self.now += FRAME_TIME
 
     def open(self, settings: Any) -> Any:
         if self.no_adapter:
             raise LinkError(f"cannot open {settings}: no such file")
-        self.buses.append(ScriptedBus([self.insertion, self.rotation]))
+        self.buses.append(ScriptedBus([self.insertion, self.rotation], self.pass_frame))
         return self.buses[-1]
 
     @property
@@ -91,28 +111,19 @@ class DriveBench:
     def cycle(self, count: int = 1, *, holding: bool = False, scale: float = 1.0) -> None:
         for _ in range(count):
             self.ros_ns += 20_000_000
+            self.now += PERIOD
             if holding:
                 self.hold(scale=scale)
-            now = self.clock()
-            self.supervisor.note_time(self.ros_ns, now)
+            self.supervisor.note_time(self.ros_ns, self.now)
             self.drives.collect()
-            self.supervisor.drive(PERIOD, now)
-            self.drives.exchange(self.wait)
+            self.supervisor.drive(PERIOD, self.now)
+            # What is answered at once is here when the frame is sent.
+            self.drives.exchange(0.0)
             self.supervisor.observe(self.clock())
 
     def hold(self, pressed: bool = True, *, scale: float = 1.0) -> None:
         message = HoldMessage("a", next(self.stamps), pressed, scale)
         self.supervisor.receive_hold(message, self.clock())
-
-    def deliver(self, drive: ScriptedDrive) -> None:
-        """Hand on what a drive said by itself, and wait until the link has taken it."""
-        before = self.link.frames_received
-        count = len(drive.out)
-        self.bus.flush()
-        with self.link.arrival:
-            assert self.link.arrival.wait_for(
-                lambda: self.link.frames_received >= before + count, 5.0
-            )
 
     def written(self, node: int, index: int, subindex: int = 0) -> bytes:
         """Return what a drive's object holds after set-up."""

@@ -32,12 +32,12 @@ def home(bench: DriveBench) -> None:
 
 def reboot(bench: DriveBench) -> None:
     bench.rotation.reboot()
-    bench.deliver(bench.rotation)
+    bench.bus.flush()
 
 
 def fail(bench: DriveBench) -> None:
     bench.insertion.fail(0x7121)
-    bench.deliver(bench.insertion)
+    bench.bus.flush()
 
 
 def lose(bench: DriveBench) -> None:
@@ -47,7 +47,7 @@ def lose(bench: DriveBench) -> None:
 EVENTS: dict[str, Callable[[DriveBench], object]] = {
     "press": lambda bench: bench.hold(True),
     "release": lambda bench: bench.hold(False),
-    "silence": lambda bench: setattr(bench, "skipped", bench.skipped + 0.3),
+    "silence": lambda bench: setattr(bench, "now", bench.now + 0.3),
     "enable": lambda bench: bench.supervisor.enable(True, bench.clock()),
     "disable": lambda bench: bench.supervisor.enable(False, bench.clock()),
     "stop": lambda bench: bench.supervisor.stop(),
@@ -110,7 +110,6 @@ def test_nothing_moves_that_was_not_let_go(
     make_drive_bench: Callable[..., DriveBench], prefix: list[str], names: list[str]
 ) -> None:
     bench = make_drive_bench()
-    bench.wait = 0.01
     bench.configured()
     for name in [*prefix, *names]:
         if name == "wait":

@@ -75,7 +75,7 @@ def test_drive_watchdog_that_tripped_stops_both_and_has_its_name(drive_bench: Dr
     bench = drive_bench
     bench.moving()
     bench.rotation.fail(0x8130)
-    bench.deliver(bench.rotation)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     failed(bench, Rule.DRIVE_WATCHDOG, "heartbeat was missed")
     assert bench.insertion.state == "disabled"
@@ -114,7 +114,7 @@ def test_drive_emergency_stops_both_and_says_why(
     bench = drive_bench
     bench.moving()
     bench.insertion.fail(code)
-    bench.deliver(bench.insertion)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     failed(bench, Rule.DRIVE_EMERGENCY, words)
     assert bench.rotation.state == "disabled"
@@ -135,13 +135,13 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(drive_bench: Drive
     bench.moving()
     bench.insertion.fail(0x7121)
     bench.insertion.deaf_to_reset = True
-    bench.deliver(bench.insertion)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
     took = bench.insertion.sdo
 
     def late(data: bytes) -> None:
-        bench.skipped += 0.05
+        bench.now += 0.05
         took(data)
 
     bench.insertion.sdo = late  # type: ignore[method-assign]

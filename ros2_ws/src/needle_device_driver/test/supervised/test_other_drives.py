@@ -223,7 +223,7 @@ def test_an_answer_that_is_one_sync_old_does_not_bring_a_fault_back(
     bench.moving()
     bench.insertion.tells_late = bench.rotation.tells_late = True
     bench.rotation.fail(0x7121)
-    bench.deliver(bench.rotation)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     failed(bench, Rule.DRIVE_EMERGENCY, "motor blocked")
     recovers(bench)
@@ -249,7 +249,7 @@ def test_a_node_without_heartbeat_is_told_from_one_that_does_not_start(
 
     def impatient(cob_id: int, data: bytes) -> None:
         # Nobody waits a second for what does not come.
-        bench.skipped += 0.1 * (cob_id == 0x77F)
+        bench.now += 0.1 * (cob_id == 0x77F)
         take(cob_id, data)
 
     bench.rotation.take = impatient  # type: ignore[method-assign]
@@ -285,7 +285,7 @@ def test_a_fault_is_acknowledged_in_the_process_data(drive_bench: DriveBench) ->
     for drive in (bench.insertion, bench.rotation):
         drive.ignores_sdo_orders = True
     bench.rotation.fail(0x7121)
-    bench.deliver(bench.rotation)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     failed(bench, Rule.DRIVE_EMERGENCY, "motor blocked")
     recovers(bench)
@@ -302,7 +302,7 @@ def test_a_fault_that_stays_in_a_drive_without_error_code_is_told_all_the_same(
     sdo = drive.sdo
 
     def late(data: bytes) -> None:
-        bench.skipped += 0.05
+        bench.now += 0.05
         sdo(data)
 
     drive.sdo = late  # type: ignore[method-assign]

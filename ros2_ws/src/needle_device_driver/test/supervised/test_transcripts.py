@@ -57,7 +57,7 @@ def fault_and_reset(bench: DriveBench) -> int:
     bench.moving()
     start = len(bench.bus.sent)
     bench.rotation.fail(0x8611)
-    bench.deliver(bench.rotation)
+    bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
     assert bench.supervisor.reset(bench.clock()).success
