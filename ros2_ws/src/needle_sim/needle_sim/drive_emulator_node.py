@@ -71,6 +71,7 @@ class DriveEmulatorNode(Node):
         self._states = {name: drive.state for name, drive in self._bus.drives.items()}
         self._syncs_seen = 0
         self._stamps = SyncStamps(_PATIENCE)
+        self._sim_time = bool(self.get_parameter("use_sim_time").value)
         self._told_at = 0.0
         self._times = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
         self._positions = self.create_publisher(JointState, "sim/drive_positions", JOINT_STATES)
@@ -142,7 +143,9 @@ class DriveEmulatorNode(Node):
         """Tell the positions of the last SYNC, with the simulated time that it belongs to."""
         self._stamps.sync(self._bus.syncs - self._syncs_seen, now)
         self._syncs_seen = self._bus.syncs
-        stamp_ns = self._stamps.take(now, simulated=self._times.get_publisher_count() > 0)
+        # Who sends SYNCs may know of /clock before it is discovered here.
+        simulated = self._sim_time or self._times.get_publisher_count() > 0
+        stamp_ns = self._stamps.take(now, simulated=simulated)
         if stamp_ns is not None:
             self._tell_positions(stamp_ns or self.get_clock().now().nanoseconds)
 

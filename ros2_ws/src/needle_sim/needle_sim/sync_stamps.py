@@ -56,14 +56,14 @@ class SyncStamps:
         now : float
             Steady time [s].
         simulated : bool
-            Whether anybody tells simulated time.
+            Whether simulated time is told: a SYNC then waits until one was heard.
 
         Returns
         -------
         int or None
             Its time [ns], 0 where nobody tells any; None while it waits, or none does.
         """
-        if not self._waiting:
+        if not self._waiting or (simulated and not self._time_ns):
             return None
         patience = self._patience if simulated else 0.0
         if self._new_times != 1 and now - self._waits_since < patience:

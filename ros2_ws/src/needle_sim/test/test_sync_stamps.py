@@ -19,6 +19,17 @@ def begun() -> SyncStamps:
     return stamps
 
 
+def test_a_sync_before_the_first_time_waits_for_it() -> None:
+    stamps = SyncStamps(0.2)
+    stamps.sync(1, 0.0)
+    assert stamps.take(5.0, simulated=True) is None
+    stamps.hear(1000)
+    assert stamps.take(5.0, simulated=True) == 1000
+    stamps.hear(1020)
+    stamps.sync(1, 5.1)
+    assert stamps.take(5.1, simulated=True) == 1020
+
+
 def test_time_may_come_before_or_after_its_sync() -> None:
     rng = random.Random(3)
     stamps = begun()
