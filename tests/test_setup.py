@@ -489,12 +489,18 @@ def test_a_phase_shows_that_it_goes_on(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(workspace, "TICK_OF_LINES", 0.01)
-    phase = workspace.Phase("unpacking")
-    said = capsys.readouterr().err
-    while said.count("\n") < 3:
-        said += capsys.readouterr().err
-    phase.done()
+    with workspace.Phase("unpacking"):
+        said = capsys.readouterr().err
+        while said.count("\n") < 3:
+            said += capsys.readouterr().err
     first, second, *_ = said.splitlines()
     assert first == "setup: unpacking ..."
     assert second == "setup: unpacking ... 0 s"
     assert capsys.readouterr().err.endswith("setup: unpacking: 0 s\n")
+
+
+def test_a_phase_that_fails_says_no_more(workspace: Workspace) -> None:
+    before = threading.active_count()
+    with pytest.raises(ZeroDivisionError), workspace.Phase("unpacking"):
+        _ = 1 / 0
+    assert threading.active_count() == before

@@ -20,6 +20,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import TracebackType
 
 ROOT = Path(__file__).resolve().parents[2]
 VENV = ROOT / ".venv"
@@ -64,34 +65,37 @@ TICK_OF_LINES = 30.0
 
 
 class Phase:
-    """One line of progress, updated in place on a terminal."""
+    """One line of progress, updated in place on a terminal, within a `with` block."""
 
     def __init__(self, text: str) -> None:
         self._text = text
         self._start = time.monotonic()
         self._live = sys.stderr.isatty()
         self._detail = ""
-        self._print(" ...", "" if self._live else "\n")
         self._over = threading.Event()
         self._ticks = threading.Thread(target=self._tick, daemon=True)
+
+    def __enter__(self) -> Phase:
+        self._print(" ...", "" if self._live else "\n")
         self._ticks.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._ticks.join()
+        if kind is None:
+            self._print(f": {self._seconds()} s", "\n")
+        elif self._live:
+            # The line stays as it is, before something else is printed.
+            print(file=sys.stderr)
 
     def update(self, detail: str) -> None:
         """Show how far it is."""
         self._detail = detail
         if self._live:
             self._show()
-
-    def done(self) -> None:
-        """Show how long it took."""
-        self._stop()
-        self._print(f": {self._seconds()} s", "\n")
-
-    def end_line(self) -> None:
-        """Leave the line as it is, before something else is printed."""
-        self._stop()
-        if self._live:
-            print(file=sys.stderr)
 
     def _tick(self) -> None:
         """Show that it goes on while pip and compilers are silent, for minutes on slow machines."""
@@ -106,10 +110,6 @@ class Phase:
 
     def _seconds(self) -> str:
         return f"{time.monotonic() - self._start:.0f}"
-
-    def _stop(self) -> None:
-        self._over.set()
-        self._ticks.join()
 
     def _print(self, rest: str, end: str = "") -> None:
         start = "\r\033[K" if self._live else ""
@@ -340,17 +340,15 @@ def install(mode: str, lock: int) -> None:
     BUILD_STAMP.unlink(missing_ok=True)
     env = venv_environment(mode)
     if not fits or not VENV_PYTHON.exists():
-        phase = Phase("making the virtual environment .venv")
-        if VENV.is_symlink() or VENV.is_file():
-            VENV.unlink()
-        shutil.rmtree(VENV, ignore_errors=True)
-        options = ["--system-site-packages"] if mode == "ros" else []
-        try:
-            run([sys.executable, "-I", "-m", "venv", *options, VENV], env=env, lock=lock)
-        except CommandFailedError as error:
-            phase.end_line()
-            raise SetupError(explain("could not make the virtual environment")) from error
-        phase.done()
+        with Phase("making the virtual environment .venv"):
+            if VENV.is_symlink() or VENV.is_file():
+                VENV.unlink()
+            shutil.rmtree(VENV, ignore_errors=True)
+            options = ["--system-site-packages"] if mode == "ros" else []
+            try:
+                run([sys.executable, "-I", "-m", "venv", *options, VENV], env=env, lock=lock)
+            except CommandFailedError as error:
+                raise SetupError(explain("could not make the virtual environment")) from error
     scratch = VENV / "tmp"
     scratch.mkdir(exist_ok=True)
     env["TMPDIR"] = str(scratch)
@@ -358,31 +356,31 @@ def install(mode: str, lock: int) -> None:
     pip += ["--no-deps", "--require-hashes", "--progress-bar", "off"]
     text = LOCKS[mode].read_text("utf-8")
     total = len(re.findall(r"^[\w.-]+==", text, flags=re.MULTILINE))
-    phase = Phase(f"installing packages ({'1.1' if mode == 'wheels' else '0.7'} GB)")
-    seen = 0
+    with Phase(f"installing packages ({'1.1' if mode == 'wheels' else '0.7'} GB)") as phase:
+        seen = 0
 
-    def count(line: str) -> None:
-        nonlocal seen
-        if line.startswith(("Collecting ", "Requirement already", "Ignoring ")):
-            seen += 1
-            phase.update(f"{min(seen, total)}/{total}")
-        elif line.startswith("Installing collected packages"):
-            phase.update("unpacking")
+        def count(line: str) -> None:
+            nonlocal seen
+            if line.startswith(("Collecting ", "Requirement already", "Ignoring ")):
+                seen += 1
+                phase.update(f"{min(seen, total)}/{total}")
+            elif line.startswith("Installing collected packages"):
+                phase.update("unpacking")
 
-    try:
-        # One package comes as source: setuptools first, so that pip builds with the pinned one.
-        builder = scratch / "builder.txt"
-        builder.write_text(requirement(text, "setuptools"), encoding="utf-8")
-        run([*pip, "-r", builder], env=env, lock=lock)
-        run([*pip, "--no-build-isolation", "-r", LOCKS[mode]], env=env, lock=lock, on_line=count)
-        phase.update("checking")
-        run([VENV_PYTHON, "-c", IMPORT_CHECK], env=env, lock=lock)
-    except CommandFailedError as error:
-        phase.end_line()
-        raise SetupError(explain("could not install the packages")) from error
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-    phase.done()
+        try:
+            # One package comes as source: setuptools first, so that pip builds with the pinned one.
+            builder = scratch / "builder.txt"
+            builder.write_text(requirement(text, "setuptools"), encoding="utf-8")
+            run([*pip, "-r", builder], env=env, lock=lock)
+            run(
+                [*pip, "--no-build-isolation", "-r", LOCKS[mode]], env=env, lock=lock, on_line=count
+            )
+            phase.update("checking")
+            run([VENV_PYTHON, "-c", IMPORT_CHECK], env=env, lock=lock)
+        except CommandFailedError as error:
+            raise SetupError(explain("could not install the packages")) from error
+        finally:
+            shutil.rmtree(scratch, ignore_errors=True)
     write(INSTALL_STAMP, stamp_text(mode))
 
 
@@ -429,25 +427,23 @@ def build(mode: str, lock: int) -> None:
     BUILD_STAMP.unlink(missing_ok=True)
     key = build_key(mode)
     names = {package.name for package in packages()}
-    phase = Phase(f"building {len(names)} packages")
-    for folder in (WORKSPACE / "build", WORKSPACE / "install"):
-        for path in folder.glob("*/"):
-            if path.name not in names:
-                shutil.rmtree(path, ignore_errors=True)
-    # A link to a file that is gone from the sources would fail the build.
-    for path in (WORKSPACE / "build").glob("*/*/*"):
-        if path.is_symlink() and not path.exists():
-            path.unlink()
-    # Run by the environment's Python, so that the executables get it as their interpreter.
-    command: list[str | Path] = [VENV_PYTHON, "-c", COLCON, "--log-base", "log"]
-    try:
-        run([*command, "build", "--symlink-install"], env=venv_environment(mode), lock=lock)
-    except CommandFailedError as error:
-        phase.end_line()
-        raise SetupError(explain("colcon build failed")) from error
-    for name in sorted(names):
-        tidy_executables(name)
-    phase.done()
+    with Phase(f"building {len(names)} packages"):
+        for folder in (WORKSPACE / "build", WORKSPACE / "install"):
+            for path in folder.glob("*/"):
+                if path.name not in names:
+                    shutil.rmtree(path, ignore_errors=True)
+        # A link to a file that is gone from the sources would fail the build.
+        for path in (WORKSPACE / "build").glob("*/*/*"):
+            if path.is_symlink() and not path.exists():
+                path.unlink()
+        # Run by the environment's Python, so that the executables get it as their interpreter.
+        command: list[str | Path] = [VENV_PYTHON, "-c", COLCON, "--log-base", "log"]
+        try:
+            run([*command, "build", "--symlink-install"], env=venv_environment(mode), lock=lock)
+        except CommandFailedError as error:
+            raise SetupError(explain("colcon build failed")) from error
+        for name in sorted(names):
+            tidy_executables(name)
     write(BUILD_STAMP, key)
 
 
@@ -473,17 +469,13 @@ def compile_ahead(mode: str, lock: int) -> None:
 
     What fails here is left to the nodes: they compile by themselves.
     """
-    phase = Phase("compiling numerical code")
     script = (
         f". {shlex.quote(str(ROOT / 'scripts' / 'env.sh'))}; ahead="
         f"{shlex.quote(str(Path(__file__).with_name('compile_ahead.py')))}; "
         'python "$ahead" controllers & python "$ahead" tracker & wait'
     )
-    try:
+    with contextlib.suppress(CommandFailedError), Phase("compiling numerical code"):
         run(["bash", "-c", script], env=venv_environment(mode), lock=lock)
-        phase.done()
-    except CommandFailedError:
-        phase.end_line()
     write(COMPILE_STAMP, compile_key(mode))
 
 
