@@ -40,6 +40,8 @@ LEFT_OUT = ("scripts/test",)
 LIMIT = 600.0
 READY = 60.0
 ENDS = 40.0
+# How often to look whether nodes live [s].
+LOOK = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,24 +212,40 @@ class Session:
     def _run(self, command: str) -> str:
         command = self._change(command)
         wanted = re.search(r"exit code (\d+)", command)
-        try:
-            result = subprocess.run(
+        with tempfile.TemporaryFile("w+") as output:
+            process = subprocess.Popen(
                 self._shell(command),
-                check=False,
                 cwd=self._folder,
                 env=self._environment,
                 stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
+                stdout=output,
                 stderr=subprocess.STDOUT,
-                text=True,
-                timeout=LIMIT,
+                start_new_session=True,
             )
-        except subprocess.TimeoutExpired as error:
-            raise PageError(f"{command}\ndoes not end") from error
-        self.said.append(result.stdout)
-        if result.returncode != int(wanted[1] if wanted else 0):
-            raise PageError(f"{command}\nends with {result.returncode}: {result.stdout}")
-        return result.stdout
+            try:
+                code = self._end_of(process, command)
+            except PageError:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+                raise
+            output.seek(0)
+            said = output.read()
+        self.said.append(said)
+        if code != int(wanted[1] if wanted else 0):
+            raise PageError(f"{command}\nends with {code}: {said}")
+        return said
+
+    def _end_of(self, process: subprocess.Popen[bytes], command: str) -> int:
+        """Return a command's exit code; what it speaks to must live until then."""
+        end = time.monotonic() + LIMIT
+        while True:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                return process.wait(LOOK)
+            for name, (node, log) in self._nodes.items():
+                if node.poll() is not None:
+                    raise PageError(f"{command}\n{name} has ended: {log.read_text('utf-8')}")
+            if time.monotonic() > end:
+                raise PageError(f"{command}\ndoes not end")
 
     def _start_node(self, name: str, command: str) -> None:
         log = self._logs / name
