@@ -7,6 +7,7 @@ lanes, each a process of its own; nodes of one lane must not hear those of anoth
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import time
@@ -14,18 +15,25 @@ from pathlib import Path
 
 import pytest
 
+from needle_common.ros_domain import own_domain
+
 RUN = os.environ.get("NEEDLE_TEST_RUN", "")
 FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").split(",") if name]
 _left: list[str] = []
+_reserved = contextlib.ExitStack()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Give each lane a ROS domain of its own, and end as Ctrl-C does: with all cleaning up."""
+    """Reserve a ROS domain for each lane, and end as Ctrl-C does: with all cleaning up."""
     if in_lane(config):
-        lane = int(os.environ["PYTEST_XDIST_WORKER"].removeprefix("gw"))
-        os.environ["ROS_DOMAIN_ID"] = str(int(os.environ["ROS_DOMAIN_ID"]) + lane)
+        os.environ["ROS_DOMAIN_ID"] = str(_reserved.enter_context(own_domain()))
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.default_int_handler)
+
+
+def pytest_unconfigure() -> None:
+    """Give the lane's ROS domain back."""
+    _reserved.close()
 
 
 def in_lane(config: pytest.Config) -> bool:
