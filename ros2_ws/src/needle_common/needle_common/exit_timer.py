@@ -36,7 +36,7 @@ class ExitTimer:
     """
 
     def __init__(self) -> None:
-        self._library = ctypes.CDLL(None, use_errno=True)
+        self._library = _library()
         self._timer: ctypes.c_void_p | None = None
 
     def start(self, seconds: float, code: int) -> None:
@@ -66,3 +66,9 @@ class ExitTimer:
         if self._timer is not None:
             self._library.timer_delete(self._timer)
             self._timer = None
+
+
+def _library() -> ctypes.CDLL:
+    """Return the library that has timers: before glibc 2.34 that was one of its own."""
+    found = ctypes.CDLL(None, use_errno=True)
+    return found if hasattr(found, "timer_create") else ctypes.CDLL("librt.so.1", use_errno=True)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import subprocess
 import sys
+import types
 
 import pytest
+
+from needle_common import exit_timer
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -165,3 +169,14 @@ sys.modules["made_up"] = types.SimpleNamespace(main=main)
 executables.{kind}("made_up")()
 """
     assert run(code) == (4, "last words\n")
+
+
+def test_timers_of_an_older_c_library_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    libc, librt = types.SimpleNamespace(), types.SimpleNamespace(timer_create=None)
+    libraries = {None: libc, "librt.so.1": librt}
+    monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libraries[name])
+    assert vars(exit_timer._library()) == {"timer_create": None}
+    assert not vars(libc)
+    libc.timer_create = None
+    del librt.timer_create
+    assert vars(exit_timer._library()) == {"timer_create": None}
