@@ -17,6 +17,8 @@ DOMAINS = range(1, 100)
 PORT_BASE = 7400
 PORTS_PER_DOMAIN = 250
 FIRST_PARTICIPANT = 10
+# Of a domain's participants, those that are looked for: the first may have gone, others not.
+PARTICIPANTS = 40
 
 
 @contextmanager
@@ -53,8 +55,12 @@ def ports_of(domain: int) -> range:
 
 
 def _is_silent(domain: int) -> bool:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        return _binds(probe, ("", ports_of(domain)[FIRST_PARTICIPANT]))
+    ports = ports_of(domain)[FIRST_PARTICIPANT : FIRST_PARTICIPANT + 2 * PARTICIPANTS : 2]
+    for port in ports:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            if not _binds(probe, ("", port)):
+                return False
+    return True
 
 
 def _binds(one: socket.socket, address: str | tuple[str, int]) -> bool:
