@@ -29,7 +29,7 @@ FROM_THE_LOCK_ALONE = {"canopen", "lz4", "mcap", "rosbags", "zstandard"}
 def imports_of(folder: Path) -> set[str]:
     """Return the top-level names that the modules of a Python package import."""
     found = set()
-    for module in folder.glob("*.py"):
+    for module in folder.rglob("*.py"):
         for node in ast.walk(ast.parse(module.read_text("utf-8"))):
             if isinstance(node, ast.Import):
                 found |= {alias.name.partition(".")[0] for alias in node.names}

@@ -256,13 +256,14 @@ def test_a_new_executable_or_file_is_only_built(
     assert commands.names == ["colcon"]
 
 
+@pytest.mark.parametrize("path", ["fast.py", "room/fast.py"])
 def test_changed_compiled_code_is_compiled_and_not_built(
-    workspace: Workspace, commands: Commands
+    workspace: Workspace, commands: Commands, path: str
 ) -> None:
     workspace.main()
     commands.names.clear()
-    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / "fast.py"
-    module.parent.mkdir()
+    module = workspace.WORKSPACE / "src" / "needle_one" / "needle_one" / path
+    module.parent.mkdir(parents=True)
     module.write_text("from x import compiled\n\n@compiled\ndef f(): ...\n")
     assert workspace.main() == 0
     assert commands.names == ["compile"]

@@ -450,7 +450,7 @@ def build(mode: str, lock: int) -> None:
 def compile_key(mode: str) -> str:
     """Return what the compiled code depends on: its sources, their place, packages' versions."""
     digest = hashlib.sha256(LOCKS[mode].read_bytes() + str(ROOT).encode())
-    for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/*.py")):
+    for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/**/*.py")):
         source = path.read_bytes()
         marks = rb"^(@compiled|@inlined|# Read by compiled code\.)$"
         # compiled.py says where the outcome is kept

@@ -25,10 +25,11 @@ def compiled(function: Function) -> Function:
     Divisions follow IEEE 754, as numpy's do, and nothing is reordered: results do not depend on how
     many elements a call has. A product and a sum may become one rounding (FMA).
 
-    What was compiled is kept in the user's cache, in a folder named after all files with compiled
-    functions, or marked as read by such, beside the function's own: numba itself looks at the file
-    of the called function only, and would go on using old code of what that function calls in
-    another file. What lies there is run: where it cannot be this user's alone, nothing is kept.
+    What was compiled is kept in the user's cache, in a folder named after all files of the
+    function's package, from its root down, that hold compiled functions or are marked as read by
+    such: numba itself looks at the file of the called function only, and would go on using old code
+    of what that function calls in another file. What lies there is run: where it cannot be this
+    user's alone, nothing is kept.
 
     Parameters
     ----------
@@ -52,7 +53,7 @@ def inlined(function: Function) -> Function:
 
 
 def _compile(function: Function, *, always_inline: bool) -> Function:
-    folder = _cache_directory(Path(function.__code__.co_filename).parent)
+    folder = _cache_directory(_package_root(Path(function.__code__.co_filename)))
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = folder
     try:
@@ -67,11 +68,19 @@ def _compile(function: Function, *, always_inline: bool) -> Function:
     return cast(Function, result)
 
 
+def _package_root(module: Path) -> Path:
+    """Return the topmost folder of the package that a module's file is in."""
+    folder = module.parent
+    while (folder.parent / "__init__.py").exists():
+        folder = folder.parent
+    return folder
+
+
 @functools.cache
 def _cache_directory(package: Path) -> str:
     """Return a private folder for this state of a package's sources, or "" where there is none."""
     digest = hashlib.sha256(numba.__version__.encode())
-    for path in [Path(__file__), *sorted(package.glob("*.py"))]:
+    for path in [Path(__file__), *sorted(package.rglob("*.py"))]:
         source = path.read_bytes()
         if _COMPILED.search(source) or path == Path(__file__):
             digest.update(source)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import pwd
+import subprocess
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -54,3 +57,43 @@ def test_a_cache_that_others_could_have_filled_is_not_used(package: Path, tmp_pa
     planted.chmod(0o777)
     assert compiled._cache_directory(package) == ""
     assert not list(planted.iterdir())
+
+
+CALLEE = """
+from needle_common.compiled import compiled
+
+@compiled
+def callee(x):
+    return x + {added}
+"""
+CALLER = """
+from needle_common.compiled import compiled
+from rooms.inner.callee import callee
+
+@compiled
+def caller(x):
+    return callee(x)
+"""
+
+
+def test_an_edited_callee_in_another_room_is_compiled_anew(tmp_path: Path) -> None:
+    rooms = tmp_path / "rooms"
+    for folder in (rooms, rooms / "inner", rooms / "outer"):
+        folder.mkdir()
+        (folder / "__init__.py").touch()
+    (rooms / "outer" / "caller.py").write_text(CALLER)
+    environment = {
+        **os.environ,
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}",
+        # Sources of one second and size are told apart by nothing but their content.
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    said = []
+    for added in (1, 2):
+        (rooms / "inner" / "callee.py").write_text(CALLEE.format(added=added))
+        script = "from rooms.outer.caller import caller; print(caller(0))"
+        command = [sys.executable, "-c", script]
+        said.append(subprocess.check_output(command, env=environment, text=True, timeout=60))
+    assert list((tmp_path / "cache").rglob("*.nbi"))
+    assert said == ["1\n", "2\n"]
