@@ -1,0 +1,58 @@
+"""The shape of the tree: modules and folders of a size to be read, and the counter of lines."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+from code_lines import ROOT, code_lines, modules
+
+LONGEST_MODULE = 400
+MOST_MODULES = 15
+# What breaks these rules today; it only ever becomes less.
+LONG_MODULES = 14
+FULL_FOLDERS = 14
+SOURCE = '''"""A docstring.
+
+Of three lines.
+"""
+
+# A comment
+X = """A value
+of two lines"""
+
+
+def double(x: int) -> int:  # beside code
+    """Return twice x."""
+
+    return (
+        # a comment within
+        2 * x
+    )
+
+
+class Empty:
+    """Nothing but a docstring."""
+'''
+
+
+def test_a_line_of_code_is_no_blank_comment_or_docstring() -> None:
+    assert code_lines(SOURCE) == 2 + 1 + 3 + 1
+
+
+def test_no_module_is_too_long_to_be_read_at_once() -> None:
+    long = {
+        str(module.relative_to(ROOT)): length
+        for module in modules(ROOT)
+        if (length := len(module.read_text("utf-8").splitlines())) > LONGEST_MODULE
+    }
+    assert len(long) <= LONG_MODULES, long
+
+
+def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
+    folders = Counter(module.parent for module in modules(ROOT) if module.name != "__init__.py")
+    full = {
+        str(folder.relative_to(ROOT)): number
+        for folder, number in folders.items()
+        if number > MOST_MODULES
+    }
+    assert len(full) <= FULL_FOLDERS, full
