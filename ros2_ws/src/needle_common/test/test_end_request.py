@@ -18,6 +18,8 @@ SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 def run(code: str, *, ignored: signal.Signals | None = None) -> tuple[int, str]:
     """Run code that has `os`, `signal`, `send(number)`; return exit code and output."""
     begin = "import os, signal, sys, time\ndef send(n): os.kill(os.getpid(), n)\n"
+    # A shell's background, where tests may run, ignores SIGINT.
+    begin += "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     if ignored is not None:
         begin += f"signal.signal({int(ignored)}, signal.SIG_IGN)\n"
     command = [sys.executable, "-u", "-c", begin + code]
