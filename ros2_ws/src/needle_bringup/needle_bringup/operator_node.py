@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 import time
@@ -146,13 +147,13 @@ class OperatorNode(Node):
     def _advance(self) -> None:
         call = self._sequence.next_call(time.monotonic())
         if call is not None:
-            self._call(call).add_done_callback(self._on_answer)
+            self._call(call).add_done_callback(functools.partial(self._on_answer, call))
         self._report()
 
-    def _on_answer(self, future: Future[Any]) -> None:
+    def _on_answer(self, call: ServiceCall, future: Future[Any]) -> None:
         answer = future.result()
         if answer is not None:
-            self._sequence.take_answer(answer.success, answer.message, time.monotonic())
+            self._sequence.take_answer(call, answer.success, answer.message, time.monotonic())
             self._advance()
 
     def _on_controller_status(self, message: DiagnosticStatus) -> None:

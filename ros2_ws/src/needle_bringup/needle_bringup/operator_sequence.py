@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 
 from needle_common.claim import WAY_OUT
@@ -24,16 +25,17 @@ class ServiceCall:
     data: bool | None = None
 
 
-PREPARATION = (
-    ServiceCall("device/confirm_needle_out", True),
-    ServiceCall("device/home"),
-    ServiceCall("device/enable", True),
-    ServiceCall("plane_controller/start"),
-)
+HOME = ServiceCall("device/home")
+ENABLE = ServiceCall("device/enable", True)
+START = ServiceCall("plane_controller/start")
+PREPARATION = (ServiceCall("device/confirm_needle_out", True), HOME, ENABLE, START)
 DISABLE = ServiceCall("device/enable", False)
 # A rig that has not found all its partners yet refuses with this beginning: ask again.
 NOT_YET = "waiting for"
 RETRY_AFTER = 0.1
+# An answer can be lost for good: a server whose process does not know the client yet drops it, and
+# neither side is told. So long it is waited for before the call is made again [s].
+ASK_AGAIN = 1.0
 # What device/home answers when it has begun; anything else: there is nothing to wait for.
 HOMING = "homing"
 # Any other refusal may rest on news that are still under way (joints, the answer before this one).
@@ -69,6 +71,9 @@ class Outcome:
 class OperatorSequence:
     """Prepares the rig, keeps the hold while it steers, and ends with an outcome.
 
+    A call whose answer does not come is made again. Confirming and enabling twice is the same as
+    once; whether homing and start were taken is told by the statuses, before they are asked again.
+
     All times are readings of one steady clock [s].
 
     Parameters
@@ -92,18 +97,19 @@ class OperatorSequence:
         self._missing: Sequence[str] = ("everything",)
         self._prepared = 0
         self._pending = False
+        self._asked = False
         self._retry_at = now + look_around
         self._refusal = ""
         self._refused_since: float | None = None
         self._homed = False
+        self._moving = False
         self._simulated = False
         self._speaker = ""
         self._devices: Sequence[str] = ()
         self._homed_since_call = False
-        self._steered = False
-        self._starts = 0
+        self._homing_seen = False
+        self._starts: int | None = None
         self._starts_before = 0
-        self._said_since_start: Mapping[str, str] | None = None
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
         self._hold_counts = False
@@ -135,38 +141,35 @@ class OperatorSequence:
 
     def next_call(self, now: float) -> ServiceCall | None:
         """Return the service to call now; its answer goes to `take_answer`."""
-        waits = self._pending or bool(self._missing) or now < self._retry_at
-        waits = waits or not self._may_act
+        waits = bool(self._missing) or now < self._retry_at or not self._may_act
         if waits or self.outcome is not None or self._prepared == len(PREPARATION):
             return None
         call = PREPARATION[self._prepared]
-        if call.service == "device/enable" and not self._homed:
+        if call == HOME and self._asked and self._moving:
             return None
-        self._pending = True
+        if call == ENABLE and not self._homed:
+            return None
+        if call == START and self._starts is None:
+            return None
         self._homed_since_call = False
-        self._said_since_start = None
-        self._starts_before = self._starts
+        if not self._asked:
+            self._homing_seen = not self._homed
+            self._starts_before = self._starts or 0
+        self._asked = self._pending = True
+        self._retry_at = now + ASK_AGAIN
         return call
 
-    def take_answer(self, success: bool, message: str, now: float) -> None:
-        """Take the answer to the call under way."""
-        self._pending = False
-        if self.outcome is not None:
+    def take_answer(self, call: ServiceCall, success: bool, message: str, now: float) -> None:
+        """Take an answer to `call`, however late; one to a call that is over changes nothing."""
+        wanted = self._prepared < len(PREPARATION) and call == PREPARATION[self._prepared]
+        if self.outcome is not None or not wanted:
             return
-        call = PREPARATION[self._prepared]
+        self._pending = False
         if success:
-            self._prepared += 1
             if message == HOMING:
                 # What was heard before the call is no news of this homing.
                 self._homed = self._homed_since_call
-            self._refusal = ""
-            self._refused_since = None
-            self._deadline = now + self._wait_timeout
-            self._progress_at = self._press_since = now
-            said = self._said_since_start or {}
-            if self.steering and (said.get("state") == "FAULT" or "starts" in said):
-                # The controller's status can overtake its answer.
-                self._judge(said)
+            self._go_on(now)
             return
         self._refusal = message
         self._retry_at = now + RETRY_AFTER
@@ -177,10 +180,19 @@ class OperatorSequence:
         elif now >= self._refused_since + REFUSAL_PATIENCE:
             self._end(f"{call.service} was refused: {message}")
 
+    def _go_on(self, now: float) -> None:
+        self._prepared += 1
+        self._asked = self._pending = False
+        self._retry_at = now
+        self._refusal = ""
+        self._refused_since = None
+        self._deadline = now + self._wait_timeout
+        self._progress_at = self._press_since = now
+
     def see_devices(self, names: Sequence[str]) -> None:
         """Take who publishes device/status: with more than one, nobody knows what would move."""
         self._devices = names
-        if len(names) > 1 and (self._prepared or self._pending):
+        if len(names) > 1 and (self._prepared or self._asked):
             self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
 
     def see_device(self, values: Mapping[str, str], speaker: str, now: float) -> None:
@@ -193,8 +205,12 @@ class OperatorSequence:
                 "false): there a person holds, no stand-in"
             )
             return
-        self._homed = values.get("homed") == "true" and values.get("state") != "MOVING"
+        self._moving = values.get("state") == "MOVING"
+        self._homed = values.get("homed") == "true" and not self._moving
         self._homed_since_call = self._homed
+        self._homing_seen = self._homing_seen or self._moving
+        if self._called(HOME) and self._homed and self._homing_seen:
+            self._go_on(now)
         counts = bool(values.get("hold_owner"))
         if self._hold_counts and not counts:
             self._press_since = now
@@ -209,31 +225,30 @@ class OperatorSequence:
         waits = values.get("state") == "WAITING_FOR_TIP"
         self.waits_because = values.get("reason", "") if waits else ""
         self._starts = int(_number(values.get("starts")) or 0)
+        started = self._starts > self._starts_before
+        if self._called(START) and started:
+            # The status can overtake the answer, which may be lost.
+            self._go_on(now)
         progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
-        if self.steering:
+        if self.steering and started:
             self._judge(values)
-        elif self._pending:
-            self._said_since_start = values
 
     def _judge(self, values: Mapping[str, str]) -> None:
         state = values.get("state", "")
-        if "starts" in values:
-            if int(_number(values["starts"]) or 0) <= self._starts_before:
-                # Of an earlier run.
-                return
-            self._steered = True
         if state == "DONE":
             self.outcome = Outcome(
                 True, f"inserted {self.insertion * 1e3:.1f} mm in {values.get('step')} steps"
             )
         elif state == "FAULT":
             self._end(f"plane_controller FAULT: {_why(values)}")
-        elif state == "IDLE" and self._steered:
+        elif state == "IDLE":
             self._end(f"plane_controller stopped: {_why(values)}")
-        elif state in ("STEERING", "WAITING_FOR_TIP"):
-            self._steered = True
+
+    def _called(self, call: ServiceCall) -> bool:
+        """Whether `call` has been made and its success is not known yet."""
+        return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
 
     def interrupt(self) -> None:
         """Take a signal to end."""
@@ -270,6 +285,8 @@ class OperatorSequence:
             return "missing " + ", ".join(self._missing)
         if self._pending:
             return f"no answer from {call}"
+        if call == START.service and self._starts is None:
+            return "needle/controller_status has not been heard"
         if not self._may_act:
             names = ", ".join(self._devices)
             return f"device/status of one simulated device is wanted, of {names} it is there"
@@ -286,6 +303,7 @@ def _why(values: Mapping[str, str]) -> str:
 
 def _number(text: str | None) -> float | None:
     try:
-        return float(text) if text else None
+        number = float(text) if text else math.nan
     except ValueError:
         return None
+    return number if math.isfinite(number) else None

@@ -31,10 +31,12 @@ class PlayedRig(Node):
         self.asked: list[str] = []
         self.holds: list[Joy] = []
         self.refusal = ""
+        self.starts = 0
+        self.mute: set[str] = set()
         for name in ("device/confirm_needle_out", "device/enable"):
-            self.create_service(SetBool, name, self._answer(name))
+            self._serve(SetBool, name)
         for name in ("device/home", "plane_controller/start"):
-            self.create_service(Trigger, name, self._answer(name))
+            self._serve(Trigger, name)
         self.create_subscription(Joy, "device/hold", self.holds.append, HOLD)
         self._device = self.create_publisher(DiagnosticStatus, "device/status", LATCHED)
         self._controller = self.create_publisher(
@@ -50,8 +52,21 @@ class PlayedRig(Node):
 
     def tell_controller(self, state: str, step: int, reason: str = "") -> None:
         values = {"state": state, "step": str(step), "reason": reason}
+        values |= {"starts": str(self.starts)}
         values |= {"insertion_m": str(step * 1e-3), "depth_m": "0.12"}
         self._controller.publish(_status(values))
+
+    def _serve(self, kind: type[SetBool] | type[Trigger], name: str) -> None:
+        service = self.create_service(kind, name, self._answer(name))
+        send = service.send_response
+
+        def send_unless_mute(response: object, header: object) -> None:
+            if name in self.mute:
+                self.mute.remove(name)
+            else:
+                send(response, header)
+
+        service.send_response = send_unless_mute
 
     def _answer(self, name: str) -> Callable[..., object]:
         def answer(request: object, response: object) -> object:
@@ -59,6 +74,10 @@ class PlayedRig(Node):
             self.asked.append(name if data is None else f"{name} {data}")
             response.success = not self.refusal  # type: ignore[attr-defined]
             response.message = self.refusal  # type: ignore[attr-defined]
+            if name == "device/home":
+                self.tell_device(homed="true", state="MOVING")
+                self.tell_device(homed="true", state="DISABLED")
+            self.starts += name == "plane_controller/start"
             return response
 
         return answer
@@ -161,6 +180,24 @@ def test_a_fault_ends_it_with_the_reason_in_one_line(scene: Scene) -> None:
     assert code == 1
     lines = [line for line in said.strip().splitlines() if not line.startswith("[INFO]")]
     assert lines == ["operator: plane_controller FAULT: the needle is gone"]
+
+
+@pytest.mark.parametrize("mute", STARTED)
+def test_an_answer_that_is_lost_is_asked_for_again(scene: Scene, mute: str) -> None:
+    rig = scene.rig
+    rig.mute = {mute.partition(" ")[0]}
+    scene.until(lambda: "plane_controller/start" in rig.asked)
+    rig.tell_controller("STEERING", 1)
+    scene.until(lambda: rig.holds)
+    rig.tell_controller("DONE", 120)
+    code, said = scene.end()
+    assert code == 0, said
+    assert not rig.mute
+    assert list(dict.fromkeys(rig.asked)) == [*STARTED, "device/enable False"]
+    if mute in (STARTED[0], STARTED[2]):
+        assert rig.asked.count(mute) == 2
+    else:
+        assert rig.asked.count("plane_controller/start") == 1
 
 
 def test_a_refusal_ends_it_without_a_hold(scene: Scene) -> None:

@@ -1,6 +1,18 @@
 import pytest
 
-from needle_bringup.operator_sequence import PREPARATION, OperatorSequence, Outcome, ServiceCall
+from needle_bringup.operator_sequence import (
+    ASK_AGAIN,
+    ENABLE,
+    HOME,
+    PREPARATION,
+    START,
+    OperatorSequence,
+    Outcome,
+    ServiceCall,
+)
+
+CONFIRM = PREPARATION[0]
+DISABLED = {"homed": "true", "state": "DISABLED"}
 
 
 def fresh() -> OperatorSequence:
@@ -8,6 +20,7 @@ def fresh() -> OperatorSequence:
     sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
     sequence.see_devices(["/sim_rig"])
     see(sequence, {}, 0.0)
+    sequence.see_controller({"state": "IDLE", "starts": "0"}, 0.0)
     return sequence
 
 
@@ -20,18 +33,26 @@ def outcome(sequence: OperatorSequence) -> Outcome | None:
     return sequence.outcome
 
 
+def answer(sequence: OperatorSequence, message: str = "") -> None:
+    """Let the next call be made and agreed to."""
+    call = sequence.next_call(1.0)
+    assert call is not None
+    sequence.take_answer(call, True, message, 1.0)
+
+
 def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
     sequence.see_missing([])
     see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
     calls = []
     while (call := sequence.next_call(now)) is not None:
         calls.append(call)
-        sequence.take_answer(True, "", now)
+        sequence.take_answer(call, True, "", now)
     return calls
 
 
 def steering(**values: str) -> dict[str, str]:
-    return {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"} | values
+    said = {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"}
+    return said | {"starts": "1"} | values
 
 
 def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
@@ -42,7 +63,7 @@ def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> N
         assert not sequence.hold(1.0)
         assert sequence.next_call(1.0) == expected
         assert sequence.next_call(1.0) is None, "one call at a time"
-        sequence.take_answer(True, "", 1.0)
+        sequence.take_answer(expected, True, "", 1.0)
     assert sequence.hold(1.0)
 
 
@@ -64,15 +85,15 @@ def test_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses
     sequence = fresh()
     sequence.see_missing([])
     assert sequence.next_call(1.0) == PREPARATION[0]
-    sequence.take_answer(False, "waiting for a subscriber of joint_states", 1.0)
+    sequence.take_answer(CONFIRM, False, "waiting for a subscriber of joint_states", 1.0)
     assert sequence.next_call(1.05) is None
     assert sequence.next_call(20.0) == PREPARATION[0]
-    sequence.take_answer(False, "waiting for a subscriber of joint_states", 20.0)
+    sequence.take_answer(CONFIRM, False, "waiting for a subscriber of joint_states", 20.0)
     assert sequence.next_call(20.2) == PREPARATION[0]
-    sequence.take_answer(False, "the needle is in", 20.2)
+    sequence.take_answer(CONFIRM, False, "the needle is in", 20.2)
     assert outcome(sequence) is None, "what it rests on may have changed meanwhile"
     assert sequence.next_call(22.2) == PREPARATION[0]
-    sequence.take_answer(False, "the needle is in", 22.2)
+    sequence.take_answer(CONFIRM, False, "the needle is in", 22.2)
     assert sequence.outcome is not None
     assert "the needle is in" in sequence.outcome.reason
     assert sequence.next_call(23.0) is None
@@ -91,8 +112,7 @@ def test_waits_for_homing_before_it_enables() -> None:
     sequence = fresh()
     sequence.see_missing([])
     for _ in range(2):
-        assert sequence.next_call(1.0) is not None
-        sequence.take_answer(True, "", 1.0)
+        answer(sequence)
     assert sequence.next_call(1.0) is None
     see(sequence, {"homed": "true"}, 1.0)
     assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
@@ -113,6 +133,7 @@ def test_the_done_of_an_earlier_run_does_not_count() -> None:
     sequence = fresh()
     sequence.see_controller(steering(state="DONE"), 0.5)
     prepare(sequence)
+    sequence.see_controller(steering(state="DONE"), 2.0)
     assert sequence.outcome is None
 
 
@@ -137,7 +158,7 @@ def test_fault_release_and_stop_end_the_run_with_their_reason() -> None:
 def test_the_idle_before_steering_is_no_stop() -> None:
     sequence = fresh()
     prepare(sequence)
-    sequence.see_controller(steering(state="IDLE"), 2.0)
+    sequence.see_controller(steering(state="IDLE", starts="0"), 2.0)
     assert sequence.outcome is None
 
 
@@ -201,16 +222,14 @@ def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
 def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    see(sequence, DISABLED, 1.0)
     for _ in PREPARATION[:-1]:
-        sequence.next_call(1.0)
-        sequence.take_answer(True, "", 1.0)
-    sequence.next_call(1.0)
+        answer(sequence)
+    assert sequence.next_call(1.0) == START
     sequence.see_controller(steering(state="FAULT", reason="the needle is gone"), 1.0)
-    assert outcome(sequence) is None
-    sequence.take_answer(True, "", 1.0)
     assert sequence.outcome is not None
     assert "the needle is gone" in sequence.outcome.reason
+    assert sequence.outcome.prepared
 
 
 @pytest.mark.parametrize("prepared", range(len(PREPARATION) + 1))
@@ -219,8 +238,7 @@ def test_a_device_that_is_real_ends_it_whenever_it_is_heard(prepared: int) -> No
     sequence.see_missing([])
     see(sequence, {"homed": "true"}, 1.0)
     for _ in range(prepared):
-        sequence.next_call(1.0)
-        sequence.take_answer(True, "", 1.0)
+        answer(sequence)
     sequence.see_device({"homed": "true", "simulated": "false"}, "/device_driver", 1.0)
     assert sequence.outcome is not None
     assert "/device_driver is a real device" in sequence.outcome.reason
@@ -258,10 +276,9 @@ def test_a_homing_under_way_is_waited_for_whatever_was_heard_before_it() -> None
     sequence = fresh()
     sequence.see_missing([])
     see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
-    sequence.next_call(1.0)
-    sequence.take_answer(True, "needle out", 1.0)
+    answer(sequence, "needle out")
     assert sequence.next_call(1.0) == ServiceCall("device/home")
-    sequence.take_answer(True, "homing", 1.0)
+    sequence.take_answer(HOME, True, "homing", 1.0)
     assert sequence.next_call(1.0) is None
     # A device may say that it is homed, from last time, while it looks for its switches.
     for homed in ("false", "true"):
@@ -274,11 +291,10 @@ def test_a_homing_under_way_is_waited_for_whatever_was_heard_before_it() -> None
 def test_the_end_of_a_homing_may_overtake_its_answer() -> None:
     sequence = fresh()
     sequence.see_missing([])
-    sequence.next_call(1.0)
-    sequence.take_answer(True, "needle out", 1.0)
-    sequence.next_call(1.0)
+    answer(sequence, "needle out")
+    assert sequence.next_call(1.0) == HOME
     see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
-    sequence.take_answer(True, "homing", 1.0)
+    sequence.take_answer(HOME, True, "homing", 1.0)
     assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
 
 
@@ -290,13 +306,12 @@ def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
         sequence.see_missing([])
         see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
         for _ in PREPARATION[:-1]:
-            sequence.next_call(1.0)
-            sequence.take_answer(True, "", 1.0)
-        sequence.next_call(1.0)
+            answer(sequence)
+        assert sequence.next_call(1.0) == START
         ended = steering(state="IDLE", starts="2", reason="the needle was drawn back")
         if overtakes:
             sequence.see_controller(ended, 1.0)
-        sequence.take_answer(True, "", 1.0)
+        sequence.take_answer(START, True, "", 1.0)
         if not overtakes:
             sequence.see_controller(ended, 1.0)
         assert sequence.outcome is not None
@@ -324,3 +339,87 @@ def test_before_it_acts_another_device_has_time_to_show_itself() -> None:
     see(sequence, {}, 0.1)
     assert sequence.next_call(1.9) is None
     assert sequence.next_call(2.0) == PREPARATION[0]
+
+
+def reach(wanted: ServiceCall) -> OperatorSequence:
+    """Return a sequence that has just made the call, for the first time, at 1.0 s."""
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, DISABLED, 1.0)
+    for _ in range(PREPARATION.index(wanted)):
+        answer(sequence)
+    assert sequence.next_call(1.0) == wanted
+    return sequence
+
+
+@pytest.mark.parametrize("call", PREPARATION)
+def test_a_call_whose_answer_was_lost_is_made_again(call: ServiceCall) -> None:
+    sequence = reach(call)
+    assert sequence.next_call(0.9 + ASK_AGAIN) is None
+    assert sequence.next_call(1.0 + ASK_AGAIN) == call
+    sequence.take_answer(call, True, "", 2.1)
+    assert sequence.next_call(2.1) != call
+
+
+@pytest.mark.parametrize("call", PREPARATION[:-1])
+def test_a_late_answer_is_to_its_own_call_alone(call: ServiceCall) -> None:
+    sequence = reach(call)
+    assert sequence.next_call(1.0 + ASK_AGAIN) == call
+    sequence.take_answer(call, True, "", 2.1)
+    following = sequence.next_call(2.1)
+    assert following == PREPARATION[PREPARATION.index(call) + 1]
+    sequence.take_answer(call, True, "", 2.2)
+    assert not sequence.steering
+    assert sequence.next_call(2.2) is None, "that one has not been answered"
+    sequence.take_answer(call, False, "the device is MOVING", 2.3)
+    assert sequence.next_call(2.5) is None
+
+
+def test_a_homing_whose_answer_was_lost_is_not_asked_for_again_while_it_moves() -> None:
+    sequence = reach(HOME)
+    see(sequence, {"homed": "true", "state": "MOVING"}, 1.2)
+    assert sequence.next_call(5.0) is None
+    see(sequence, DISABLED, 9.0)
+    assert sequence.next_call(9.0) == ENABLE
+
+
+def test_homed_from_before_the_call_is_no_answer_to_it() -> None:
+    sequence = reach(HOME)
+    # What was under way when the call was made.
+    see(sequence, DISABLED | {"needle_out_confirmed": "true"}, 1.1)
+    assert sequence.next_call(1.2) is None
+    assert sequence.next_call(1.0 + ASK_AGAIN) == HOME
+
+
+def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
+    sequence = reach(START)
+    sequence.see_controller(steering(starts="0", state="IDLE"), 1.1)
+    assert not sequence.hold(1.1)
+    sequence.see_controller(steering(), 1.2)
+    assert sequence.hold(1.2)
+    sequence.take_answer(START, False, "already steering", 1.3)
+    assert outcome(sequence) is None
+    assert sequence.next_call(9.0) is None
+
+
+def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, DISABLED, 1.0)
+    for _ in PREPARATION[:-1]:
+        answer(sequence)
+    assert sequence.next_call(1.0) is None
+    assert "needle/controller_status" in sequence.hangs()
+    sequence.see_controller(steering(state="DONE", starts="4"), 1.1)
+    assert sequence.next_call(1.1) == START
+    sequence.take_answer(START, True, "", 1.1)
+    assert outcome(sequence) is None
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "two", ""])
+def test_figures_that_are_none_end_nothing(text: str) -> None:
+    sequence = reach(START)
+    sequence.see_controller(steering(starts=text, insertion_m=text, depth_m=text), 1.1)
+    assert outcome(sequence) is None
+    assert not sequence.steering
