@@ -7,14 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from needle_bringup.bag_writer import refuse_existing_bag
-from needle_bringup.rig_configuration import (
-    Parameters,
-    command_line_parameters,
-    merge,
-    read_parameters,
-)
+from needle_bringup.rig_configuration import NODES, command_line_parameters, merge
 from needle_bringup.simulate_options import parse
 from needle_common.errors import UserError
+from needle_common.parameter_files import Parameters, read_parameters
 
 # Parameter that no file may set -> the launch argument that does.
 _OF_SIMULATION = {
@@ -121,7 +117,7 @@ def _read(argument: str, file: str) -> Parameters:
     path = Path(file).expanduser()
     if not path.is_file():
         raise UserError(f"{argument}:={file}: no such file")
-    return read_parameters(path)
+    return read_parameters(path, NODES)
 
 
 def _new_bag(text: str) -> Path | None:

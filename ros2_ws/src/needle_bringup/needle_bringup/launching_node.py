@@ -11,8 +11,9 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from needle_bringup.rig_configuration import PACKAGES, Parameters
+from needle_bringup.rig_configuration import PACKAGES
 from needle_bringup.simulate import RECORDER_GRACE
+from needle_common.parameter_files import Parameters
 
 
 def describe(

@@ -25,11 +25,11 @@ from needle_bringup.rerun import (
 )
 from needle_bringup.rerun_bag import write_rerun
 from needle_bringup.rerun_text import describe, errors_text, flat, tolerance_table
-from needle_bringup.rig_configuration import read_parameters
 from needle_bringup.tracker_rerun_node import TrackerStage
 from needle_common.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
 from needle_common.options import CommandParser, output_file
+from needle_common.parameter_files import read_parameters
 from needle_common.parameters import OF_EVERY_NODE
 from needle_controller.control_settings import PRESETS
 from needle_controller.parameters import PlaneControllerParameters

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import yaml
 
 from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
+from needle_common.parameter_files import Parameters
 
 # Node -> its package, in the order in which they start.
 PACKAGES = {
@@ -62,42 +62,8 @@ PATIENT_WATCHDOG = 5.0
 # The same in real time: as long as on a rig whose motors turn by themselves it may be [s].
 REAL_TIME_WATCHDOG = 0.5
 
-Parameters = dict[str, dict[str, Any]]
-
 # Parameters of the recorder that leave something out of the bag.
 _CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
-
-
-def read_parameters(path: Path) -> Parameters:
-    """Return a ROS parameter file as node name -> parameter name -> value.
-
-    Raises
-    ------
-    UserError
-        If it cannot be read, is no such file, or names a node that the rig does not have.
-    """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}: not YAML{where}: {getattr(error, 'problem', error)}") from error
-    if not isinstance(document, Mapping):
-        raise UserError(f"{path}: not a ROS parameter file (NODE: {{ros__parameters: ...}})")
-    parameters: Parameters = {}
-    for key, section in document.items():
-        name = str(key).removeprefix("/")
-        if name not in NODES:
-            raise UserError(f"{path}: unknown node '{key}' (known: {', '.join(NODES)})")
-        if not isinstance(section, Mapping) or list(section) != ["ros__parameters"]:
-            raise UserError(f"{path}: '{key}' wants one entry, ros__parameters")
-        values = section["ros__parameters"]
-        if not isinstance(values, Mapping):
-            raise UserError(f"{path}: '{key}' wants NAME: VALUE pairs under ros__parameters")
-        parameters[name] = {str(k): value for k, value in values.items()}
-    return parameters
 
 
 def merge(*layers: Parameters) -> Parameters:

@@ -18,12 +18,11 @@ from needle_bringup.installed import find_executable
 from needle_bringup.node_process import NodeProcess, stop, wait_for
 from needle_bringup.progress import PROGRESS_FD
 from needle_bringup.rig_configuration import (
+    NODES,
     PACKAGES,
-    Parameters,
     command_line_parameters,
     merge,
     nodes_of,
-    read_parameters,
     refuse_reserved,
     write_parameters,
 )
@@ -37,6 +36,7 @@ from needle_common.cli import (
     write_json,
 )
 from needle_common.errors import UserError
+from needle_common.parameter_files import Parameters, read_parameters
 from needle_common.ros_domain import own_domain
 
 LOGS = "logs"
@@ -138,7 +138,7 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
     if options.params is not None:
-        given = read_parameters(options.params)
+        given = read_parameters(options.params, NODES)
         refuse_reserved(options.params, given, options)
     executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     bag = _make_folder(options)
@@ -265,8 +265,8 @@ def shown(path: Path) -> Path:
 
 def _import_report() -> tuple[ModuleType, ...]:
     """Import what makes the report: a second of work, best done while there is time to spare."""
-    names = ("report", "bag_reader", "run_summary")
-    return tuple(importlib.import_module(f"needle_bringup.{name}") for name in names)
+    names = ("needle_bringup.report", "needle_bringup.bag_reader", "needle_bringup.run_summary")
+    return tuple(importlib.import_module(name) for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:

@@ -10,8 +10,8 @@ import yaml
 
 from needle_bringup.installed import find_shared
 from needle_bringup.launch_nodes import nodes_beside_rig, simulated_nodes
-from needle_bringup.rig_configuration import Parameters
 from needle_common.errors import UserError
+from needle_common.parameter_files import Parameters
 
 
 def simulated(**arguments: str) -> Parameters:

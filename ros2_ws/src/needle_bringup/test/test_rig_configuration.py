@@ -9,13 +9,12 @@ from needle_bringup.rig_configuration import (
     command_line_parameters,
     merge,
     nodes_of,
-    read_parameters,
     refuse_reserved,
     write_parameters,
 )
 from needle_bringup.simulate_options import SimulateOptions
 from needle_common.errors import UserError
-from needle_common.parameter_files import NODES
+from needle_common.parameter_files import NODES, read_parameters
 from needle_controller.parameters import PlaneControllerParameters
 
 

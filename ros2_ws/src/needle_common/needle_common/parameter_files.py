@@ -1,9 +1,9 @@
-"""Parameter files on a node's command line: a section for a node that does not exist is refused."""
+"""Parameter files: read, and a section for a node that does not exist refused."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,47 @@ NODES = (
 )
 """What the rig's nodes are called."""
 _SECTION = "ros__parameters"
+
+Parameters = dict[str, dict[str, Any]]
+
+
+def read_parameters(path: Path, nodes: Sequence[str] = NODES) -> Parameters:
+    """Return a ROS parameter file as node name -> parameter name -> value.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    nodes : sequence of str
+        Whom it may name.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read, is no such file, or names another node.
+    """
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}: not YAML{where}: {getattr(error, 'problem', error)}") from error
+    if not isinstance(document, Mapping):
+        raise UserError(f"{path}: not a ROS parameter file (NODE: {{ros__parameters: ...}})")
+    parameters: Parameters = {}
+    for key, section in document.items():
+        name = str(key).removeprefix("/")
+        if name not in nodes:
+            raise UserError(f"{path}: unknown node '{key}' (known: {', '.join(nodes)})")
+        if not isinstance(section, Mapping) or list(section) != ["ros__parameters"]:
+            raise UserError(f"{path}: '{key}' wants one entry, ros__parameters")
+        values = section["ros__parameters"]
+        if not isinstance(values, Mapping):
+            raise UserError(f"{path}: '{key}' wants NAME: VALUE pairs under ros__parameters")
+        parameters[name] = {str(k): value for k, value in values.items()}
+    return parameters
 
 
 def refuse_unknown_nodes(arguments: Sequence[str]) -> None:
