@@ -10,11 +10,13 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_tracker.insertion_history import InsertionHistory
 from needle_tracker.measurement import Measurement
 from needle_tracker.pairing import OTHER_SIDE, PairMatcher
+from needle_tracker.swapped_images import SUSPICION
 from needle_tracker.track import TrackState
 
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
+_EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
 
 
 @dataclasses.dataclass
@@ -27,6 +29,8 @@ class Health:
         Pairs refused before they were looked at, by reason.
     rejected : Counter
         Pairs that gave no believed tip, by reason.
+    swapped : bool
+        Whether left and right images seem to be swapped.
     """
 
     refused: Counter[str]
@@ -34,6 +38,7 @@ class Health:
     joints_without_insertion: int = 0
     last_refusal: tuple[float, str] | None = None
     camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
+    swapped: bool = False
     _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
     _first_image: float = 0.0
     _last_unpaired: float | None = None
@@ -121,6 +126,11 @@ class Health:
         for problem in self.camera_info.values():
             if problem:
                 return Level.ERROR, problem
+        if self.swapped:
+            return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
+        return self._pairing_level(now, matcher)
+
+    def _pairing_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
         for side, other in OTHER_SIDE.items():
             last = self._last_image.get(other, self._first_image)
             if matcher.waiting(side) and now - last > PARTNER_LATE:

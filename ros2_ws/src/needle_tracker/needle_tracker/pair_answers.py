@@ -18,6 +18,7 @@ from needle_tracker.insertion_history import InsertionHistory
 from needle_tracker.measurement import Measurement
 from needle_tracker.pairing import Pair, PairMatcher
 from needle_tracker.pre_bend import heading_of
+from needle_tracker.swapped_images import SwapWatch
 from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import TrackerSettings
 from needle_tracker.triangulation import SpatialTip
@@ -109,6 +110,7 @@ class PairAnswers:
     ) -> None:
         self.tracker = StereoTracker(calibration, tracker)
         self.tracker.warm_up()
+        self.swap = SwapWatch(calibration, tracker)
         self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
         self.insertions = InsertionHistory()
         self.joints_silent = False
@@ -156,7 +158,10 @@ class PairAnswers:
                     return
                 self.joints_silent = True
             self._queue.popleft()
-            yield self._answer(arrival, pair)
+            answer = self._answer(arrival, pair)
+            yield answer
+            # No answer waits for a suspicion.
+            self._suspect(answer)
 
     def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:
         refused = self._refusal(pair)
@@ -169,6 +174,13 @@ class PairAnswers:
         if tip is not None:
             tip = self._with_heading(tip, pair.stamp)
         return Answer(pair, arrival, measured, tip, refused)
+
+    def _suspect(self, answer: Answer) -> None:
+        """Look whether the images seem to be swapped."""
+        pair = answer.pair
+        left, right = pair.left.pixels, pair.right.pixels
+        if left is not None and right is not None and not answer.refused:
+            self.swap.see(left, right, self.insertions.at(pair.stamp), answer.measured)
 
     def _refusal(self, pair: Pair[Frame]) -> str:
         """Return why a pair cannot be looked at; a long step back in time begins anew."""

@@ -225,6 +225,7 @@ class StereoTrackerNode(Node):
         now = time.monotonic()
         answers, health = self._answers, self._health
         health.note_pairing(now, answers.matcher)
+        health.swapped = answers.swap.suspected
         self._tell("track", health.track())
         self._tell("images", health.images(now, answers.matcher))
         self._tell("joints", health.joints(answers.insertions, answers.joints_silent))

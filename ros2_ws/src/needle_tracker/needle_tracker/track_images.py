@@ -19,6 +19,7 @@ from needle_common.options import CommandParser, number, output_file
 from needle_tracker.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.measurement import Measurement
+from needle_tracker.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.track import TrackState
 from needle_tracker.tracker import StereoTracker
 from needle_tracker.tracker_settings import default_settings
@@ -53,12 +54,16 @@ _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images
 
 @dataclasses.dataclass(frozen=True)
 class TrackedSequence:
-    """What a sequence gave: CSV rows, reasons for missing tips, names that nothing was made of."""
+    """What a sequence gave: CSV rows, reasons for missing tips, names that nothing was made of.
+
+    And whether left and right images seem to be swapped.
+    """
 
     rows: list[list[str]]
     reasons: Counter[str]
     unreadable: list[str]
     without_insertion: int
+    swapped: bool
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -93,6 +98,8 @@ def _run(words: Sequence[str]) -> int:
     print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
     for reason, count in tracked.reasons.most_common():
         print(f"  no tip {count:6d} x  {reason}")
+    if tracked.swapped:
+        print(f"warning: {SUSPICION}; exchange --left and --right", file=sys.stderr)
     _warn("without a partner", pairs.unpaired)
     _warn("cannot be used", tracked.unreadable)
     if pairs.cut_off:
@@ -140,6 +147,7 @@ def track_sequence(
     reasons: Counter[str] = Counter()
     unusable: list[str] = []
     without, last, checked = 0, None, False
+    swap = SwapWatch(calibration, tracker.settings)
     bar = tqdm(
         pairs,
         total=len(pairs.names),
@@ -160,6 +168,7 @@ def track_sequence(
         problem = pair_problem(pair, calibration)
         if pair.left is not None and pair.right is not None and not problem:
             measured = tracker.process(pair.left, pair.right, insertion)
+            swap.see(pair.left, pair.right, insertion, measured)
             checked = True
         else:
             if not checked and pair.left is not None and pair.right is not None:
@@ -171,7 +180,7 @@ def track_sequence(
             entry = measured.state is TrackState.ENTRY
             reasons["in the entry zone" if entry else measured.reason] += 1
         rows.append(row)
-    return TrackedSequence(rows, reasons, unusable, without)
+    return TrackedSequence(rows, reasons, unusable, without, swap.suspected)
 
 
 def pair_problem(pair: NamedPair, calibration: StereoCalibration) -> str:

@@ -375,6 +375,17 @@ def test_the_same_images_from_both_cameras_are_no_tip(bench: Bench, images: Imag
     assert not bench.tips
 
 
+def test_swapped_images_are_suspected_aloud(bench: Bench, images: Images) -> None:
+    left, right = images
+    for k in range(1, 13):
+        assert not found(bench.pair(10 * k, (right, left)))
+    bench.until(lambda: "seem to be swapped" in bench.health["images"][1])
+    assert bench.health["images"][0] == 1
+    assert "parameters left and right" in bench.health["images"][1]
+    assert found(bench.pair(1000, images))
+    bench.until(lambda: bench.health["images"][0] == 0)
+
+
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [

@@ -65,6 +65,31 @@ def test_the_defaults_are_the_nodes(calibration: StereoCalibration) -> None:
     assert default_settings(phantom) == StereoTrackerParameters().tracker_settings(phantom)
 
 
+def test_swapped_folders_are_suspected(
+    tmp_path: Path,
+    calibration_path: Path,
+    draw_pair: Drawer,
+    make_arc: Callable[..., np.ndarray],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = ["name,insertion_m"]
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+    for mm in range(50, 65):
+        for side, image in zip(
+            ("right", "left"), draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), strict=True
+        ):
+            cv2.imwrite(str(tmp_path / side / f"{mm}.png"), image)
+        lines.append(f"{mm}.png,{1e-3 * mm}")
+    (tmp_path / "insertion.csv").write_text("\n".join(lines) + "\n")
+    code, rows = track(tmp_path, calibration_path, "--insertion", str(tmp_path / "insertion.csv"))
+    assert code == 0
+    assert {row["valid"] for row in rows} == {"0"}
+    said = capsys.readouterr().err
+    assert "seem to be swapped" in said
+    assert "exchange --left and --right" in said
+
+
 def test_every_pair_has_its_line(folder: Path, calibration_path: Path, drawn: Drawn) -> None:
     code, rows = track(folder, calibration_path, "--insertion", str(folder / "insertion.csv"))
     assert code == 0
