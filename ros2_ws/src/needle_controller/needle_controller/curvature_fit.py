@@ -116,6 +116,8 @@ class CurvatureFit:
         Standard deviation of one measured coordinate, assumed or from the residuals [m].
     weights : ndarray, shape (..., K)
         Weight of each tip, near 1 as a rule and near 0 for an outlier.
+    misses : ndarray, shape (..., K, 3)
+        What each tip is off the arc, across it [m].
     entry : ndarray, shape (..., 3)
         The arc's start [m].
     entry_std : ndarray, shape (...)
@@ -130,6 +132,7 @@ class CurvatureFit:
     std: Array
     measurement_std: Array
     weights: Array
+    misses: Array
     entry: Array
     entry_std: Array
     heading: Array
@@ -203,8 +206,8 @@ def fit_curvature(
     for iteration in range(_ITERATIONS):
         expected, slopes, tangent = arc_points(unknowns, length)
         residual = measured - expected
+        along = np.sum(residual * tangent, axis=-1, keepdims=True)
         if not known:
-            along = np.sum(residual * tangent, axis=-1, keepdims=True)
             residual = residual - along * tangent
             across = np.sum(slopes * tangent[..., None], axis=-2, keepdims=True)
             slopes = slopes - tangent[..., None] * across
@@ -234,6 +237,7 @@ def fit_curvature(
         std=std,
         measurement_std=sigma,
         weights=weights,
+        misses=(residual - along * tangent) @ axes.T,
         entry=unknowns[..., ENTRY] @ axes.T + np.asarray(settings.entry, dtype=float),
         entry_std=np.sqrt(np.max(variances[..., ENTRY], axis=-1)),
         heading=headings(unknowns[..., HEADING])[..., :, 2] @ axes.T,

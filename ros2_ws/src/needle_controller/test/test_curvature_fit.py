@@ -210,6 +210,31 @@ def needle() -> tuple[Array, Array]:
     return uniform(tips[0], rng), insertion
 
 
+@pytest.mark.parametrize("known", [True, False])
+def test_a_steered_insertion_is_refused_though_the_rotation_is_not_recorded(
+    tmp_path: Path, known: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rng = default_rng(3)
+    plant = NeedlePlant(np.eye(4), curvature=1.0 / RADIUS)
+    insertion = np.arange(STEP, 0.0605, STEP)
+    tips = []
+    for k in range(len(insertion)):
+        plant.advance(STEP, math.radians(90.0) if k == 30 else 0.0)
+        tips.append(plant.T_rig_tip[:3, 3])
+    noisy = np.array(tips) + rng.normal(0.0, 3e-5, (len(tips), 3))
+    path = write_csv(tmp_path / "tips.csv", noisy, insertion if known else None, None)
+    assert command(path) == 2
+    error = capsys.readouterr().err
+    assert "the tips follow no single arc" in error
+    assert error.count("\n") == 1
+    turned = np.zeros(len(insertion))
+    # Whoever has recorded that nothing turned is believed.
+    assert command(write_csv(path, noisy, insertion, turned)) == 0
+    if known:
+        write_csv(path, noisy, insertion, None)
+        assert command(path, "--until-mm", "30") == 0
+
+
 def command(*arguments: str | Path) -> int:
     return main([str(argument) for argument in arguments])
 
