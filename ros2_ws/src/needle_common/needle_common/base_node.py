@@ -30,7 +30,7 @@ from needle_common.end_request import GRACE, EndRequest
 from needle_common.errors import UserError
 from needle_common.executor_node import NodeExecutor
 from needle_common.parameter_fields import describe
-from needle_common.parameter_files import refuse_unknown_nodes
+from needle_common.parameter_files import foreign_nodes
 from needle_common.partners_node import signature
 from needle_common.reach import keep_to_this_machine
 from needle_common.shared_memory import make_private
@@ -158,7 +158,8 @@ def run_node(
                 return run_command(lambda: _explain(help_text, parameters))
             if own:
                 raise UserError(f"unknown argument {own[0]!r}; see --help")
-            refuse_unknown_nodes(argv)
+            for line in foreign_nodes(argv):
+                print(line, file=sys.stderr)
             keep_to_this_machine()
             # rclpy's own handlers would shut the context down in the middle of what is under way.
             rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)

@@ -1,7 +1,8 @@
-"""Parameter files: read, and a section for a node that does not exist refused."""
+"""Parameter files: read, and a section for a node that does not exist refused, or said."""
 
 from __future__ import annotations
 
+import difflib
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ NODES = (
 )
 """What the rig's nodes are called."""
 _SECTION = "ros__parameters"
+_CLOSE = 0.7  # names that have so much in common are one, misspelt
 
 Parameters = dict[str, dict[str, Any]]
 
@@ -67,20 +69,30 @@ def read_parameters(path: Path, nodes: Sequence[str] = NODES) -> Parameters:
     return parameters
 
 
-def refuse_unknown_nodes(arguments: Sequence[str]) -> None:
-    """Refuse files that name nodes which the rig does not have: ROS passes over them in silence.
+def foreign_nodes(arguments: Sequence[str]) -> list[str]:
+    """Return whom else a node's parameter files name; misspelt names of this rig are refused.
+
+    A rig's file is often shared by all its nodes, those of other packages too. But ROS passes over
+    a section in silence: with its name misspelt, a node would run on its defaults.
 
     Parameters
     ----------
     arguments : sequence of str
         A node's command line.
 
+    Returns
+    -------
+    list of str
+        One line for each file that names nodes of others.
+
     Raises
     ------
     UserError
-        For such a file; one that cannot be read is left to rclpy, which says so.
+        For a name that is close to a node of this rig; a file that cannot be read is left to rclpy,
+        which says so.
     """
     renamed = {word.partition(":=")[2] for word in arguments if word.startswith("__node:=")}
+    lines = []
     for option, path in itertools.pairwise(arguments):
         if option != "--params-file":
             continue
@@ -88,10 +100,18 @@ def refuse_unknown_nodes(arguments: Sequence[str]) -> None:
             document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, yaml.YAMLError):
             continue
+        foreign = []
         for name in _sections(document):
             last = name.rstrip("/").rpartition("/")[2]
-            if "*" not in name and last not in (*NODES, *renamed):
-                raise UserError(f"{path}: unknown node '{name}' (known: {', '.join(NODES)})")
+            if "*" in name or last in (*NODES, *renamed):
+                continue
+            meant = difflib.get_close_matches(last, NODES, n=1, cutoff=_CLOSE)
+            if meant:
+                raise UserError(f"{path}: unknown node '{name}', did you mean '{meant[0]}'?")
+            foreign.append(name)
+        if foreign:
+            lines.append(f"{path}: passed over, no nodes of this rig: {', '.join(foreign)}")
+    return lines
 
 
 def _sections(document: Any, above: str = "") -> Iterator[str]:
