@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from needle_bringup.bag_writer import refuse_existing_bag
@@ -23,7 +24,31 @@ _OF_SIMULATION = {
     "pty": "can",
     "channel": "can",
 }
+_CLOSE = 0.84  # names that have so much in common are one, misspelt; ros_namespace is none
 _OF_RIG = {"calibration_file": "calibration", "bag": "bag"}
+
+
+def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
+    """Refuse launch arguments that are close to a declared one: launch takes any, in silence.
+
+    Others may be those of a launch file that includes this one.
+
+    Parameters
+    ----------
+    given : iterable of str
+        The names that launch knows.
+    declared : sequence of str
+        Those of the launch file.
+
+    Raises
+    ------
+    UserError
+        Names the argument, and the one that is meant.
+    """
+    for name in given:
+        meant = difflib.get_close_matches(name.lower(), declared, n=1, cutoff=_CLOSE)
+        if name not in declared and meant:
+            raise UserError(f"unknown argument {name}:=, did you mean {meant[0]}:=?")
 
 
 def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:

@@ -11,6 +11,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
+from needle_bringup.launch_nodes import refuse_misspelt
 from needle_bringup.rig_configuration import PACKAGES
 from needle_bringup.simulate import RECORDER_GRACE
 from needle_common.parameter_files import Parameters
@@ -25,13 +26,15 @@ def describe(
     Parameters
     ----------
     arguments : sequence of DeclareLaunchArgument
-        What the user can say, beside `namespace`.
+        What the user can say, beside `namespace`; misspelt, it ends the launch likewise.
     nodes : callable
         Takes launch argument -> text, returns node -> parameter -> value; what it raises ends the
         launch before a node is started.
     """
 
     def start(context: Any) -> list[Node]:
+        declared = [*(one.name for one in arguments), "namespace"]
+        refuse_misspelt(context.launch_configurations, declared)
         given = {one.name: LaunchConfiguration(one.name).perform(context) for one in arguments}
         namespace = LaunchConfiguration("namespace").perform(context)
         return [_node(name, values, namespace) for name, values in nodes(given).items()]

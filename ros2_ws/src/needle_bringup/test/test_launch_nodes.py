@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from needle_bringup.installed import find_shared
-from needle_bringup.launch_nodes import nodes_beside_rig, simulated_nodes
+from needle_bringup.launch_nodes import nodes_beside_rig, refuse_misspelt, simulated_nodes
 from needle_common.errors import UserError
 from needle_common.parameter_files import Parameters
 
@@ -108,3 +108,24 @@ def test_images_that_are_sent_best_effort_are_heard() -> None:
 def test_a_number_that_cannot_be_meant_starts_nothing(name: str, text: str) -> None:
     with pytest.raises(UserError, match=text):
         simulated(**{name: text})
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [
+        ("calibraton", "calibration"),
+        ("drive", "drives"),
+        ("parms", "params"),
+        ("Bag", "bag"),
+        ("bags", "bag"),
+    ],
+)
+def test_a_misspelt_argument_starts_nothing(name: str, meant: str) -> None:
+    declared = ["calibration", "drives", "bag", "params", "namespace"]
+    with pytest.raises(UserError, match=f"unknown argument {name}:=, did you mean {meant}:="):
+        refuse_misspelt([*declared, name], declared)
+
+
+def test_the_arguments_of_an_including_launch_file_are_let_pass() -> None:
+    declared = ["calibration", "drives", "bag", "params", "namespace"]
+    refuse_misspelt([*declared, "ros_namespace", "cameras", "use_sim_time"], declared)
