@@ -36,6 +36,7 @@ from needle_common.reach import keep_to_this_machine
 from needle_common.shared_memory import make_private
 
 _LONGEST_TEXT = 200
+_ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level")
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 # An executor that waits does not see a signal: it looks up after this time [s].
 LOOK_PERIOD = 0.1
@@ -157,7 +158,7 @@ def run_node(
             if own in (["--help"], ["-h"]):
                 return run_command(lambda: _explain(help_text, parameters))
             if own:
-                raise UserError(f"unknown argument {own[0]!r}; see --help")
+                raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
             for line in foreign_nodes(argv):
                 print(line, file=sys.stderr)
             keep_to_this_machine()
@@ -167,6 +168,10 @@ def run_node(
         except Exception as error:  # noqa: BLE001
             return _refuse(error)
         return _run(create, spin or _spin, end)
+
+
+def _hint(argument: str) -> str:
+    return "it goes after --ros-args" if argument in _ROS_OPTIONS else "see --help"
 
 
 def _run(

@@ -45,14 +45,7 @@ def read_parameters(path: Path, nodes: Sequence[str] = NODES) -> Parameters:
     UserError
         If it cannot be read, is no such file, or names another node.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path}: cannot be read: {error}") from error
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f" in line {mark.line + 1}" if mark else ""
-        raise UserError(f"{path}: not YAML{where}: {getattr(error, 'problem', error)}") from error
+    document = _document(path)
     if not isinstance(document, Mapping):
         raise UserError(f"{path}: not a ROS parameter file (NODE: {{ros__parameters: ...}})")
     parameters: Parameters = {}
@@ -88,20 +81,15 @@ def foreign_nodes(arguments: Sequence[str]) -> list[str]:
     Raises
     ------
     UserError
-        For a name that is close to a node of this rig; a file that cannot be read is left to rclpy,
-        which says so.
+        For a file that cannot be read, and a name that is close to a node of this rig.
     """
     renamed = {word.partition(":=")[2] for word in arguments if word.startswith("__node:=")}
     lines = []
     for option, path in itertools.pairwise(arguments):
         if option != "--params-file":
             continue
-        try:
-            document = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, yaml.YAMLError):
-            continue
         foreign = []
-        for name in _sections(document):
+        for name in _sections(_document(Path(path))):
             last = name.rstrip("/").rpartition("/")[2]
             if "*" in name or last in (*NODES, *renamed):
                 continue
@@ -112,6 +100,19 @@ def foreign_nodes(arguments: Sequence[str]) -> list[str]:
         if foreign:
             lines.append(f"{path}: passed over, no nodes of this rig: {', '.join(foreign)}")
     return lines
+
+
+def _document(path: Path) -> Any:
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: cannot be read: {error}") from error
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 1}" if mark else ""
+        raise UserError(f"{path}: not YAML{where}: {getattr(error, 'problem', error)}") from error
 
 
 def _sections(document: Any, above: str = "") -> Iterator[str]:

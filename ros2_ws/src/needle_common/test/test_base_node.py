@@ -95,3 +95,10 @@ def test_help_is_given_without_a_context(word: str, capsys: pytest.CaptureFixtur
 def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(Refuses, "--fast") == EXIT_BAD_INPUT
     assert "'--fast'" in capsys.readouterr().err
+
+
+def test_a_parameter_before_ros_args_is_said_to_go_after(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(Refuses, "-p", "x:=1") == EXIT_BAD_INPUT
+    assert "'-p'; it goes after --ros-args" in capsys.readouterr().err

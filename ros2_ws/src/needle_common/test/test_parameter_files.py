@@ -25,7 +25,6 @@ def given(path: Path, text: str, *more: str) -> list[str]:
         "/**: {ros__parameters: {use_sim_time: true}}",
         "/**/sim_rig: {ros__parameters: {seed: 1}}",
         "",
-        "[1, 2",
     ],
 )
 def test_known_nodes_pass_in_any_way_of_writing(tmp_path: Path, text: str) -> None:
@@ -55,6 +54,14 @@ def test_a_file_may_be_shared_with_other_nodes_which_is_said(tmp_path: Path, nam
     [line] = given(tmp_path / "p.yaml", text)
     assert "no nodes of this rig" in line
     assert name in line
+
+
+def test_a_file_that_cannot_be_read_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match=r"p\.yaml: not YAML in line 1"):
+        given(tmp_path / "p.yaml", "[1, 2")
+    path = tmp_path / "none.yaml"
+    with pytest.raises(UserError, match=r"none\.yaml: cannot be read: No such file or directory$"):
+        foreign_nodes(["node", "--ros-args", "--params-file", str(path)])
 
 
 def test_a_renamed_node_is_known(tmp_path: Path) -> None:
