@@ -41,7 +41,8 @@ operator: stands in for the person who holds the needle's switch, in simulation.
 Confirms that the needle is out, homes, enables, starts the controller, then keeps the hold until
 the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Draws the
 progress. It acts only on a device that is alone and says in device/status that it is simulated: on
-a rig that moves a real needle a person holds.
+a rig that moves a real needle a person holds. A call that is not answered is made again after 1 s,
+home and start only where the statuses do not show that they were taken.
 
 Publishes   device/hold
 Subscribes  needle/controller_status, device/status
