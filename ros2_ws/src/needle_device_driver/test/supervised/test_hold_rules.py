@@ -51,6 +51,17 @@ def test_hold_age_silence_aborts_within_the_timeout_and_takes_a_new_press(bench:
     assert bench.status.hold_owner == "a"
 
 
+def test_hold_age_a_message_counts_for_a_quarter_of_a_second(bench: Bench) -> None:
+    bench.ready()
+    bench.command(0.002, 0.1, duration=2.0)
+    arrival = bench.now
+    assert bench.supervisor.may_move(arrival + 0.249)
+    assert not bench.supervisor.may_move(arrival + 0.251)
+    bench.supervisor.drive(bench.period, arrival + 0.251)
+    assert in_state(bench, State.HOLDING)
+    assert bench.last_rule is Rule.HOLD_AGE
+
+
 def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same(bench: Bench) -> None:
     bench.ready()
     bench.command(0.002, 0.1, duration=2.0)
@@ -127,6 +138,17 @@ def test_hold_one_owner_a_crowd_of_senders_is_refused(bench: Bench) -> None:
         bench.hold(False, sender=str(number))
     bench.hold(sender="late")
     assert bench.status.hold_owner == ""
+
+
+def test_hold_one_owner_sixteen_senders_are_known(bench: Bench) -> None:
+    bench.ready(holding=False)
+    for number in range(16):
+        bench.hold(False, sender=str(number))
+    bench.hold(False, sender="16")
+    bench.hold(sender="16")
+    assert bench.status.hold_owner == ""
+    bench.hold(sender="15")
+    assert bench.status.hold_owner == "15"
 
 
 def test_hold_stamp_increases_an_old_one_keeps_nothing_alive(bench: Bench) -> None:

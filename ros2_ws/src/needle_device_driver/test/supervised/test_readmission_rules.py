@@ -176,6 +176,42 @@ def test_hold_one_owner_reset_forgets_who_is_silent(bench: Bench) -> None:
     assert has_hold(bench, "late")
 
 
+def test_hold_one_owner_reset_forgets_nobody_who_is_heard(bench: Bench) -> None:
+    bench.ready(holding=False)
+    for number in range(MAX_SENDERS):
+        bench.hold(False, sender=str(number))
+    assert bench.supervisor.reset(bench.now).success
+    bench.hold(False, sender="late")
+    bench.hold(sender="late")
+    assert not has_hold(bench, "late")
+
+
+def test_a_reset_is_refused_while_something_moves_and_forgets_nothing(bench: Bench) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(3, holding=True)
+    assert "under way" in bench.supervisor.reset(bench.now).message
+    assert has_hold(bench, "a")
+    bench.cycle(22, holding=True)
+    assert bench.results[-1].outcome == "succeeded"
+
+
+@pytest.mark.parametrize(("sooner_ns", "counts"), [(19 * MS, True), (21 * MS, False)])
+def test_hold_stamp_increases_a_press_after_a_reset_was_as_long_on_its_way(
+    bench: Bench, sooner_ns: int, counts: bool
+) -> None:
+    bench.ready(holding=False)
+    hand = Hand(bench)
+    hand.ahead_ns = FAR_AHEAD
+    hand.send(False)
+    assert bench.supervisor.reset(bench.now).success
+    hand.ahead_ns = 0
+    hand.send(False)
+    hand.ahead_ns = sooner_ns
+    hand.send(True)
+    assert has_hold(bench, "a") is counts
+
+
 def test_hold_one_owner_a_crowd_is_told_of_once(bench: Bench) -> None:
     bench.ready(holding=False)
     for number in range(300):
