@@ -40,6 +40,7 @@ LEFT_OUT = ("scripts/test",)
 LIMIT = 600.0
 READY = 60.0
 ENDS = 40.0
+INTERRUPTED = 130
 # How often to look whether nodes live [s].
 LOOK = 1.0
 
@@ -152,7 +153,9 @@ class Session:
         self._change = change
         self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
         self.said: list[str] = []
-        self._logs = Path(tempfile.mkdtemp(prefix="typed_"))
+        # Goes with the session.
+        self._kept = tempfile.TemporaryDirectory(prefix="typed_")
+        self._logs = Path(self._kept.name)
 
     def type(self, page: Path) -> None:
         """Type a page, then end what it started.
@@ -224,7 +227,7 @@ class Session:
             )
             try:
                 code = self._end_of(process, command)
-            except PageError:
+            except BaseException:
                 os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
                 raise
@@ -313,7 +316,17 @@ def fresh_clone() -> Iterator[Path]:
 
 
 def main(pages: list[str]) -> int:
-    """Type pages in a fresh clone; returns 1 where one does not work."""
+    """Type pages in a fresh clone; returns 1 where one does not work, 130 when interrupted."""
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        # The clone and what runs in it must not outlive this.
+        signal.signal(number, signal.default_int_handler)
+    try:
+        return _type_all(pages)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+def _type_all(pages: list[str]) -> int:
     environment = {
         name: value
         for name, value in os.environ.items()
