@@ -28,6 +28,32 @@ def test_command_state_only_in_holding(make_bench: type[Bench]) -> None:
     assert "DISABLED" in bench.results[-1].outcome
 
 
+def test_command_state_not_before_both_axes_are_powered(bench: Bench) -> None:
+    bench.ready()
+    bench.rotation.powered = False
+    bench.command()
+    assert bench.last_rule is Rule.COMMAND_STATE
+    assert "not powered yet" in bench.results[-1].outcome
+    assert in_state(bench, State.HOLDING)
+
+
+@pytest.mark.parametrize("which", ["insertion", "rotation"])
+def test_reply_age_no_step_begins_where_an_axis_is_silent(bench: Bench, which: str) -> None:
+    bench.ready()
+    getattr(bench, which).silent_since = bench.now - 0.101
+    bench.command()
+    assert bench.last_rule is Rule.REPLY_AGE
+    assert in_state(bench, State.HOLDING)
+
+
+def test_inner_limit_switch_no_step_begins_there(bench: Bench) -> None:
+    bench.ready()
+    bench.insertion.inner_switch = True
+    bench.command()
+    assert bench.last_rule is Rule.INNER_LIMIT_SWITCH
+    assert in_state(bench, State.HOLDING)
+
+
 def test_command_state_a_second_command_leaves_the_running_step_alone(bench: Bench) -> None:
     bench.ready()
     stamp = bench.command()

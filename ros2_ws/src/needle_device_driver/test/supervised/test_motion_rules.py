@@ -47,6 +47,29 @@ def test_following_error_of_one_axis_stops_both(bench: Bench, which: str) -> Non
     assert bench.insertion.stops == bench.rotation.stops == 1
 
 
+@pytest.mark.parametrize(("which", "bound"), [("insertion", 0.0005), ("rotation", 0.1)])
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_following_error_counts_from_its_bound_on(
+    bench: Bench, which: str, bound: float, share: float
+) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(5, holding=True)
+    axis = getattr(bench, which)
+    axis.position -= share * bound
+    bench.now += bench.period
+    bench.hold()
+    bench.supervisor.drive(bench.period, bench.now)
+    assert in_state(bench, State.FAULT if share > 1.0 else State.MOVING)
+
+
+def test_retraction_waits_for_power(bench: Bench) -> None:
+    inserted(bench)
+    bench.insertion.powered = False
+    assert "not powered yet" in bench.supervisor.retract(bench.now).message
+    assert in_state(bench, State.HOLDING)
+
+
 def inserted(bench: Bench, steps: int = 3) -> None:
     bench.ready()
     for _ in range(steps):
@@ -100,6 +123,13 @@ def test_unhomed_outward_only_by_the_last_known_depth(bench: Bench) -> None:
     assert bench.insertion.position == pytest.approx(-0.003)
     assert in_state(bench, State.HOLDING)
     assert "out" in bench.supervisor.retract(bench.now).message
+
+
+def test_unhomed_outward_only_not_from_the_switch(bench: Bench) -> None:
+    rebooted(bench)
+    bench.insertion.switch = True
+    assert "out" in bench.supervisor.retract(bench.now).message
+    assert in_state(bench, State.HOLDING)
 
 
 def test_unhomed_outward_only_ends_at_the_switch(bench: Bench) -> None:

@@ -151,8 +151,10 @@ def test_disable_stop_and_close_end_a_motion(bench: Bench) -> None:
     bench.hold(False)
     bench.hold()
     bench.command(stamp_ns=bench.ros_ns)
+    stops = bench.insertion.stops, bench.rotation.stops
     bench.supervisor.close()
     assert bench.results[-1].outcome == "aborted: the device is shut down"
+    assert (bench.insertion.stops, bench.rotation.stops) == (stops[0] + 1, stops[1] + 1)
 
 
 def test_configuration_that_fails_is_a_fault_with_the_reason(bench: Bench) -> None:
