@@ -152,10 +152,8 @@ class Session:
         self._say = say
         self._change = change
         self._nodes: dict[str, tuple[subprocess.Popen[bytes], Path]] = {}
+        self._logs = Path()
         self.said: list[str] = []
-        # Goes with the session.
-        self._kept = tempfile.TemporaryDirectory(prefix="typed_")
-        self._logs = Path(self._kept.name)
 
     def type(self, page: Path) -> None:
         """Type a page, then end what it started.
@@ -169,6 +167,11 @@ class Session:
         for block in found:
             if block.kind == FILE:
                 (self._folder / block.name).write_text(f"{block.text}\n", encoding="utf-8")
+        with tempfile.TemporaryDirectory(prefix="typed_") as logs:
+            self._logs = Path(logs)
+            self._type_blocks(page, found)
+
+    def _type_blocks(self, page: Path, found: list[Block]) -> None:
         try:
             for block in found:
                 try:
