@@ -11,6 +11,7 @@ from __future__ import annotations
 import heapq
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -24,17 +25,21 @@ _LEAST_DELAY, _MOST_DELAY = -1_000_000, 200_000_000
 _ENOUGH = 20
 
 
-Reorder = Callable[[list[SentMessage]], list[SentMessage]]
+Reorder = Callable[[list[SentMessage]], list[tuple[int, SentMessage]]]
+"""Gives messages, as sent, the times [ns] by which they come, in that order."""
 
 
 def messages_as_sent(
-    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool], reorder: Reorder
-) -> Iterator[tuple[str, int, Any]]:
-    """Yield (topic, log time [ns], message) in the order of sending; as `raw_as_sent` otherwise."""
+    path: Path,
+    wanted: Callable[[str], bool],
+    is_large: Callable[[str], bool],
+    reorder: Reorder | None = None,
+) -> Iterator[tuple[SentMessage, Any]]:
+    """Yield messages as they are and deserialized, in the order of `raw_as_sent`."""
     with BagDirectory(path) as bag:
         store = bag.typestore()
         for sent in _as_sent(bag, wanted, is_large, reorder):
-            yield sent.topic, sent.log_time, bag.deserialize(store, sent)
+            yield sent, bag.deserialize(store, sent)
 
 
 def raw_as_sent(
@@ -55,7 +60,7 @@ def raw_as_sent(
         Whether a topic's messages are not to be kept in memory, such as images; such topics are
         expected in order.
     reorder : callable, optional
-        Gives the messages that are not large other times.
+        Gives the messages that are not large another order, where senders' clocks agree.
 
     Raises
     ------
@@ -76,10 +81,15 @@ def _as_sent(
     streamed = bag.messages(lambda name: wanted(name) and is_large(name))
     if not _clocks_agree(small):
         small, streamed = list(map(_as_received, small)), map(_as_received, streamed)
-    if reorder is not None:
-        small = reorder(small)
-    small.sort(key=lambda sent: (sent.time, sent.log_time))
-    yield from heapq.merge(small, streamed, key=lambda sent: sent.time)
+        reorder = None
+    timed = (reorder or _in_order)(small)
+    both = heapq.merge(timed, ((sent.time, sent) for sent in streamed), key=itemgetter(0))
+    yield from map(itemgetter(1), both)
+
+
+def _in_order(messages: list[SentMessage]) -> list[tuple[int, SentMessage]]:
+    ordered = sorted(messages, key=lambda sent: (sent.time, sent.log_time))
+    return [(sent.time, sent) for sent in ordered]
 
 
 def _as_received(message: SentMessage) -> SentMessage:

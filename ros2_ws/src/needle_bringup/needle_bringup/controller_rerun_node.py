@@ -2,28 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
+from needle_bringup.bag_order import SentMessage, messages_as_sent
 from needle_bringup.parameters import plain_value
 from needle_bringup.rerun import Output, stored
 from needle_common.conversions import to_nanoseconds, values_of
 from needle_common.errors import UserError
 from needle_controller import conversions
+from needle_controller.heard_messages import HeardMessage
 from needle_controller.joint_history import JointSample
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.steering_types import Action, PublishUpdate, SendStep, State
 
 _STEERING = (State.STEERING.value, State.WAITING_FOR_TIP.value)
+_LONGER_THAN_ANY_TIMEOUT = 1e6
+"""[s]"""
 
 
 class ControllerStage:
     """Today's step protocol, estimator and law on a bag's messages.
 
-    The device is the recorded one: its answer to a step counts as the answer to whatever step is
-    under way, so that one other decision does not end the comparison. Watchdogs do not run: they
-    live on time, and a bag has none.
+    The device is the recorded one: its joints and answers are those to other commands, maybe, and
+    a step that is answered led where the joints say; so one other decision does not end the
+    comparison. Watchdogs run out where the recorded ones did.
 
     Parameters
     ----------
@@ -31,8 +37,10 @@ class ControllerStage:
         The node's, as the run began.
     node : str
         The node's full name in the bag, whose changes of parameters are taken over.
-    unheard : frozenset of int
-        Stamps of tips that came while no tip was wanted (`bag_hearing.unheard_tips`) [ns].
+    ends : mapping of int to JointSample
+        Stamp of a command [ns] to where it led (`step_ends`).
+    unheard : frozenset of HeardMessage
+        What the recorded controller did not hear (`bag_hearing.unheard_messages`).
 
     Attributes
     ----------
@@ -43,25 +51,30 @@ class ControllerStage:
     """
 
     def __init__(
-        self, parameters: PlaneControllerParameters, node: str, unheard: frozenset[int]
+        self,
+        parameters: PlaneControllerParameters,
+        node: str,
+        ends: Mapping[int, JointSample],
+        unheard: frozenset[HeardMessage],
     ) -> None:
         self._parameters = parameters
         self._node = node
-        self._unheard = unheard
         self._steering = parameters.make_steering()
-        self._steering.trusts_device = True
-        self._sent: int | None = None
+        self._ends = ends
+        self._unheard = unheard
+        self._steady = 0.0
+        self._recorded_trips = 0
         self._recorded_state = ""
         self.tips = 0
         self.notes: list[str] = []
-        self._takers: dict[str, Callable[[Any], Iterable[Action]]] = {
+        self._takers: dict[str, Callable[[Any, int], Iterable[Action]]] = {
             "joint_states": self._take_joints,
-            "needle/tip": self._take_tip,
-            "needle/tip_pose": lambda m: self._steering.on_tip_pose(
+            "needle/tip": lambda m, _: self._steering.on_tip(conversions.to_tip(m)),
+            "needle/tip_pose": lambda m, _: self._steering.on_tip_pose(
                 conversions.to_tip_covariance(m)
             ),
             "device/result": self._take_result,
-            "device/status": lambda m: self._steering.on_device(conversions.to_device_status(m)),
+            "device/status": lambda m, _: self._steering.on_device(conversions.to_device_status(m)),
             "target_plane": self._take_plane,
             "needle/controller_status": self._take_status,
             "/parameter_events": self._take_parameters,
@@ -72,42 +85,40 @@ class ControllerStage:
         """Relative names of what it takes, and one absolute."""
         return frozenset(self._takers)
 
-    def take(self, topic: str, log_time: int, message: Any) -> list[Output]:
-        """Take a message received at `log_time` [ns]; return what it led to."""
+    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Take a message of a topic, by its relative name; return what it led to."""
+        if HeardMessage(topic, sent.time) in self._unheard:
+            return []
         outputs = []
-        for action in self._takers[topic](message):
+        for action in self._takers[topic](message, sent.time):
             stamp, messages = 0, {}
             if isinstance(action, SendStep):
-                stamp = self._sent = action.stamp_ns
+                stamp = action.stamp_ns
                 messages = {"device/joint_trajectory": conversions.to_trajectory(action)}
             elif isinstance(action, PublishUpdate):
                 self.tips += 1
                 stamp = action.stamp_ns
                 messages = _messages(action)
             outputs += [
-                Output(name, log_time, stamp, stored(content)) for name, content in messages.items()
+                Output(name, sent.log_time, stamp, stored(content))
+                for name, content in messages.items()
             ]
         return outputs
 
-    def _take_joints(self, message: Any) -> Iterable[Action]:
+    def _take_joints(self, message: Any, sent_ns: int) -> Iterable[Action]:
         try:
-            sample = conversions.to_joint_sample(message)
+            sample = conversions.to_joint_sample(message, sent_ns)
         except UserError:
             return ()
-        # rclpy gives plain floats where rosbags gives numpy's.
-        insertion, rotation = float(sample.insertion), float(sample.rotation)
-        return self._steering.on_joints(JointSample(sample.stamp_ns, insertion, rotation))
+        return self._steering.on_joints(sample)
 
-    def _take_tip(self, message: Any) -> Iterable[Action]:
-        tip = conversions.to_tip(message)
-        return () if tip.stamp_ns in self._unheard else self._steering.on_tip(tip)
+    def _take_result(self, message: Any, sent_ns: int) -> Iterable[Action]:
+        stamp = to_nanoseconds(message.stamp)
+        if (end := self._ends.get(stamp)) is not None:
+            self._steering.on_recorded_step(stamp, end)
+        return self._steering.on_result(stamp, message.frame_id, sent_ns)
 
-    def _take_result(self, message: Any) -> Iterable[Action]:
-        stamp = to_nanoseconds(message.stamp) if self._sent is None else self._sent
-        self._sent = None
-        return self._steering.on_result(stamp, message.frame_id)
-
-    def _take_plane(self, message: Any) -> Iterable[Action]:
+    def _take_plane(self, message: Any, _: int) -> Iterable[Action]:
         try:
             plane = conversions.to_plane(message)
             self._parameters.check_plane(plane)
@@ -117,11 +128,18 @@ class ControllerStage:
         self._steering.control.plane = plane
         return ()
 
-    def _take_status(self, message: Any) -> Iterable[Action]:
-        """Start and stop where the recorded controller did: calls of services are in no bag."""
+    def _take_status(self, message: Any, _: int) -> Iterable[Action]:
+        """Start, stop and lose patience where the recorded controller did.
+
+        Calls of services and the steady clock are in no bag.
+        """
         values = values_of(message)
         before, now = self._recorded_state, values.get("state", "")
         self._recorded_state = now
+        trips = values.get("watchdog_trips", "")
+        if trips.isdecimal() and int(trips) > self._recorded_trips:
+            self._recorded_trips = int(trips)
+            return self._wait_too_long()
         if now in _STEERING and before not in _STEERING:
             reply, actions = self._steering.on_start()
             if not reply.success:
@@ -131,7 +149,11 @@ class ControllerStage:
             return self._steering.on_stop()[1]
         return ()
 
-    def _take_parameters(self, message: Any) -> Iterable[Action]:
+    def _wait_too_long(self) -> list[Action]:
+        begin, self._steady = self._steady, self._steady + _LONGER_THAN_ANY_TIMEOUT
+        return [*self._steering.on_time(begin), *self._steering.on_time(self._steady)]
+
+    def _take_parameters(self, message: Any, _: int) -> Iterable[Action]:
         if message.node != self._node:
             return ()
         known = {field.name for field in dataclasses.fields(self._parameters)}
@@ -149,6 +171,28 @@ class ControllerStage:
             values.change_steering(self._steering, self._parameters)
             self._parameters = values
         return ()
+
+
+def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
+    """Return where each command led that was answered: the joints sent next, by its stamp [ns].
+
+    Raises
+    ------
+    UserError
+        If the bag is broken.
+    """
+    joints, results = namespace + "joint_states", namespace + "device/result"
+    ends: dict[int, JointSample] = {}
+    answered: list[int] = []
+    for sent, message in messages_as_sent(path, {joints, results}.__contains__, lambda _: False):
+        if sent.topic == results:
+            answered.append(to_nanoseconds(message.stamp))
+            continue
+        with contextlib.suppress(UserError):
+            sample = conversions.to_joint_sample(message, sent.time)
+            ends.update(dict.fromkeys(answered, sample))
+            answered.clear()
+    return ends
 
 
 def _messages(action: PublishUpdate) -> dict[str, Any]:

@@ -1,11 +1,12 @@
-"""A bag's inputs through today's code: one pass over the bag, recorded outputs beside today's."""
+"""A bag's inputs through today's code, recorded outputs beside today's."""
 
 from __future__ import annotations
 
 import array
 import dataclasses
+import functools
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,15 +16,13 @@ from tqdm import tqdm
 
 from needle_bringup.bag_hearing import as_heard
 from needle_bringup.bag_images import TOPICS as IMAGE_TOPICS
-from needle_bringup.bag_order import messages_as_sent
+from needle_bringup.bag_order import Reorder, SentMessage, messages_as_sent
 from needle_bringup.bag_reader import Run, Series, nanoseconds
 from needle_bringup.comparison import Record, members
 from needle_bringup.run_summary import reduced_states, target_offset
 
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
-# Tells when the tips were heard.
-HEARD = "needle/estimate"
 TYPES: Mapping[str, str] = {
     "needle/tip": "geometry_msgs/msg/PointStamped",
     "needle/tip_pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
@@ -87,8 +86,8 @@ class Stage(Protocol):
         """Names of what it takes, relative to the rig's namespace, or absolute."""
         ...
 
-    def take(self, topic: str, log_time: int, message: Any) -> list[Output]:
-        """Take a message received at `log_time` [ns]; return what it led to."""
+    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Take a message of a topic, by its relative name; return what it led to."""
         ...
 
 
@@ -153,21 +152,19 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
         watched.update(TIP_TOPICS)
     if controller is not None:
         watched.update(topic for topic in TYPES if topic not in TIP_TOPICS)
-    stages = [stage for stage in (tracker, controller) if stage is not None]
     recorded: list[Record] = []
     outputs: list[Output] = []
     exposed: set[int] = set()
     without_images = last_time = 0
-    for topic, log_time, message in _inputs(run, watched, stages):
-        last_time = log_time
+    for topic, sent, message in _inputs(run, watched | _topics(tracker)):
+        last_time = max(last_time, sent.log_time)
         if IMAGE_TOPICS.get(topic) == "left":
             exposed.add(nanoseconds(message.header.stamp))
         if topic in watched:
             stamp = nanoseconds(message.header.stamp)
             recorded.append(Record(topic, stamp, dict(members(message))))
-        for stage in stages:
-            if topic in stage.topics:
-                outputs += stage.take(topic, log_time, message)
+        if tracker is not None and topic in tracker.topics:
+            outputs += tracker.take(topic, sent, message)
     if tracker is not None:
         outputs += tracker.finish(last_time)
         kept = [r for r in recorded if r.topic not in TIP_TOPICS or r.stamp in exposed]
@@ -175,6 +172,9 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
             record.topic == POSE for record in kept
         )
         recorded = kept
+    if controller is not None:
+        for topic, sent, message in _inputs(run, controller.topics, _in_hearing_order(run)):
+            outputs += controller.take(topic, sent, message)
     today = [
         Record(o.topic, o.stamp, dict(members(o.message)))
         for o in _recordable(recorded, outputs, last_time)
@@ -203,7 +203,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
     answered = {answer.stamp for answer in answers}
     recorded = set(run.tips.stamps.tolist())
     outputs: list[Output] = []
-    for topic, log_time, message in _inputs(run, {HEARD}, [controller]):
+    for topic, sent, message in _inputs(run, controller.topics, _in_hearing_order(run)):
         stamp = nanoseconds(message.header.stamp) if topic in TIP_TOPICS else 0
         if topic not in TIP_TOPICS or stamp not in answered:
             taken = {topic: message}
@@ -213,7 +213,7 @@ def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Out
             taken = {topic: today.get((topic, stamp))}
         for name, content in taken.items():
             if name in controller.topics and content is not None:
-                outputs += controller.take(name, log_time, content)
+                outputs += controller.take(name, sent, content)
     return outputs
 
 
@@ -260,15 +260,21 @@ def _recordable(
             yield output
 
 
-def _inputs(run: Run, watched: set[str], stages: Sequence[Stage]) -> Iterator[tuple[str, int, Any]]:
-    """Yield (relative topic, log time, message) of what is watched or taken, with a bar."""
-    relative = watched.union(*(stage.topics for stage in stages))
+def _topics(stage: Stage | None) -> frozenset[str]:
+    return frozenset() if stage is None else stage.topics
+
+
+def _in_hearing_order(run: Run) -> Reorder:
+    return functools.partial(as_heard, namespace=run.namespace)
+
+
+def _inputs(
+    run: Run, relative: Set[str], reorder: Reorder | None = None
+) -> Iterator[tuple[str, SentMessage, Any]]:
+    """Yield (relative topic, as sent, message) of these topics, with a bar."""
     names = {name if name.startswith("/") else run.namespace + name: name for name in relative}
     messages = messages_as_sent(
-        run.path,
-        lambda name: name in names,
-        lambda name: names[name] in IMAGE_TOPICS,
-        lambda sent: as_heard(sent, run.namespace),
+        run.path, lambda name: name in names, lambda name: names[name] in IMAGE_TOPICS, reorder
     )
     bar = tqdm(
         messages,
@@ -278,5 +284,5 @@ def _inputs(run: Run, watched: set[str], stages: Sequence[Stage]) -> Iterator[tu
         leave=False,
         disable=not sys.stderr.isatty(),
     )
-    for topic, log_time, message in bar:
-        yield names[topic], log_time, message
+    for sent, message in bar:
+        yield names[sent.topic], sent, message

@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 import yaml
 
 from needle_bringup.bag_files import read_messages
-from needle_bringup.bag_hearing import unheard_tips
+from needle_bringup.bag_hearing import unheard_messages
 from needle_bringup.bag_reader import Run, read_run
 from needle_bringup.bag_writer import refuse_existing_bag
 from needle_bringup.comparison import compare
-from needle_bringup.controller_rerun_node import ControllerStage
+from needle_bringup.controller_rerun_node import ControllerStage, step_ends
 from needle_bringup.parameters import plain_value
 from needle_bringup.rerun import (
     TIP_TOPICS,
@@ -222,7 +222,9 @@ def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
 
 def _controller(run: Run, node: Node) -> ControllerStage:
     parameters = node.parameters(PlaneControllerParameters)
-    return ControllerStage(parameters, node.name, unheard_tips(run))
+    ends = step_ends(run.path, run.namespace)
+    unheard = unheard_messages(run.path, run.namespace)
+    return ControllerStage(parameters, node.name, ends, unheard)
 
 
 def _summary(tracker: TrackerStage | None, controller: ControllerStage, node: Node) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from needle_bringup.bag_images import SIDES, TOPICS, plain_image
+from needle_bringup.bag_order import SentMessage
 from needle_bringup.rerun import Output, stored
 from needle_common.conversions import to_nanoseconds
 from needle_tracker import conversions
@@ -54,8 +55,9 @@ class TrackerStage:
         """Relative names of what it takes."""
         return frozenset(self._takers)
 
-    def take(self, topic: str, log_time: int, message: Any) -> list[Output]:
-        """Take a message received at `log_time` [ns]; return what it led to."""
+    def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
+        """Take a message of a topic, by its relative name; return what it led to."""
+        log_time = sent.log_time
         return self._publish(self._takers[topic](message, log_time * 1e-9), log_time)
 
     def finish(self, log_time: int) -> list[Output]:

@@ -1,49 +1,100 @@
 from __future__ import annotations
 
+from pathlib import Path
+
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bringup.bag_hearing import as_heard
+from needle_bringup.bag_copy import BagCopy, standard_topic
+from needle_bringup.bag_hearing import as_heard, unheard_messages
 from needle_bringup.bag_order import SentMessage
+from needle_controller.heard_messages import HeardMessages
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
-HEADER = "std_msgs/msg/Header"
-MILLISECOND = 1_000_000
-SECOND = 1000 * MILLISECOND
+HEADER, STATUS = "std_msgs/msg/Header", "diagnostic_msgs/msg/DiagnosticStatus"
+PAIR = STORE.types["diagnostic_msgs/msg/KeyValue"]
 
 
-def sent(time_ms: float, topic: str, stamp: int = 0) -> SentMessage:
-    time = STORE.types["builtin_interfaces/msg/Time"](sec=0, nanosec=stamp)
-    data = bytes(STORE.serialize_cdr(STORE.types[HEADER](stamp=time, frame_id=""), HEADER))
-    when = SECOND + round(time_ms * MILLISECOND)
-    return SentMessage(when, when, f"/rig/{topic}", HEADER, data)
+def sent(time: int, topic: str) -> SentMessage:
+    stamp = STORE.types["builtin_interfaces/msg/Time"](sec=0, nanosec=0)
+    data = bytes(STORE.serialize_cdr(STORE.types[HEADER](stamp=stamp, frame_id=""), HEADER))
+    return SentMessage(time, time, f"/rig/{topic}", HEADER, data)
 
 
-def order(*messages: SentMessage) -> list[str]:
-    heard = sorted(as_heard(list(messages), "/rig/"), key=lambda m: (m.time, m.log_time))
-    return [m.topic.rsplit("/", maxsplit=1)[-1] for m in heard]
+def status(time: int, *heard: tuple[str, int]) -> SentMessage:
+    """What the controller said; `("joints", 7)` is that it had heard the joints sent at 7."""
+    told = HeardMessages()
+    for topic, sent_ns in heard:
+        told.add(topic, sent_ns)
+    values = [PAIR(key="heard", value=told.take_text())]
+    message = STORE.types[STATUS](level=0, name="", message="", hardware_id="", values=values)
+    data = bytes(STORE.serialize_cdr(message, STATUS))
+    return SentMessage(time, time, "/rig/needle/controller_status", STATUS, data)
 
 
-def test_a_tip_that_was_used_was_heard_after_the_result_though_sent_before() -> None:
-    result = sent(10, "device/result")
-    tip = sent(9, "needle/tip", stamp=7)
-    asked = sent(20, "needle/controller_status")
-    estimate = sent(25, "needle/estimate", stamp=7)
-    assert order(tip, result, asked, estimate) == ["result", "controller_status", "tip", "estimate"]
+def order(*messages: SentMessage) -> list[tuple[str, int]]:
+    heard = as_heard(list(messages), "/rig/")
+    assert [time for time, _ in heard] == sorted(time for time, _ in heard)
+    assert all(time >= message.time for time, message in heard)
+    return [(message.topic.rsplit("/", maxsplit=1)[-1], message.time) for _, message in heard]
 
 
-def test_tips_keep_their_order() -> None:
-    used, later = sent(9, "needle/tip", stamp=7), sent(11, "needle/tip", stamp=8)
-    estimate = sent(25, "needle/estimate", stamp=7)
-    heard = [m for m in as_heard([used, later, estimate], "/rig/") if m.topic.endswith("tip")]
-    assert heard[0].data == used.data
-    assert heard[0].time <= heard[1].time
-
-
-def test_nothing_is_heard_before_it_was_sent() -> None:
-    messages = [
-        sent(10, "device/result"),
-        sent(12, "needle/tip", stamp=7),
-        sent(13, "needle/controller_status"),
-        sent(11, "needle/estimate", stamp=7),
+def test_the_order_is_that_of_hearing() -> None:
+    found = order(
+        sent(10, "joints"),
+        sent(11, "result"),
+        sent(12, "tip"),
+        sent(20, "joints"),
+        status(30, ("tip", 12), ("joints", 10)),
+        sent(40, "joints"),
+        status(50, ("joints", 20), ("result", 11), ("joints", 40)),
+    )
+    assert found == [
+        ("tip", 12),
+        ("joints", 10),
+        ("controller_status", 30),
+        ("joints", 20),
+        ("result", 11),
+        ("joints", 40),
+        ("controller_status", 50),
     ]
-    assert all(heard.time >= heard.log_time for heard in as_heard(messages, "/rig/"))
+
+
+def test_what_the_last_status_does_not_tell_was_heard_after_it() -> None:
+    found = order(
+        sent(10, "joints"),
+        sent(15, "joints"),
+        sent(16, "other"),
+        status(20, ("joints", 10)),
+        sent(30, "joints"),
+    )
+    assert found == [
+        ("joints", 10),
+        ("other", 16),
+        ("controller_status", 20),
+        ("joints", 15),
+        ("joints", 30),
+    ]
+
+
+def test_of_bags_that_do_not_tell_the_order_is_that_of_sending() -> None:
+    assert [time for _, time in order(status(20), sent(10, "joints"))] == [10, 20]
+
+
+def test_what_was_sent_before_the_last_that_was_heard_and_is_not_told_was_never_heard(
+    tmp_path: Path,
+) -> None:
+    bag = BagCopy(tmp_path / "bag", "jazzy", {})
+    for message in (
+        sent(10, "joints"),
+        sent(11, "other"),
+        sent(20, "joints"),
+        status(25, ("joints", 20)),
+        sent(30, "joints"),
+        sent(40, "joints"),
+        status(45, ("joints", 40)),
+        sent(50, "joints"),
+    ):
+        topic = standard_topic(message.topic, message.type_name)
+        bag.put(topic, message.data, message.time, message.time)
+    bag.close()
+    assert unheard_messages(tmp_path / "bag", "/rig/") == {("joints", 10), ("joints", 30)}

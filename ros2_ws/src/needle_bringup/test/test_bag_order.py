@@ -36,8 +36,8 @@ def write(directory: Path, delay_of: Callable[[str, int], int], *, count: int = 
 
 
 def order(bag: Path) -> list[str]:
-    found = messages_as_sent(bag, lambda _: True, LARGE.__eq__, list)
-    return [topic for topic, _, _ in found]
+    found = messages_as_sent(bag, lambda _: True, LARGE.__eq__)
+    return [sent.topic for sent, _ in found]
 
 
 def test_a_late_question_still_comes_before_its_answer(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from needle_bringup.bag_hearing import unheard_tips
 from needle_bringup.bag_reader import Run, Series, Status
 from needle_bringup.innovation import gate_room, innovations, missed_tips, refused_tips
 
@@ -141,4 +140,3 @@ def test_refused_and_missed_tips_are_found() -> None:
     run = dataclasses.replace(whole, estimate=estimate)
     assert refused_tips(run).tolist() == [7 * 10**9, 9 * 10**9]
     assert missed_tips(run).tolist() == [3 * 10**9, 4 * 10**9]
-    assert unheard_tips(run) == {6 * 10**9}

@@ -35,8 +35,8 @@ INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
 _LEVELS = {State.FAULT: Level.ERROR, State.WAITING_FOR_TIP: Level.WARN}
 
 
-def to_joint_sample(message: JointState) -> JointSample:
-    """Return the two joints of a JointState, found by name.
+def to_joint_sample(message: JointState, sent_ns: int) -> JointSample:
+    """Return the two joints of a JointState, found by name, with the time of its sending [ns].
 
     Raises
     ------
@@ -50,7 +50,9 @@ def to_joint_sample(message: JointState) -> JointSample:
     insertion, rotation = position[INSERTION_JOINT], position[ROTATION_JOINT]
     if not (np.isfinite(insertion) and np.isfinite(rotation)):
         raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
-    return JointSample(to_nanoseconds(message.header.stamp), insertion, rotation)
+    # rclpy gives plain floats where rosbags gives numpy's.
+    stamp_ns = to_nanoseconds(message.header.stamp)
+    return JointSample(stamp_ns, float(insertion), float(rotation), sent_ns)
 
 
 def to_tip(message: PointStamped) -> TipMeasurement:

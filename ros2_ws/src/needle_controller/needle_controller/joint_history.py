@@ -30,11 +30,14 @@ class JointSample:
         Insertion of the base [m].
     rotation : float
         Rotation of the base [rad], not wrapped.
+    sent_ns : int
+        When the device sent it, on its own clock [ns]; 0 where nobody knows.
     """
 
     stamp_ns: int
     insertion: float
     rotation: float
+    sent_ns: int = 0
 
     def is_at(self, other: JointSample, insertion: float, rotation: float) -> bool:
         """Return whether the joints are within tolerances [m], [rad] of where they were."""

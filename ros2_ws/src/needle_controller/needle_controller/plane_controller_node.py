@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 import time
 from collections import deque
@@ -45,6 +46,7 @@ from needle_common.partners_node import (
     unrecorded,
 )
 from needle_controller import conversions
+from needle_controller.heard_messages import HeardMessages
 from needle_controller.parameters import PlaneControllerParameters
 from needle_controller.steering_types import Action, Log, PublishUpdate, SendStep, State
 
@@ -91,6 +93,7 @@ class PlaneControllerNode(Node):
         values = self._settings.values
         self._steering_has = values
         self._steering = values.make_steering()
+        self._heard = HeardMessages()
         self._logged: dict[str, float] = {}
         self._bad_joints = 0
         self._joints_complaint = ""
@@ -188,9 +191,16 @@ class PlaneControllerNode(Node):
             return missing
         return [f"service call {self.resolve_service_name('~/start')}"]
 
-    def _on_joints(self, message: JointState) -> None:
+    def _hear(self, topic: str, info: dict[str, int]) -> int:
+        """Note what is heard; return when it was sent [ns]."""
+        sent_ns = info["source_timestamp"]
+        self._heard.add(topic, sent_ns)
+        return sent_ns
+
+    def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
+        sent_ns = self._hear("joint_states", info)
         try:
-            sample = conversions.to_joint_sample(message)
+            sample = conversions.to_joint_sample(message, sent_ns)
         except UserError as error:
             self._bad_joints += 1
             self._joints_complaint = str(error)
@@ -199,16 +209,21 @@ class PlaneControllerNode(Node):
         self._joints_complaint = ""
         self._do(self._steering.on_joints(sample))
 
-    def _on_tip(self, message: PointStamped) -> None:
+    def _on_tip(self, message: PointStamped, info: dict[str, int]) -> None:
+        self._hear("needle/tip", info)
         self._do(self._steering.on_tip(conversions.to_tip(message)))
 
-    def _on_tip_pose(self, message: PoseWithCovarianceStamped) -> None:
+    def _on_tip_pose(self, message: PoseWithCovarianceStamped, info: dict[str, int]) -> None:
+        self._hear("needle/tip_pose", info)
         self._do(self._steering.on_tip_pose(conversions.to_tip_covariance(message)))
 
-    def _on_result(self, message: Header) -> None:
-        self._do(self._steering.on_result(to_nanoseconds(message.stamp), message.frame_id))
+    def _on_result(self, message: Header, info: dict[str, int]) -> None:
+        sent_ns = self._hear("device/result", info)
+        stamp_ns = to_nanoseconds(message.stamp)
+        self._do(self._steering.on_result(stamp_ns, message.frame_id, sent_ns))
 
-    def _on_device(self, message: DiagnosticStatus) -> None:
+    def _on_device(self, message: DiagnosticStatus, info: dict[str, int]) -> None:
+        self._hear("device/status", info)
         self._do(self._steering.on_device(conversions.to_device_status(message)))
 
     def _on_plane(self, message: PoseStamped, info: dict[str, int]) -> None:
@@ -217,6 +232,7 @@ class PlaneControllerNode(Node):
             # Of the other subscription.
             return
         self._planes_seen.append(sent_at)
+        self._hear("target_plane", info)
         try:
             plane = conversions.to_plane(message)
             self._settings.values.check_plane(plane)
@@ -279,10 +295,12 @@ class PlaneControllerNode(Node):
         self._diagnostics.set("target_plane", _health(self._plane_complaint, {}))
         diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
         self._diagnostics.set("steering", diagnostic)
-        if diagnostic != self._published:
+        if diagnostic != self._published or self._heard.is_full:
             self._published = diagnostic
             name = signature(self)
-            self._status.publish(to_diagnostic_status(f"{name}: steering", name, diagnostic))
+            values = {**diagnostic.values, "heard": self._heard.take_text()}
+            told = dataclasses.replace(diagnostic, values=values)
+            self._status.publish(to_diagnostic_status(f"{name}: steering", name, told))
 
 
 def _health(complaint: str, values: dict[str, str]) -> Diagnostic:

@@ -69,9 +69,6 @@ class Steering:
         Of the plane, at the last used tip.
     intake : TipIntake
         Tips and joints.
-    trusts_device : bool
-        Whether a step that succeeded is done, wherever the joints are: of a recording, whose device
-        ran other steps, and whose controller has said which tips were exposed after them.
     """
 
     def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
@@ -87,7 +84,6 @@ class Steering:
         self.insertion = 0.0
         self.reach: Reachability | None = None
         self.intake = TipIntake()
-        self.trusts_device = False
         self._retraction = RetractionWatch()
         self._device: DeviceStatus | None = None
         self._ready_step: SendStep | None = None
@@ -170,15 +166,25 @@ class Steering:
         self.intake.covariances.add(covariance)
         return self._use_tip()
 
-    def on_result(self, stamp_ns: int, text: str) -> list[Action]:
-        """Take the driver's answer to a command; answers to other commands are not ours."""
+    def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:
+        """Take the driver's answer to a command; answers to other commands are not ours.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The command's stamp [ns].
+        text : str
+            "succeeded", or why not.
+        sent_ns : int
+            When the device sent it, on its own clock [ns]; 0 where nobody knows.
+        """
         if self._sent is None or stamp_ns != self._sent.stamp_ns:
             return []
         step, self._sent = self._sent, None
         if not self._steering:
             return []
         if text == "succeeded":
-            self._followed = StepWatch(step, trusted=self.trusts_device)
+            self._followed = StepWatch(step, sent_ns)
             return [*self._ask(), *self._watch_step(None), *self._use_tip()]
         actions: list[Action] = [Log("warning", f"step {self.step + 1} {text}", "abort")]
         self.reason = f"step {text}"
@@ -186,6 +192,19 @@ class Steering:
         if why:
             return actions + self._leave(State.FAULT, why, "error")
         return actions + self._ask() + self._use_tip()
+
+    def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
+        """Take that the device made another step in place of the one under way: of a recording.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The other command's stamp [ns].
+        end : JointSample
+            Where it led.
+        """
+        if self._sent is not None:
+            self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
     def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
@@ -274,7 +293,7 @@ class Steering:
             self.awaiting = Awaiting.HOLD
             return []
         latest = self.intake.joints.latest
-        if not (self.trusts_device or self._followed is not None or latest is None):
+        if self._followed is None and latest is not None:
             # Wherever a motion ended, it was over by then.
             self.intake.want_after(latest.stamp_ns)
         self.awaiting = Awaiting.TIP

@@ -12,7 +12,7 @@ ARRIVED_INSERTION, ARRIVED_ROTATION = 1e-5, 1e-2
 REST_INSERTION, REST_ROTATION = 2e-6, 1e-4
 """What a joint at rest may change by [m], [rad]."""
 _STANDSTILL = 5
-"""Samples at one place, after the answer, which say that the joints do not go on."""
+"""Samples at one place, sent after the answer, which say that the joints do not go on."""
 
 
 class Followed(enum.Enum):
@@ -26,12 +26,15 @@ class Followed(enum.Enum):
 class StepWatch:
     """Judges a step that is said to have succeeded by the joints' own stamps.
 
+    Joints that were sent before the answer, however late they are heard, do not show a standstill:
+    they may be of before the motion.
+
     Parameters
     ----------
     step : SendStep
         What was sent.
-    trusted : bool
-        Whether it counts as followed without a look at the joints.
+    answered_ns : int
+        When the device sent its answer, on its own clock [ns].
 
     Attributes
     ----------
@@ -42,8 +45,8 @@ class StepWatch:
         stood elsewhere [ns].
     """
 
-    def __init__(self, step: SendStep, *, trusted: bool) -> None:
-        self._trusted = trusted
+    def __init__(self, step: SendStep, answered_ns: int) -> None:
+        self._answered_ns = answered_ns
         self.step = step
         self.end_ns = step.stamp_ns
         self._standing: list[JointSample] = []
@@ -59,8 +62,6 @@ class StepWatch:
             What has come since the last look.
         """
         step = self.step
-        if self._trusted:
-            return Followed.ARRIVED
         for known in joints.after(step.stamp_ns):
             # Beyond is arrived, too: a needle pushed by hand does not stop to the micrometre.
             short = step.insertion - known.insertion
@@ -69,7 +70,7 @@ class StepWatch:
             ):
                 self.end_ns = known.stamp_ns
                 return Followed.ARRIVED
-        if sample is None:
+        if sample is None or sample.sent_ns < self._answered_ns:
             return Followed.NOT_YET
         standing = self._standing
         if standing and not sample.is_at(standing[0], REST_INSERTION, REST_ROTATION):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from needle_controller.joint_history import JointSample
 from needle_controller.steering_types import Awaiting, PublishUpdate, State
 from needle_controller.tip_gate import TipMeasurement
 
@@ -121,6 +122,27 @@ def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     rig.steering.on_device(HELD)
     again = sent(rig.expose())
     assert again.insertion == pytest.approx(0.0003 + 0.001)
+
+
+def test_joints_that_are_heard_late_do_not_show_a_standstill() -> None:
+    rig = Rig()
+    step = sent(rig.expose())
+    answered = 10**18
+    for _ in range(10):
+        rig.now += TICK
+        rig.steering.on_joints(JointSample(rig.now, 0.0, 0.0, sent_ns=answered - 1))
+    rig.steering.on_result(step.stamp_ns, "succeeded", answered)
+    for _ in range(10):
+        rig.now += TICK
+        sample = JointSample(rig.now, 0.0, 0.0, sent_ns=answered - 1)
+        assert rig.steering.on_joints(sample) == []
+    assert none_sent(rig.steering.on_tip(rig.measured()))
+    for share in (0.5, 1.0):
+        rig.now += TICK
+        place = share * step.insertion, share * step.rotation
+        rig.steering.on_joints(JointSample(rig.now, *place, sent_ns=answered))
+    assert rig.steering.step == 1
+    assert rig.steering.tip_after_ns == rig.now
 
 
 def test_answers_to_other_commands_are_not_ours() -> None:
