@@ -67,7 +67,7 @@ _needle_env() {
         */needle_fastdds.xml | */needle_fastdds_network.xml) unset FASTRTPS_DEFAULT_PROFILES_FILE ;;
     esac
     if [ ! -f "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ]; then
-        export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_common/needle_common/$profiles"
+        export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_common/needle_common/process/$profiles"
     fi
 }
 

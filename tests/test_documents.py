@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from needle_common.ros_domain import own_domain
-from needle_tracker.calibration_session import parse_session
+from needle_common.process.ros_domain import own_domain
+from needle_tracker.calibrating.calibration_session import parse_session
 from typed_pages import PAGES, ROOT, PageError, Session, blocks
 
 SHORT_MM = 6
@@ -68,8 +68,8 @@ def draw_session(folder: Path) -> None:
     """Draw the images that docs/calibration.md asks for, of the places in its session file."""
     sys.path.insert(0, str(ROOT / "ros2_ws/src/needle_tracker/test"))
     try:
-        session = importlib.import_module("calibration.session")
-        rig = importlib.import_module("calibration.synthetic_rig").TrueRig
+        session = importlib.import_module("calibrating.session")
+        rig = importlib.import_module("calibrating.synthetic_rig").TrueRig
     finally:
         sys.path.pop(0)
     (text,) = (

@@ -1,4 +1,4 @@
-"""The contract that keeps ROS in the shell modules must be able to fail."""
+"""The contract that keeps ROS in its rooms must be able to fail."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from grimp import ImportGraph
 
-from import_walls import RosShellContract
+from import_walls import RosRoomContract
 
 CONFIGURATION = Path(__file__).parents[1] / "pyproject.toml"
 
@@ -19,7 +19,7 @@ def broken(importer: str, imported: str) -> list[str]:
         graph.add_module(module, is_squashed="." not in module)
     graph.add_import(importer=importer, imported=imported, line_number=1, line_contents="")
     options: dict[str, Any] = {"packages": ["needle_sim", "needle_common"]}
-    contract = RosShellContract(name="wall", session_options={}, contract_options=options)
+    contract = RosRoomContract(name="wall", session_options={}, contract_options=options)
     found: list[str] = contract.check(graph, verbose=False).metadata["broken"]
     return found
 
@@ -27,13 +27,14 @@ def broken(importer: str, imported: str) -> list[str]:
 @pytest.mark.parametrize(
     ("importer", "imported"),
     [
-        ("needle_sim.plant", "rclpy"),
-        ("needle_sim.any_new_module", "geometry_msgs"),
-        ("needle_sim.plant", "std_srvs"),
-        ("needle_sim.plant", "rcl_interfaces"),
-        # Through a shell module, ROS would be imported all the same.
-        ("needle_sim.plant", "needle_sim.conversions"),
-        ("needle_sim.plant", "needle_common.base_node"),
+        ("needle_sim.needle.plant", "rclpy"),
+        ("needle_sim.needle.any_new_module", "geometry_msgs"),
+        ("needle_sim.drives.ros", "rclpy"),
+        ("needle_sim.needle.plant", "std_srvs"),
+        ("needle_sim.needle.plant", "rcl_interfaces"),
+        # Through a module of the room, ROS would be imported all the same.
+        ("needle_sim.needle.plant", "needle_sim.ros.conversions"),
+        ("needle_sim.needle.plant", "needle_common.ros.base_node"),
     ],
 )
 def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, imported: str) -> None:
@@ -43,12 +44,12 @@ def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, impor
 @pytest.mark.parametrize(
     ("importer", "imported"),
     [
-        ("needle_sim.sim_rig_node", "rclpy"),
-        ("needle_sim.conversions", "geometry_msgs"),
-        ("needle_sim.parameters", "needle_common.parameters"),
-        ("needle_sim.sim_rig_node", "needle_sim.conversions"),
-        ("needle_sim.plant", "numpy"),
-        ("needle_sim.plant", "needle_common.errors"),
+        ("needle_sim.ros.sim_rig", "rclpy"),
+        ("needle_sim.ros.conversions", "geometry_msgs"),
+        ("needle_sim.ros.parameters", "needle_common.ros.parameters"),
+        ("needle_sim.ros.sim_rig", "needle_sim.ros.conversions"),
+        ("needle_sim.needle.plant", "numpy"),
+        ("needle_sim.needle.plant", "needle_common.errors"),
     ],
 )
 def test_the_rest_is_allowed(importer: str, imported: str) -> None:

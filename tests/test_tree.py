@@ -8,9 +8,8 @@ from code_lines import ROOT, code_lines, modules
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
-# What breaks these rules today; it only ever becomes less.
-LONG_MODULES = 20
-FULL_FOLDERS = 14
+# How many are longer today; it only ever becomes less.
+LONG_MODULES = 18
 SOURCE = '''"""A docstring.
 
 Of three lines.
@@ -55,4 +54,4 @@ def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
         for folder, number in folders.items()
         if number > MOST_MODULES
     }
-    assert len(full) <= FULL_FOLDERS, full
+    assert not full

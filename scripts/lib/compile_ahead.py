@@ -12,18 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
-from needle_controller.control_settings import PRESETS, ControlSettings
-from needle_controller.plane_control import PlaneControl
-from needle_controller.target_plane import offset_plane
-from needle_sim.disturbances import Disturbances
-from needle_sim.insertions import render_insertion
-from needle_sim.scenarios import CLEAN
-from needle_sim.stereo_rig import load_stereo_rig
-from needle_sim.study import StudySettings, run_study
-from needle_sim.study_controllers import controller_factory
-from needle_tracker.calibration import load_calibration
-from needle_tracker.parameters import StereoTrackerParameters
-from needle_tracker.tracker import StereoTracker
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.control_settings import PRESETS, ControlSettings
+from needle_controller.protocol.plane_control import PlaneControl
+from needle_sim.camera.insertions import render_insertion
+from needle_sim.camera.scenarios import CLEAN
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.studies.disturbances import Disturbances
+from needle_sim.studies.study import StudySettings, run_study
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.ros.parameters import StereoTrackerParameters
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_verification.studies.study_controllers import controller_factory
 
 CALIBRATION = (
     Path(__file__).resolve().parents[2] / "ros2_ws/src/needle_tracker/config/calibration.yaml"

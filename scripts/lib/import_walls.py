@@ -1,8 +1,7 @@
-"""An import-linter contract: ROS stays in the shell modules.
+"""An import-linter contract: ROS stays in the rooms called `ros`.
 
-These are `*_node`, `conversions` and `parameters`. Every other module of the given packages is
-pure, modules that do not exist yet included: it imports neither ROS nor a shell module, so that no
-chain of imports leads to ROS either.
+Every other module of the given packages is pure, modules that do not exist yet included: it imports
+neither ROS nor a module of such a room, so that no chain of imports leads to ROS either.
 """
 
 from __future__ import annotations
@@ -13,13 +12,12 @@ from typing import cast
 from grimp import ImportGraph
 from importlinter import Contract, ContractCheck, fields, output
 
-SHELL = re.compile(r".*_node|conversions|parameters")
 ROS = re.compile(r"rclpy|rosidl_.*|launch|launch_ros|.*_msgs|.*_interfaces|std_srvs")
 
 
-def is_shell(module: str) -> bool:
-    """Return whether one of a module's parts, below its package, names a shell module."""
-    return any(SHELL.fullmatch(part) for part in module.split(".")[1:])
+def is_in_room(module: str) -> bool:
+    """Return whether a module is in its package's room `ros`."""
+    return module.split(".")[1:2] == ["ros"]
 
 
 def is_ros(module: str) -> bool:
@@ -27,8 +25,8 @@ def is_ros(module: str) -> bool:
     return ROS.fullmatch(module.partition(".")[0]) is not None
 
 
-class RosShellContract(Contract):
-    """Pure modules import neither ROS nor a shell module."""
+class RosRoomContract(Contract):
+    """Pure modules import neither ROS nor a module of a room `ros`."""
 
     packages = fields.ListField(subfield=fields.StringField())
 
@@ -37,11 +35,11 @@ class RosShellContract(Contract):
         ours = tuple(str(name) for name in cast("list[str]", self.packages))
         broken = []
         for importer in sorted(graph.modules):
-            if not importer.startswith(ours) or is_shell(importer):
+            if not importer.startswith(ours) or is_in_room(importer):
                 continue
             for imported in sorted(graph.find_modules_directly_imported_by(importer)):
-                shell = imported.startswith(ours) and is_shell(imported)
-                if not (shell or is_ros(imported)):
+                inside = imported.startswith(ours) and is_in_room(imported)
+                if not (inside or is_ros(imported)):
                     continue
                 details = graph.get_import_details(importer=importer, imported=imported)
                 lines = ", ".join(str(detail["line_number"]) for detail in details)
@@ -50,7 +48,7 @@ class RosShellContract(Contract):
 
     def render_broken_contract(self, check: ContractCheck) -> None:
         """Print the imports that break the wall."""
-        output.print_error("Only *_node, conversions and parameters may import ROS or each other:")
+        output.print_error("Only modules of the rooms `ros` may import ROS or each other:")
         output.new_line()
         for line in check.metadata["broken"]:
             output.print_error(f"- {line}")

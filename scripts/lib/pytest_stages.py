@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.ros_domain import own_domain
+from needle_common.process.ros_domain import own_domain
 
 RUN = os.environ.get("NEEDLE_TEST_RUN", "")
 FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").split(",") if name]

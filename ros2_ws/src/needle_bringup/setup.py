@@ -2,14 +2,14 @@
 
 from glob import glob
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 PACKAGE = "needle_bringup"
 
 setup(
     name=PACKAGE,
     version="0.1.0",
-    packages=[PACKAGE],
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
     package_data={PACKAGE: ["py.typed"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
@@ -20,16 +20,11 @@ setup(
     zip_safe=False,
     maintainer="Needle steering maintainers",
     maintainer_email="maintainers@needle-steering.invalid",
-    description="The rig as a whole: operator, recorder, report, launch files, configuration.",
+    description="The rig as a whole: operator, simulate, launch files, configuration.",
     license="Apache-2.0",
     entry_points={
         "console_scripts": [
-            "recorder = needle_bringup.executables:recorder",
             "operator = needle_bringup.executables:operator",
-            "player = needle_bringup.executables:player",
-            "recover = needle_bringup.executables:recover",
-            "report = needle_bringup.executables:report",
-            "rerun = needle_bringup.executables:rerun",
         ]
     },
 )

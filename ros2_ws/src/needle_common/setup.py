@@ -2,15 +2,15 @@
 
 from glob import glob
 
-from setuptools import setup
+from setuptools import find_packages, setup
 
 PACKAGE = "needle_common"
 
 setup(
     name=PACKAGE,
     version="0.1.0",
-    packages=[PACKAGE],
-    package_data={PACKAGE: ["py.typed", "*.xml"]},
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed", "process/*.xml"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
         (f"share/{PACKAGE}", ["package.xml"]),

@@ -11,9 +11,9 @@ that ends ends the others.
 from launch.actions import DeclareLaunchArgument
 
 from launch import LaunchDescription
-from needle_bringup.installed import find_shared
-from needle_bringup.launch_nodes import nodes_beside_rig
-from needle_bringup.launching_node import describe
+from needle_bringup.ros.launching import describe
+from needle_bringup.simulation.installed import find_shared
+from needle_bringup.simulation.launch_nodes import nodes_beside_rig
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -9,9 +9,9 @@ when somebody else sends device/hold. The launch ends with the operator, and wit
 from launch.actions import DeclareLaunchArgument
 
 from launch import LaunchDescription
-from needle_bringup.launch_nodes import simulated_nodes
-from needle_bringup.launching_node import describe
-from needle_bringup.simulate_options import CONTROLLERS, LEVELS
+from needle_bringup.ros.launching import describe
+from needle_bringup.simulation.launch_nodes import simulated_nodes
+from needle_bringup.simulation.simulate_options import CONTROLLERS, LEVELS
 
 
 def generate_launch_description() -> LaunchDescription:

@@ -1,1 +1,1 @@
-"""The rig as a whole: operator, recorder, report, launch files, configuration."""
+"""The rig as a whole: operator, simulate, launch files, configuration."""

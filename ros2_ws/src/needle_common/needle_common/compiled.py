@@ -13,7 +13,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from needle_common.private_folder import private_folder
+from needle_common.process.private_folder import private_folder
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 _COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.MULTILINE)

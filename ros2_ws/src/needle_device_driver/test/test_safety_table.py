@@ -23,7 +23,7 @@ def test_the_table_has_each_rule_once() -> None:
 
 @pytest.mark.parametrize("rule", [rule.value for rule in Rule])
 def test_each_rule_has_a_test_that_begins_with_its_name(rule: str) -> None:
-    tests = list(HERE.glob("supervised/test_*_rules.py"))
+    tests = list(HERE.glob("supervised/rules/test_*_rules.py"))
     assert any(f"def test_{rule}" in file.read_text(encoding="utf-8") for file in tests)
 
 

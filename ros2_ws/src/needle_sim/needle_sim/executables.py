@@ -1,8 +1,9 @@
 """The package's executables."""
 
-from needle_common.executables import command, node
+from needle_common.commands.executables import command, node
 
-sim_rig = node("needle_sim.sim_rig_node")
-drive_emulator = node("needle_sim.drive_emulator_node")
-monte_carlo = command("needle_sim.monte_carlo")
-render_images = command("needle_sim.render_images")
+sim_rig = node("needle_sim.ros.sim_rig")
+drive_emulator = node("needle_sim.ros.drive_emulator")
+# It hands the controller under test to this package's studies, which do not know it.
+monte_carlo = command("needle_verification.studies.monte_carlo")
+render_images = command("needle_sim.camera.render_images")

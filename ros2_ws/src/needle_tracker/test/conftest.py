@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_tracker.calibration import StereoCalibration, load_calibration
-from needle_tracker.gates import GateSettings
-from needle_tracker.refraction import RefractedCamera
-from needle_tracker.search_grid import Reach
-from needle_tracker.tracker_settings import TrackerSettings
+from needle_tracker.image.search_grid import Reach
+from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracking.gates import GateSettings
+from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 CALIBRATION = Path(__file__).parents[1] / "config" / "calibration.yaml"
 

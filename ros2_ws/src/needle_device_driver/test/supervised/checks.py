@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from needle_device_driver.rules import Rule
-from needle_device_driver.states import State
+from needle_device_driver.supervisor.states import State
 
 from .drive_bench import DriveBench
 from .ideal_axes import Bench

@@ -8,15 +8,15 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from needle_device_driver.axis import AxisError
-from needle_device_driver.can_link import CanLink, LinkError
-from needle_device_driver.cia402_axis import Cia402Axis
-from needle_device_driver.drive_cycle import DriveCycle
-from needle_device_driver.hold import HoldMessage
-from needle_device_driver.parameters import DeviceDriverParameters
-from needle_device_driver.reports import DeviceStatus, Event, Notice, StepResult
-from needle_device_driver.states import State
-from needle_device_driver.supervisor import MotionSupervisor
+from needle_device_driver.axes.axis import AxisError
+from needle_device_driver.cia402.cia402_axis import Cia402Axis
+from needle_device_driver.cia402.drive_cycle import DriveCycle
+from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.supervisor.hold import HoldMessage
+from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
+from needle_device_driver.supervisor.states import State
+from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 from .ideal_axes import PERIOD, Bench
 from .scripted_drives import ScriptedBus, ScriptedDrive

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import itertools
 
-from needle_device_driver.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.command import Command, CommandPoint
-from needle_device_driver.hold import HoldMessage
-from needle_device_driver.limits import SafetyLimits
-from needle_device_driver.reports import DeviceStatus, Event, Notice, StepResult
+from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.rules import Rule
-from needle_device_driver.states import State
-from needle_device_driver.supervisor import MotionSupervisor
+from needle_device_driver.supervisor.command import Command, CommandPoint
+from needle_device_driver.supervisor.hold import HoldMessage
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
+from needle_device_driver.supervisor.states import State
+from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 PERIOD = 0.02
 

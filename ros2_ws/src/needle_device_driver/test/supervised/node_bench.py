@@ -22,7 +22,7 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.conversions import (
+from needle_common.ros.conversions import (
     HOLD,
     JOINT_STATES,
     LATCHED,
@@ -31,7 +31,7 @@ from needle_common.conversions import (
     to_stamp,
     values_of,
 )
-from needle_device_driver.device_driver_node import DeviceDriverNode
+from needle_device_driver.ros.device_driver import DeviceDriverNode
 
 from .scripted_drives import ScriptedDrive
 

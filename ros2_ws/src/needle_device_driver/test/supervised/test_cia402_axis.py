@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_device_driver.states import State
+from needle_device_driver.supervisor.states import State
 
 from .drive_bench import DriveBench
 

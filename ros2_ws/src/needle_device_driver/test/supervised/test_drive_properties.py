@@ -9,7 +9,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from needle_device_driver.states import Activity, State
+from needle_device_driver.supervisor.states import Activity, State
 
 from .drive_bench import DriveBench
 

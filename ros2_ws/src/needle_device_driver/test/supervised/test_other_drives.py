@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from needle_device_driver.rules import Rule
-from needle_device_driver.states import State
+from needle_device_driver.supervisor.states import State
 
 from .checks import failed, in_state, recovers
 from .drive_bench import DriveBench

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from needle_device_driver.states import Activity, State
+from needle_device_driver.supervisor.states import Activity, State
 
 from .ideal_axes import Bench
 

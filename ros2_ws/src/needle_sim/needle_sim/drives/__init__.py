@@ -1,1 +1,1 @@
-"""Two emulated CiA 402 drives on a CAN bus; shares no code with the driver that it tests."""
+"""Emulated CiA 402 drives with their motors."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 
+from needle_sim.bus.object_dictionary import Abort, ObjectDictionary, SdoAbortError
 from needle_sim.drives.demand import Demand
 from needle_sim.drives.drive_objects import (
     CYCLIC_SYNCHRONOUS_POSITION,
@@ -14,7 +15,6 @@ from needle_sim.drives.drive_objects import (
 )
 from needle_sim.drives.homing import METHODS, Homing
 from needle_sim.drives.motor import Motor
-from needle_sim.drives.object_dictionary import Abort, ObjectDictionary, SdoAbortError
 
 # Motion is computed in steps of so much [s].
 MOTION_STEP = 0.001

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from needle_sim.drives.object_dictionary import Access, Kind, ObjectDictionary
+from needle_sim.bus.object_dictionary import Access, Kind, ObjectDictionary
 
 PROFILE_POSITION = 1
 HOMING = 6

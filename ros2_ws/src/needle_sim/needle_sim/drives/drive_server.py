@@ -6,7 +6,7 @@ import select
 import time
 from typing import Protocol
 
-from needle_sim.drives.can_frame import CanFrame
+from needle_sim.bus.can_frame import CanFrame
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.fault_commands import PlugOrder, obey
 

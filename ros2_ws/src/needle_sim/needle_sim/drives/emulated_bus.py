@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import enum
 
-from needle_sim.drives.can_frame import CanFrame
-from needle_sim.drives.canopen_device import SYNC
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.canopen_device import SYNC
 from needle_sim.drives.drive_motion import MOTION_STEP
 from needle_sim.drives.emulated_drive import DriveSettings, EmulatedDrive
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from needle_sim.drives.can_frame import CanFrame
-from needle_sim.drives.canopen_device import HEARTBEAT_LOST, CanopenDevice
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.canopen_device import HEARTBEAT_LOST, CanopenDevice
+from needle_sim.bus.object_dictionary import Abort, SdoAbortError
 from needle_sim.drives.drive_motion import (
     MOTION_STEP,
     DriveMotion,
@@ -23,7 +24,6 @@ from needle_sim.drives.drive_objects import (
 )
 from needle_sim.drives.homing import METHODS
 from needle_sim.drives.motor import Motor, MotorSettings
-from needle_sim.drives.object_dictionary import Abort, SdoAbortError
 from needle_sim.drives.power_state import FAULT_RESET, Order, PowerState, next_state, order_of
 
 FOLLOWING_ERROR = 0x8611

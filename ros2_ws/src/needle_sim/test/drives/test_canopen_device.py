@@ -5,7 +5,7 @@ from __future__ import annotations
 import canopen
 import pytest
 
-from needle_sim.drives.object_dictionary import Abort
+from needle_sim.bus.object_dictionary import Abort
 
 from .master import INSERTION, MASTER, ROTATION, Master
 

@@ -12,13 +12,13 @@ import canopen
 import pytest
 
 from needle_common.errors import UserError
-from needle_sim.drives.can_frame import CanFrame
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.pty_port import PtyPort
+from needle_sim.bus.socketcand_port import SocketcandPort
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_server import DriveServer, Port
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.drives.fault_commands import PlugOrder, obey
-from needle_sim.drives.pty_port import PtyPort
-from needle_sim.drives.socketcand_port import SocketcandPort
 
 from .master import INSERTION, ROTATION, settings
 

@@ -8,9 +8,9 @@ import random
 import canopen
 import pytest
 
+from needle_sim.bus.object_dictionary import Abort
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.drives.object_dictionary import Abort
 from needle_sim.drives.power_state import TRANSITIONS, PowerState, next_state
 
 from .master import INSERTION, MASTER, ROTATION, Master, settings

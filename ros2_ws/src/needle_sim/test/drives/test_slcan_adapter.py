@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from needle_sim.drives.can_frame import CanFrame
-from needle_sim.drives.slcan_adapter import SlcanAdapter
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.slcan_adapter import SlcanAdapter
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from needle_sim.sim_rig_node import SimRigNode
+from needle_sim.ros.sim_rig import SimRigNode
 
 LIMIT = 20.0
 

@@ -18,8 +18,8 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.base_node import STEADY_CLOCK
-from needle_common.conversions import (
+from needle_common.ros.base_node import STEADY_CLOCK
+from needle_common.ros.conversions import (
     HOLD,
     IMAGES,
     JOINT_STATES,
@@ -29,7 +29,7 @@ from needle_common.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.own_context_node import own_context
+from needle_common.ros.own_context import own_context
 
 from .bench import SimRigBench
 

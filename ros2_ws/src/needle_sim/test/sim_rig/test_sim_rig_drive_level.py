@@ -17,7 +17,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Bool, Header
 
-from needle_common.conversions import (
+from needle_common.errors import UserError
+from needle_common.ros.conversions import (
     IMAGES,
     JOINT_STATES,
     LATCHED,
@@ -25,8 +26,7 @@ from needle_common.conversions import (
     to_nanoseconds,
     to_stamp,
 )
-from needle_common.errors import UserError
-from needle_common.own_context_node import own_context
+from needle_common.ros.own_context import own_context
 
 from .bench import SimRigBench
 

@@ -1,0 +1,110 @@
+"""Figures of what happened at each tip: innovation, gate, and the time that each stage took."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from needle_analysis.report.figure_style import (
+    ESTIMATE,
+    GREY,
+    MEASURED,
+    MM,
+    RED,
+    STYLE,
+    TEAL,
+    TRUTH,
+    VIOLET,
+    WIDTH,
+)
+from needle_analysis.run.innovation import (
+    QUANTILE_95,
+    Innovations,
+    gate_room,
+    missed_tips,
+    refused_tips,
+)
+from needle_analysis.run.stage_timing import StageTiming
+from needle_bags.reading.bag_reader import Run, Stamps
+
+_AXES = (("x, out of the plane", MEASURED), ("y", VIOLET), ("z, along", TEAL))
+
+
+def innovation_figure(run: Run, found: Innovations) -> Figure:
+    """Return innovation, its size beside what is expected, and the room left to the gate."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 7.6), layout="constrained")
+        parts, size, gate = figure.subplots(3, 1, sharex=True)
+        insertion = run.insertion_at(found.stamps) * MM
+        band = 2.0 * found.sigmas[:, 0] * MM
+        label = "±2 sigma expected in x"
+        parts.fill_between(insertion, -band, band, color=MEASURED, alpha=0.14, lw=0, label=label)
+        for column, (name, color) in enumerate(_AXES):
+            parts.plot(insertion, found.values[:, column] * MM, color=color, lw=1.1, label=name)
+        parts.axhline(0.0, color=GREY, lw=0.8)
+        # The first tips are known so badly that their band would hide all the others.
+        top = 1.25 * max(np.abs(found.values).max() * MM, float(np.median(band)))
+        parts.set(title="Innovation: measured minus expected tip", ylabel="mm", ylim=(-top, top))
+        parts.legend(loc="best", ncols=2)
+        size.plot(insertion, np.maximum(found.squared, 1e-3), ".", color=TRUTH, ms=4)
+        size.axhline(QUANTILE_95, color=RED, lw=1.1, label="95 % of tips should be below")
+        size.axhline(3.0, color=GREY, lw=0.9, ls=(0, (4, 2)), label="average where all fits: 3")
+        size.set(title="Innovation squared, normalised by its covariance", yscale="log")
+        size.legend(loc="best", ncols=2)
+        _draw_gate(gate, run)
+        gate.set_xlabel("insertion [mm]")
+        return figure
+
+
+def _draw_gate(axes: Any, run: Run) -> None:
+    room = gate_room(run)
+    insertion = run.insertion_at(room.stamps) * MM
+    axes.plot(insertion, room.jump * MM, color=ESTIMATE, lw=1.1, label="jump beyond the insertion")
+    axes.plot(insertion, room.reach * MM, color=TEAL, lw=1.1, label="distance beyond the insertion")
+    top = 1.0
+    if room.margin is not None:
+        top = room.margin * MM
+        axes.axhline(top, color=RED, lw=1.2, label="a tip above this is refused")
+    marks: Sequence[tuple[Stamps, str, str, str]] = (
+        (refused_tips(run), "x", RED, "refused"),
+        (missed_tips(run), "|", MEASURED, "no tip found"),
+    )
+    for stamps, marker, color, label in marks:
+        if len(stamps):
+            where = run.insertion_at(stamps) * MM
+            height = np.full(len(stamps), top)
+            axes.plot(where, height, marker, color=color, ms=8, mew=1.6, label=label)
+    axes.set(title="The controller's gate: where no needle can be", ylabel="mm")
+    axes.legend(loc="best", ncols=2)
+
+
+def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
+    """Return the wall time of each stage of every step."""
+    colors = (ESTIMATE, MEASURED, GREY, TEAL)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+        axes = figure.subplots()
+        for timing, color in zip(timings, colors, strict=False):
+            insertion = run.insertion_at(timing.stamps) * MM
+            milliseconds = np.maximum(timing.seconds * 1e3, 1e-2)
+            axes.plot(insertion, milliseconds, ".", ms=4, color=color, label=timing.name)
+        axes.set(yscale="log", ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
+        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        figure.legend(loc="outside lower center", ncols=4)
+        return figure
+
+
+def timing_rows(timings: Sequence[StageTiming]) -> list[tuple[str, ...]]:
+    """Return (stage, from what to what, steps, median, 95 %, largest [ms]) as text."""
+    rows: list[tuple[str, ...]] = []
+    for timing in timings:
+        figures: npt.NDArray[np.float64] = np.percentile(timing.seconds, [50, 95, 100]) * 1e3
+        numbers = (f"{value:.1f}" for value in figures)
+        rows.append((timing.name, timing.meaning, str(len(timing.seconds)), *numbers))
+    return rows

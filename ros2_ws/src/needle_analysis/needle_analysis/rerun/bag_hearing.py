@@ -1,0 +1,85 @@
+"""A bag's messages in the order in which the controller heard them, and those that it did not.
+
+needle/controller_status tells what the controller had heard since the status before, message by
+message (`needle_controller.protocol.heard_messages`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.reading.bag_order import SentMessage, raw_as_sent
+from needle_controller.protocol.heard_messages import HeardMessage, heard_messages
+
+_STATUS = "needle/controller_status"
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+
+def as_heard(messages: list[SentMessage], namespace: str) -> list[tuple[int, SentMessage]]:
+    """Return the messages with the times by which the controller had heard them, in their order.
+
+    Parameters
+    ----------
+    messages : list of SentMessage
+        Everything small in a bag.
+    namespace : str
+        Of the rig's topics, `/` or with one at its end.
+
+    Returns
+    -------
+    list of tuple
+        Time [ns] and message: that of sending, or the least later one that keeps the order of
+        hearing. Topics that no status tells of count as heard when they were sent.
+    """
+    ordered = sorted(messages, key=lambda m: (m.time, m.log_time))
+    heard_at: dict[tuple[str, int], int] = {}
+    time = 0
+    told = list(_told(ordered, namespace))
+    for status, heard in told:
+        for topic, sent_ns in heard:
+            time = max(time + 1, sent_ns)
+            heard_at.setdefault((namespace + topic, sent_ns), time)
+        # A status comes after what it tells of.
+        time = heard_at[status.topic, status.time] = max(time + 1, status.time)
+    # What no status tells of any more was heard after the last one.
+    rest = {namespace + topic: time + 1 for _, heard in told for topic, _ in heard}
+    timed = [
+        (heard_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m) for m in ordered
+    ]
+    # Equal times keep the order of sending.
+    return sorted(timed, key=lambda pair: pair[0])
+
+
+def unheard_messages(path: Path, namespace: str) -> frozenset[HeardMessage]:
+    """Return what the controller never heard, topics by their relative names.
+
+    What was sent after the last of its topic that was heard may have been.
+
+    Raises
+    ------
+    UserError
+        If the bag is broken.
+    """
+    statuses = raw_as_sent(path, (namespace + _STATUS).__eq__, lambda _: False)
+    heard = {message for _, told in _told(statuses, namespace) for message in told}
+    last: dict[str, int] = {}
+    for topic, sent_ns in heard:
+        last[namespace + topic] = max(sent_ns, last.get(namespace + topic, 0))
+    sent = raw_as_sent(path, last.__contains__, lambda _: False)
+    early = (m for m in sent if m.time < last[m.topic])
+    names = (HeardMessage(m.topic.removeprefix(namespace), m.time) for m in early)
+    return frozenset(names) - heard
+
+
+def _told(
+    messages: Iterable[SentMessage], namespace: str
+) -> Iterator[tuple[SentMessage, list[HeardMessage]]]:
+    for message in messages:
+        if message.topic == namespace + _STATUS:
+            status: Any = _STORE.deserialize_cdr(message.data, message.type_name)
+            values = {pair.key: pair.value for pair in status.values}
+            yield message, heard_messages(values.get("heard", ""))

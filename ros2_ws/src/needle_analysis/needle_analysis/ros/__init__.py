@@ -1,0 +1,1 @@
+"""The stages of `rerun`, with the nodes' own conversions."""

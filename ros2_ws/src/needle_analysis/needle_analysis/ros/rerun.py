@@ -1,0 +1,236 @@
+"""`rerun`: a bag's images and tips through today's code, in place of the nodes."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from needle_analysis.rerun.bag_hearing import unheard_messages
+from needle_analysis.rerun.bag_pass import (
+    TIP_TOPICS,
+    has_images,
+    run_again,
+    run_tips,
+)
+from needle_analysis.rerun.comparison import compare
+from needle_analysis.rerun.rerun_bag import write_rerun
+from needle_analysis.rerun.rerun_text import describe, errors_text, flat, tolerance_table
+from needle_analysis.ros.controller_rerun import ControllerStage, step_ends
+from needle_analysis.ros.tracker_rerun import TrackerStage
+from needle_bags.format.bag_writer import refuse_existing_bag
+from needle_bags.reading.bag_files import read_messages
+from needle_bags.reading.bag_reader import Run, read_run
+from needle_bags.ros.parameter_snapshots import plain_value
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
+from needle_common.commands.options import CommandParser, output_file
+from needle_common.errors import UserError
+from needle_common.ros.parameters import OF_EVERY_NODE
+from needle_common.settings.parameter_files import read_parameters
+from needle_controller.presets.control_settings import PRESETS
+from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_tracker.optics.calibration import parse_calibration
+from needle_tracker.ros.parameters import StereoTrackerParameters
+
+DESCRIPTION = """\
+Run a bag again, without a graph and without waiting: its images through today's tracker, its tips
+through today's estimator, law and step protocol, with the parameters and the calibration that were
+recorded. Compare every output with the recorded one, field by field, and say what changed where.
+
+The needle does what it did: joints, tips and the device's answers are the recorded ones.
+"""
+EPILOG = f"""\
+examples:
+  ros2 run needle_analysis rerun bags/my_run
+      does today's code still do the same?
+  ros2 run needle_analysis rerun bags/my_run --preset best
+      what would `best` have seen here, and how would it have turned the needle?
+  ros2 run needle_analysis rerun bags/my_run --params other.yaml --output bags/again
+  ros2 run needle_analysis report bags/my_run bags/again
+      other parameters, and both in one report
+
+tolerances: a value may differ by absolute + relative x recorded
+{tolerance_table()}
+
+exit codes: 0 nothing changed, 1 something did, 2 bad input or something missing, 3 today's code
+broke, 130 interrupted.
+"""
+FILE = "calibration_file"
+TRACKER, CONTROLLER = "stereo_tracker", "plane_controller"
+
+P = TypeVar("P")
+
+
+@dataclasses.dataclass(frozen=True)
+class Node:
+    """A recorded node.
+
+    Attributes
+    ----------
+    name : str
+        Its full name.
+    values : mapping
+        Its parameters, those of --params on top.
+    given : frozenset of str
+        Names of those of --params.
+    """
+
+    name: str
+    values: Mapping[str, Any]
+    given: frozenset[str]
+
+    def parameters(self, kind: type[P]) -> P:
+        """Return them as a node's parameter class has them; warn of those it no longer has."""
+        names = {field.name for field in dataclasses.fields(kind)}  # type: ignore[arg-type]
+        known = {name: value for name, value in self.values.items() if name in names}
+        unknown = [n for n in self.values if n not in names and not n.startswith(OF_EVERY_NODE)]
+        refused = self.given.intersection(unknown)
+        if refused:
+            raise UserError(f"--params: {self.name} has no parameter {', '.join(sorted(refused))}")
+        if unknown:
+            text = f"{self.name} no longer has {', '.join(unknown)}: left out"
+            print(f"warning: {text}", file=sys.stderr)
+        plain = {k: tuple(v) if isinstance(v, list) else v for k, v in known.items()}
+        try:
+            return kind(**plain)
+        except UserError as error:
+            raise UserError(f"{self.name}: {error}") from error
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `rerun`; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    given = _parser().parse_args(words)
+    file = output_file("--json", given.json)
+    if given.output is not None:
+        refuse_existing_bag(given.output)
+    changes = read_parameters(given.params) if given.params is not None else {}
+    if given.preset is not None:
+        if given.preset not in PRESETS:
+            raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
+        changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), "preset": given.preset}}
+    run = read_run(given.bag, given.namespace)
+    tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
+    controller_node = _node(run, CONTROLLER, changes)
+    calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
+    tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
+    controller = _controller(run, controller_node)
+    rerun = run_again(run, tracker, controller)
+    comparison = compare(rerun.recorded, rerun.today)
+
+    if file is not None:
+        write_json(file, flat(run, comparison, rerun.outputs))
+    if given.output is not None:
+        outputs = rerun.outputs
+        answers = [output for output in outputs if output.topic in TIP_TOPICS]
+        if answers:
+            outputs = [*answers, *run_tips(run, _controller(run, controller_node), answers)]
+        nodes = [node for node in (tracker_node, controller_node) if node is not None]
+        used = {node.name: node.values for node in nodes}
+        write_rerun(run, given.output, outputs, used, calibration)
+    print(f"{run.path}: {_summary(tracker, controller, controller_node)}")
+    for note in controller.notes:
+        print(f"note: {note}")
+    if rerun.tips_without_images:
+        print(f"note: {rerun.tips_without_images} recorded tips have no images in the bag")
+    print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
+    for text in (describe(run, comparison), errors_text(run, rerun.outputs)):
+        if text:
+            print(text)
+    if given.output is not None:
+        print(f"written: {given.output}")
+    return EXIT_MISSED if comparison.changed else EXIT_DONE
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("rerun", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add("bag", type=Path, metavar="BAG", help="the bag's directory")
+    add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")
+    add("--params", type=Path, metavar="FILE", help="ROS parameter file on top of the recorded")
+    add(
+        "--output",
+        type=Path,
+        metavar="NEW_BAG",
+        help="write a copy of the bag with today's outputs in place of the recorded ones",
+    )
+    add("--namespace", metavar="NS", help="of the rig to run again, where the bag holds several")
+    add("--json", type=Path, metavar="FILE", help="write the result as one flat JSON object")
+    return parser
+
+
+def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node:
+    recorded = run.parameters or _announced(run)
+    found = [full for full in recorded if full.rsplit("/", maxsplit=1)[-1] == name]
+    if not found and name not in changes:
+        raise UserError(
+            f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
+            f"with --params"
+        )
+    own = f"{run.namespace}{name}"
+    full_name = found[0] if found and own not in found else own
+    given = changes.get(name, {})
+    return Node(full_name, {**recorded.get(full_name, {}), **given}, frozenset(given))
+
+
+def _announced(run: Run) -> dict[str, dict[str, Any]]:
+    """Return what nodes said of their parameters as they started, by full name.
+
+    That is all that a bag of ROS 2's own recorder has, if the recorder was there first.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for _, _, message in read_messages(run.path, "/parameter_events".__eq__):
+        values = found.setdefault(str(message.node), {})
+        for parameter in message.new_parameters:
+            if parameter.value.type:
+                values[str(parameter.name)] = plain_value(parameter.value)
+    return {node: values for node, values in found.items() if values}
+
+
+def _calibration(run: Run, node: Node) -> str:
+    """Return the text of the calibration: that of --params, or the recorded one."""
+    if FILE in node.given:
+        path = Path(str(node.values[FILE]))
+        try:
+            return path.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UserError(f"--params: {FILE}: cannot read {path}: {error}") from error
+    if not run.calibration:
+        raise UserError(
+            f"{run.path} has images but no calibration: name one with --params "
+            f"({TRACKER}: {{ros__parameters: {{{FILE}: ...}}}})"
+        )
+    return run.calibration
+
+
+def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
+    try:
+        calibration = parse_calibration(yaml.safe_load(text))
+    except (UserError, yaml.YAMLError) as error:
+        lines = str(error).splitlines()
+        raise UserError(f"{run.path}: the calibration is broken: {lines[0]}") from error
+    return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
+
+
+def _controller(run: Run, node: Node) -> ControllerStage:
+    parameters = node.parameters(PlaneControllerParameters)
+    ends = step_ends(run.path, run.namespace)
+    unheard = unheard_messages(run.path, run.namespace)
+    return ControllerStage(parameters, node.name, ends, unheard)
+
+
+def _summary(tracker: TrackerStage | None, controller: ControllerStage, node: Node) -> str:
+    pairs = "" if tracker is None else f"{tracker.pairs} image pairs through {TRACKER}, "
+    return f"{pairs}{controller.tips} tips through {CONTROLLER} ({node.values.get('preset')})"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,134 @@
+"""Bags made to harm, before every tool that reads bags: one line, and nothing elsewhere changes."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import yaml
+
+from needle_analysis.report import report
+from needle_analysis.ros import rerun as rerun_node
+from needle_bags.format.bag_copy import standard_topic
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.reading import small_bag
+from needle_bags.reading.bag_reader import read_run
+from needle_bags.recovery import recover
+from needle_bags.ros import player as player_node
+
+MakeRun = Callable[..., Path]
+BOMB = "a: &a [x, x]\n" + "".join(f"b{n}: &b{n} [*a, *a]\n" for n in range(9))
+TOOLS: dict[str, Callable[[Path], int]] = {
+    "report": lambda bag: report.main([str(bag)]),
+    "rerun": lambda bag: rerun_node.main([str(bag)]),
+    "player": lambda bag: player_node.main(["player", str(bag)]),
+    "small_bag": lambda bag: small_bag.main([str(bag), str(bag.parent / "small")]),
+    "recover": lambda bag: recover.main([str(bag)]),
+}
+
+
+def change(bag: Path, **values: object) -> None:
+    document = yaml.safe_load((bag / "metadata.yaml").read_text())
+    document["rosbag2_bagfile_information"].update(values)
+    (bag / "metadata.yaml").write_text(yaml.safe_dump(document))
+
+
+def alias_bomb(bag: Path) -> None:
+    (bag / "metadata.yaml").write_text(BOMB)
+
+
+def huge_metadata(bag: Path) -> None:
+    with (bag / "metadata.yaml").open("r+") as stream:
+        stream.truncate(300 * 10**6)
+
+
+def deep_metadata(bag: Path) -> None:
+    (bag / "metadata.yaml").write_text("{a: " * 100_000)
+
+
+def metadata_pipe(bag: Path) -> None:
+    (bag / "metadata.yaml").unlink()
+    os.mkfifo(bag / "metadata.yaml")
+
+
+def data_pipe(bag: Path) -> None:
+    (bag / "run_0.mcap").unlink()
+    os.mkfifo(bag / "run_0.mcap")
+
+
+def data_outside(bag: Path) -> None:
+    (bag / "run_0.mcap").rename(bag.parent / "elsewhere")
+    (bag / "run_0.mcap").symlink_to(bag.parent / "elsewhere")
+
+
+def missing_messages(bag: Path) -> None:
+    change(bag, message_count=5)
+
+
+# What `recover` makes whole again, of what the others refuse.
+REPAIRED = (alias_bomb, huge_metadata, deep_metadata, metadata_pipe, missing_messages)
+
+
+@pytest.mark.parametrize("tool", list(TOOLS))
+@pytest.mark.parametrize("harm", [*REPAIRED, data_pipe, data_outside])
+def test_every_tool_says_why_in_one_line(
+    make_run: MakeRun,
+    capsys: pytest.CaptureFixture[str],
+    harm: Callable[[Path], None],
+    tool: str,
+) -> None:
+    bag = make_run()
+    harm(bag)
+    is_repaired = tool == "recover" and harm in REPAIRED
+    assert TOOLS[tool](bag) == (0 if is_repaired else 2)
+    said = capsys.readouterr()
+    if is_repaired:
+        assert len(read_run(bag).tips) == 121
+    else:
+        assert said.err.startswith("error: ")
+        assert said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", [BOMB, "[" * 100_000])
+def test_texts_within_metadata_are_bounded_too(make_run: MakeRun, text: str) -> None:
+    bag = make_run()
+    change(bag, custom_data={"parameters": text, "run_info": text, "versions": text})
+    assert read_run(bag).versions == {"text": text}
+
+
+@pytest.mark.parametrize("height", [7, 2**32 - 1])
+@pytest.mark.parametrize("tool", ["report", "small_bag"])
+def test_an_image_of_another_size_than_it_says_is_one_line(
+    make_run: MakeRun, capsys: pytest.CaptureFixture[str], tool: str, height: int
+) -> None:
+    bag = make_run(image_height=height)
+    assert TOOLS[tool](bag) in (0, 2)
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert said.count("\n") <= 1
+
+
+def test_links_in_a_bag_are_replaced_not_followed(make_run: MakeRun, tmp_path: Path) -> None:
+    bag = make_run()
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    for name in ("report.html", "states.png", "metadata.yaml.tmp"):
+        (bag / name).symlink_to(precious)
+    assert report.main([str(bag)]) == 0
+    change(bag, message_count=5)
+    assert recover.main([str(bag)]) == 0
+    assert precious.read_text() == "mine"
+    assert not (bag / "report.html").is_symlink()
+
+
+def test_the_recorder_follows_no_link(tmp_path: Path) -> None:
+    bag, precious = tmp_path / "bag", tmp_path / "precious"
+    bag.mkdir()
+    (bag / "metadata.yaml").symlink_to(precious)
+    writer = BagWriter(bag)
+    topic = writer.add_topic(standard_topic("/a", "std_msgs/msg/Header"))
+    writer.write(topic, bytes([0, 1, 0, 0]) + bytes(13), 1, 1)
+    writer.close()
+    assert not precious.exists()

@@ -1,0 +1,1 @@
+"""Bags of the rig: recorder, player, recovery, and reading."""

@@ -1,0 +1,263 @@
+"""What rosbag2's metadata.yaml (version 9) says about a bag, as data, and the file itself."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import yaml
+
+from needle_common.files.bag_directory import METADATA_FILE
+from needle_common.files.file_access import replace_file
+from needle_common.files.plain_yaml import load_plain
+
+METADATA_VERSION: Final = 9
+# Name of the MCAP metadata records that rosbag2 writes.
+METADATA_RECORD: Final = "rosbag2"
+INFINITE_NS: Final = 2**63 - 1
+_NANOSECONDS: Final = 1_000_000_000
+# rmw's enumerations: up to version 8 policies are written as these numbers.
+_HISTORIES: Final = ("system_default", "keep_last", "keep_all", "unknown")
+_RELIABILITIES: Final = ("system_default", "reliable", "best_effort", "unknown", "best_available")
+_DURABILITIES: Final = (
+    "system_default",
+    "transient_local",
+    "volatile",
+    "unknown",
+    "best_available",
+)
+_LIVELINESSES: Final = (
+    "system_default",
+    "automatic",
+    "manual_by_node",
+    "manual_by_topic",
+    "unknown",
+    "best_available",
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class OfferedQos:
+    """Quality of service that one publisher offers, in rosbag2's words.
+
+    Attributes
+    ----------
+    history, reliability, durability, liveliness : str
+        Names of rmw's policies in lower case, e.g. `keep_last`, `transient_local`.
+    depth : int
+        Queue length; 0 where DDS does not tell it.
+    deadline, lifespan, lease_duration : int
+        Durations in ns; `INFINITE_NS` for none.
+    """
+
+    history: str = "unknown"
+    depth: int = 0
+    reliability: str = "reliable"
+    durability: str = "volatile"
+    deadline: int = INFINITE_NS
+    lifespan: int = INFINITE_NS
+    liveliness: str = "automatic"
+    lease_duration: int = INFINITE_NS
+
+    def as_rosbag2(self) -> dict[str, Any]:
+        """Return the profile as metadata.yaml has it from version 9 on."""
+
+        def duration(nanoseconds: int) -> dict[str, int]:
+            return {"sec": nanoseconds // _NANOSECONDS, "nsec": nanoseconds % _NANOSECONDS}
+
+        return {
+            "history": self.history,
+            "depth": self.depth,
+            "reliability": self.reliability,
+            "durability": self.durability,
+            "deadline": duration(self.deadline),
+            "lifespan": duration(self.lifespan),
+            "liveliness": self.liveliness,
+            "liveliness_lease_duration": duration(self.lease_duration),
+            "avoid_ros_namespace_conventions": False,
+        }
+
+    @classmethod
+    def from_rosbag2(cls, profile: Mapping[str, Any]) -> OfferedQos:
+        """Return the profile that metadata.yaml or an MCAP channel has, of any version.
+
+        Raises
+        ------
+        KeyError, TypeError, ValueError, IndexError
+            If it is none.
+        """
+
+        def duration(key: str) -> int:
+            return int(profile[key]["sec"]) * _NANOSECONDS + int(profile[key]["nsec"])
+
+        def policy(key: str, names: Sequence[str]) -> str:
+            value = profile[key]
+            return names[value] if isinstance(value, int) else str(value).lower()
+
+        return cls(
+            history=policy("history", _HISTORIES),
+            depth=int(profile["depth"]),
+            reliability=policy("reliability", _RELIABILITIES),
+            durability=policy("durability", _DURABILITIES),
+            deadline=duration("deadline"),
+            lifespan=duration("lifespan"),
+            liveliness=policy("liveliness", _LIVELINESSES),
+            lease_duration=duration("liveliness_lease_duration"),
+        )
+
+
+def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[OfferedQos, ...]:
+    """Return the profiles that metadata.yaml or an MCAP channel has; none if it has other things.
+
+    Parameters
+    ----------
+    profiles : sequence of mapping or str
+        As they are from version 9 on, or as YAML text.
+    """
+    try:
+        found = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
+        return tuple(OfferedQos.from_rosbag2(profile) for profile in found)
+    except (ValueError, TypeError, KeyError, IndexError):
+        return ()
+
+
+@dataclasses.dataclass(frozen=True)
+class BagTopic:
+    """What a bag says about a topic, beside its messages.
+
+    Attributes
+    ----------
+    name : str
+        Absolute name.
+    type_name : str
+        `package/msg/Name`.
+    definition : str
+        Full definition text (`message_definitions.full_definition`).
+    type_hash : str
+        `RIHS01_...` as the publishers announce it, or an empty text.
+    offered_qos : tuple of OfferedQos
+        One for each publisher.
+    """
+
+    name: str
+    type_name: str
+    definition: str
+    type_hash: str = ""
+    offered_qos: tuple[OfferedQos, ...] = ()
+
+    def channel_metadata(self) -> dict[str, str]:
+        """Return what an MCAP channel says about the topic."""
+        profiles = [qos.as_rosbag2() for qos in self.offered_qos]
+        return {
+            "offered_qos_profiles": to_yaml(profiles).strip() if profiles else "",
+            "topic_type_hash": self.type_hash,
+        }
+
+
+@dataclasses.dataclass
+class DataFile:
+    """What one of the bag's data files holds.
+
+    Attributes
+    ----------
+    name : str
+        File name.
+    counts : dict of str to int
+        Messages for each topic.
+    first, last : int or None, int
+        Log times of the earliest and latest message, system clock [ns].
+    """
+
+    name: str
+    counts: dict[str, int] = dataclasses.field(default_factory=dict)
+    first: int | None = None
+    last: int = 0
+
+    @property
+    def message_count(self) -> int:
+        """Messages in the file."""
+        return sum(self.counts.values())
+
+    def add(self, topic: str, log_time: int) -> None:
+        """Count a message."""
+        self.counts[topic] = self.counts.get(topic, 0) + 1
+        if self.first is None or log_time < self.first:
+            self.first = log_time
+        self.last = max(self.last, log_time)
+
+
+def bag_information(
+    files: Sequence[DataFile],
+    topics: Sequence[BagTopic],
+    custom_data: Mapping[str, str],
+    distribution: str,
+) -> dict[str, Any]:
+    """Return the content of metadata.yaml below `rosbag2_bagfile_information`."""
+    starts = [file.first for file in files if file.first is not None]
+    start = min(starts, default=0)
+    last = max((file.last for file in files), default=0)
+    return {
+        "version": METADATA_VERSION,
+        "storage_identifier": "mcap",
+        "duration": {"nanoseconds": max(0, last - start)},
+        "starting_time": {"nanoseconds_since_epoch": start},
+        "message_count": sum(file.message_count for file in files),
+        "topics_with_message_count": [
+            {
+                "topic_metadata": _topic_metadata(topic),
+                "message_count": sum(file.counts.get(topic.name, 0) for file in files),
+            }
+            for topic in topics
+        ],
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [file.name for file in files],
+        "files": [
+            {
+                "path": file.name,
+                "starting_time": {"nanoseconds_since_epoch": file.first or 0},
+                "duration": {"nanoseconds": max(0, file.last - (file.first or 0))},
+                "message_count": file.message_count,
+            }
+            for file in files
+        ],
+        "custom_data": dict(custom_data) or None,
+        "ros_distro": distribution,
+    }
+
+
+def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
+    """Write metadata.yaml; one that exists is complete, and on the disk.
+
+    Raises
+    ------
+    OSError
+        If the disk refuses it.
+    """
+    text = to_yaml({"rosbag2_bagfile_information": dict(information)})
+    replace_file(directory / METADATA_FILE, text.encode())
+
+
+def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:
+    """Return YAML that simple readers understand, too."""
+    text: str = yaml.dump(value, Dumper=_PlainDumper, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
+    return {
+        "name": topic.name,
+        "type": topic.type_name,
+        "serialization_format": "cdr",
+        "offered_qos_profiles": [qos.as_rosbag2() for qos in topic.offered_qos],
+        "type_description_hash": topic.type_hash,
+    }
+
+
+class _PlainDumper(yaml.SafeDumper):
+    """Writes no anchors: rosbag2's reader and other simple ones do not follow them."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True

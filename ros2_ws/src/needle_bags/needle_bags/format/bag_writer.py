@@ -1,0 +1,276 @@
+"""Writes a rosbag2 directory: MCAP data with its index, and metadata.yaml (version 9)."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Final
+
+from mcap.writer import CompressionType, Writer
+
+from needle_bags.format.bag_metadata import (
+    METADATA_RECORD,
+    BagTopic,
+    DataFile,
+    bag_information,
+    to_yaml,
+    write_metadata,
+)
+from needle_bags.format.mcap_ending import NO_ROOM, McapEnding
+from needle_common.errors import UserError
+from needle_common.files.bag_directory import METADATA_FILE
+
+LIBRARY: Final = "needle_bags"
+COMPRESSIONS: Final = ("none", "zstd")
+CHUNK_SIZE: Final = 2 * 2**20
+DISTRO_KEY: Final = "ROS_DISTRO"
+_SEQUENCE_MASK: Final = 0xFFFFFFFF
+
+
+class BagWriteError(Exception):
+    """The disk refused the bag's data; the message says why and where."""
+
+
+class BagWriter:
+    """One bag being written; not thread-safe: one thread owns it.
+
+    Parameters
+    ----------
+    directory : Path
+        The bag; made if it does not exist.
+    distribution : str
+        ROS distribution whose message types the bag holds.
+    chunk_size : int
+        Bytes after which a chunk is written out.
+    max_file_size : int
+        Bytes of messages after which another data file is begun; 0: never.
+    compression : str
+        `none` or `zstd`, chunk by chunk.
+
+    Raises
+    ------
+    UserError
+        If the directory holds a bag already or cannot be made.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        distribution: str = "jazzy",
+        chunk_size: int = CHUNK_SIZE,
+        max_file_size: int = 0,
+        compression: str = "none",
+    ) -> None:
+        refuse_existing_bag(directory)
+        self.directory = directory
+        self._distribution = distribution
+        self._chunk_size = chunk_size
+        self._max_file_size = max_file_size
+        self._compression = CompressionType[compression.upper()]
+        self._topics: list[BagTopic] = []
+        self._files: list[DataFile] = []
+        self._custom_data: dict[str, str] = {}
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            self._begin_file()
+        except OSError as error:
+            raise UserError(f"cannot record into {directory}: {error.strerror}") from error
+
+    @property
+    def message_count(self) -> int:
+        """Messages written so far."""
+        return sum(file.message_count for file in self._files)
+
+    @property
+    def data_file(self) -> Path:
+        """The file that is written now."""
+        return self.directory / self._files[-1].name
+
+    def add_topic(self, topic: BagTopic) -> int:
+        """Announce a topic and return the number that its messages are written with."""
+        self._topics.append(topic)
+        self._register(topic)
+        return len(self._topics) - 1
+
+    def write(
+        self, topic: int, data: bytes, log_time: int, publish_time: int, sequence: int = 0
+    ) -> None:
+        """Append one serialised message.
+
+        Parameters
+        ----------
+        topic : int
+            Number from `add_topic`.
+        data : bytes
+            The message as CDR with its header.
+        log_time, publish_time : int
+            When it was received and sent, system clock [ns].
+        sequence : int
+            The publisher's own number of the message, 0 where it has none.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses the data.
+        """
+        try:
+            if self._max_file_size and self._file_bytes + len(data) > self._max_file_size:
+                self._split()
+            self._mcap.add_message(
+                self._channels[topic], log_time, data, publish_time, sequence & _SEQUENCE_MASK
+            )
+        except OSError as error:
+            raise self._failure(error) from error
+        self._file_bytes += len(data)
+        self._files[-1].add(self._topics[topic].name, log_time)
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Append a named MCAP metadata record."""
+        try:
+            self._mcap.add_metadata(name, dict(values))
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
+        """Append a file as an MCAP attachment; `time` is the system clock's [ns]."""
+        try:
+            self._mcap.add_attachment(time, time, name, media_type, data)
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def set_custom_data(self, key: str, value: str) -> None:
+        """Set one text of the `custom_data` in metadata.yaml, which every bag reader shows."""
+        self._custom_data[key] = value
+
+    def flush(self) -> None:
+        """Close the chunk in progress, so that a crash loses nothing written before."""
+        try:
+            self._mcap.flush()  # type: ignore[no-untyped-call]
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def close(self) -> None:
+        """Write the index and metadata.yaml; the bag is whole after this.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses the data.
+        """
+        information = self._information()
+        try:
+            self._mcap.add_metadata(METADATA_RECORD, {"serialized_metadata": to_yaml(information)})
+            self._end_file()
+            write_metadata(self.directory, information)
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def end_early(self) -> dict[str, int]:
+        """Complete the bag after a `BagWriteError`, as far as what is written is whole.
+
+        What a full disk cut off is dropped; if there is no room for the index and metadata.yaml
+        either, the last chunks make room for them.
+
+        Returns
+        -------
+        dict of str to int
+            Messages of each topic that were taken and are not in the bag.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses that, too.
+        """
+        # The buffer's rest meets the same disk; the file is closed all the same.
+        with contextlib.suppress(OSError):
+            self._stream.close()
+        path = self.data_file
+        taken = self._files[-1].counts
+        try:
+            ending = McapEnding(path)
+            while True:
+                ending.write()
+                self._files[-1] = DataFile(path.name, ending.counts, *ending.times)
+                try:
+                    write_metadata(self.directory, self._information())
+                except OSError as error:
+                    if error.errno not in NO_ROOM:
+                        raise
+                    ending.give_back()
+                else:
+                    break
+        except OSError as error:
+            raise self._failure(error) from error
+        kept = self._files[-1].counts
+        missing = {topic: count - kept.get(topic, 0) for topic, count in taken.items()}
+        return {topic: count for topic, count in missing.items() if count}
+
+    def update_metadata(self) -> None:
+        """Write metadata.yaml again, with custom data that came after the end.
+
+        Raises
+        ------
+        BagWriteError
+            If the disk refuses it; the file that is there stays as it is.
+        """
+        try:
+            write_metadata(self.directory, self._information())
+        except OSError as error:
+            raise self._failure(error) from error
+
+    def _begin_file(self) -> None:
+        name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
+        self._stream: IO[bytes] = (self.directory / name).open("xb")
+        # Held until the file is closed: `recover` keeps off a bag that is being recorded.
+        fcntl.flock(self._stream, fcntl.LOCK_EX)
+        self._files.append(DataFile(name))
+        self._file_bytes = 0
+        self._schemas: dict[tuple[str, str], int] = {}
+        self._channels: list[int] = []
+        self._mcap = Writer(
+            self._stream, chunk_size=self._chunk_size, compression=self._compression
+        )
+        self._mcap.start(profile="ros2", library=LIBRARY)
+        self._mcap.add_metadata(METADATA_RECORD, {DISTRO_KEY: self._distribution})
+        for topic in self._topics:
+            self._register(topic)
+
+    def _end_file(self) -> None:
+        self._mcap.finish()  # type: ignore[no-untyped-call]
+        self._stream.flush()
+        os.fsync(self._stream.fileno())
+        self._stream.close()
+
+    def _split(self) -> None:
+        self._end_file()
+        self._begin_file()
+
+    def _register(self, topic: BagTopic) -> None:
+        key = (topic.type_name, topic.definition)
+        if key not in self._schemas:
+            self._schemas[key] = self._mcap.register_schema(
+                topic.type_name, "ros2msg", topic.definition.encode()
+            )
+        self._channels.append(
+            self._mcap.register_channel(
+                topic.name, "cdr", self._schemas[key], topic.channel_metadata()
+            )
+        )
+
+    def _failure(self, error: OSError) -> BagWriteError:
+        return BagWriteError(f"cannot write {self.data_file}: {error.strerror}")
+
+    def _information(self) -> dict[str, object]:
+        return bag_information(self._files, self._topics, self._custom_data, self._distribution)
+
+
+def refuse_existing_bag(directory: Path) -> None:
+    """Raise a `UserError` if a directory holds (a part of) a bag already, or is a file."""
+    if directory.exists() and not directory.is_dir():
+        raise UserError(f"cannot record into {directory}: it is a file")
+    if (directory / METADATA_FILE).exists() or any(directory.glob("*.mcap")):
+        raise UserError(f"{directory} holds a bag already: name a new directory")

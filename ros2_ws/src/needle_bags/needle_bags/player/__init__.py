@@ -1,0 +1,1 @@
+"""What of a bag is played, when, and under which names."""

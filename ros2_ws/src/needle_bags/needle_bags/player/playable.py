@@ -1,0 +1,37 @@
+"""Which recorded topics can be played with the message types that are installed."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from needle_bags.format.bag_metadata import BagTopic
+from needle_bags.format.message_definitions import full_definition, type_hash
+from needle_common.errors import UserError
+
+
+def unplayable(topic: BagTopic) -> str:
+    """Return why a topic cannot be played here; an empty text if it can."""
+    try:
+        installed = full_definition(topic.type_name)
+        message_class(topic.type_name)
+        here = type_hash(topic.type_name, installed)
+        there = topic.type_hash or (
+            type_hash(topic.type_name, topic.definition) if topic.definition else here
+        )
+    except UserError as error:
+        return str(error)
+    except (ImportError, AttributeError, ValueError):
+        return f"{topic.type_name} is not installed"
+    if here != there:
+        return (
+            f"{topic.type_name} is defined otherwise in this bag than here (another ROS "
+            "distribution): play it where it was recorded"
+        )
+    return ""
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of an installed type's messages; raises where it is not installed."""
+    package, kind, short = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), short)

@@ -1,0 +1,162 @@
+"""The command line of `player`."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from needle_bags.format.topic_choice import TopicChoice
+from needle_bags.reading.bag_files import BagContents
+from needle_common.commands.options import CommandParser
+from needle_common.errors import OutOfBoundsError, UserError
+
+_DESCRIPTION = """\
+Plays a bag: sends its messages again, in their order and at their distances, with the quality of
+service that they were recorded with. Late subscribers get the last message of topics that were
+transient local.
+
+It never speaks to a rig. Commands (device/joint_trajectory), holds (device/hold), emergency stops
+(device/estop), targets (target_plane) and /parameter_events are played under /replay only. Beside
+a living rig (something publishes device/status) everything is; a rig that comes up later ends the
+playing.
+"""
+_EPILOG = """\
+While it plays, in a terminal: the space bar pauses and goes on, up and down play a tenth faster
+and slower, right and left go five seconds on and back. From anywhere:
+  ros2 service call /player/pause std_srvs/srv/SetBool "{data: true}"
+  ros2 param set /player rate 0.5
+  ros2 param set /player seek 12.5       (seconds after the bag's first message)
+
+examples:
+  ros2 run needle_bags player bags/my_run
+  ros2 run needle_bags player bags/my_run --rate 0.5 --start 10 --end 20 --loop
+  ros2 run needle_bags player bags/my_run --topics needle/tip joint_states --paused
+  ros2 run needle_bags player bags/my_run --regex '^/needle/' --exclude-regex pose
+  ros2 run needle_bags player bags/my_run --remap needle/tip:=old/tip
+
+A recorded /clock is played like any topic; --clock makes one from the time of recording instead.
+Exit codes: 0 done, or ended by Ctrl-C; 1 a rig came up; 2 bad arguments, or a bag that cannot be
+played.
+"""
+MIN_RATE = 0.001
+MAX_RATE = 1000.0
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayerOptions:
+    """What to play, and how.
+
+    Attributes
+    ----------
+    bag : Path
+        The bag's directory.
+    rate : float
+        How many times faster than recorded.
+    start, end : float
+        From and to when, after the bag's first message [s].
+    topics : TopicChoice
+        Which topics.
+    remaps : dict of str to str
+        Absolute recorded name to absolute name.
+    loop, paused : bool
+        Begin again at the end; begin paused.
+    clock : float or None
+        Rate of a /clock with the time of recording [Hz].
+    """
+
+    bag: Path
+    rate: float = 1.0
+    start: float = 0.0
+    end: float = math.inf
+    topics: TopicChoice = dataclasses.field(default_factory=TopicChoice)
+    remaps: dict[str, str] = dataclasses.field(default_factory=dict)
+    loop: bool = False
+    paused: bool = False
+    clock: float | None = None
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        _require("--rate", self.rate, MIN_RATE, MAX_RATE, "-")
+        _require("--start", self.start, 0.0, 1e9, "s")
+        if self.clock is not None:
+            _require("--clock", self.clock, 0.1, 1000.0, "Hz")
+        if not self.end > self.start:
+            raise UserError(f"--end {self.end:g} s is not after --start {self.start:g} s")
+
+
+def parse_options(arguments: Sequence[str]) -> PlayerOptions:
+    """Return the options of a command line (without ROS arguments).
+
+    Raises
+    ------
+    UserError
+        If they are not what `--help` says.
+    """
+    parser = CommandParser("player", _DESCRIPTION, _EPILOG)
+
+    def add_regex(name: str, text: str) -> None:
+        parser.add_argument(name, default="", metavar="REGEX", help=text)
+
+    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
+    parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast")
+    parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin here [s]")
+    parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end here [s]")
+    parser.add_argument("--topics", nargs="+", default=[], metavar="T", help="only these topics")
+    add_regex("--regex", "topics in whose name this is found (and those of --topics)")
+    add_regex("--exclude-regex", "not those in whose name this is found, but for --topics")
+    parser.add_argument(
+        "--remap", nargs="+", default=[], metavar="A:=B", help="play topic A under the name B"
+    )
+    parser.add_argument("--loop", action="store_true", help="begin again at the end, until Ctrl-C")
+    parser.add_argument("--paused", action="store_true", help="begin paused")
+    parser.add_argument(
+        "--clock",
+        nargs="?",
+        type=float,
+        const=40.0,
+        metavar="HZ",
+        help="publish /clock from the time of recording (40 Hz) in place of a recorded one",
+    )
+    given = parser.parse_args(arguments)
+    return PlayerOptions(
+        given.bag,
+        given.rate,
+        given.start,
+        given.end,
+        TopicChoice(
+            tuple(_absolute(name) for name in given.topics), given.regex, given.exclude_regex
+        ),
+        dict(_remap(text) for text in given.remap),
+        given.loop,
+        given.paused,
+        given.clock,
+    )
+
+
+def require_fits(options: PlayerOptions, contents: BagContents) -> None:
+    """Raise a `UserError` if the options ask for what the bag does not have."""
+    known = contents.topics
+    for name in (*options.topics.names, *options.remaps):
+        if name not in known:
+            raise UserError(f"{name} is not in {options.bag}; it has {', '.join(known)}")
+    seconds = (contents.end - contents.start) / 1e9
+    if options.start > seconds:
+        raise UserError(f"--start {options.start:g} s: {options.bag} has {seconds:.1f} s only")
+
+
+def _remap(text: str) -> tuple[str, str]:
+    before, mark, after = text.partition(":=")
+    if not (before and mark and after):
+        raise UserError(f"--remap {text!r} is not of the form A:=B; see --help")
+    return _absolute(before), _absolute(after)
+
+
+def _absolute(name: str) -> str:
+    return name if name.startswith("/") else f"/{name}"
+
+
+def _require(name: str, value: float, lower: float, upper: float, unit: str) -> None:
+    if not lower <= value <= upper:
+        raise OutOfBoundsError(name, value, lower, upper, unit)

@@ -1,0 +1,1 @@
+"""What a recorded run says, straight from its bag."""

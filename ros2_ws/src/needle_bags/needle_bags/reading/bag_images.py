@@ -1,0 +1,113 @@
+"""Images in a bag: raw, or compressed as image_transport's `.../compressed` topics have them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from needle_bags.format.bag_copy import stamp_of
+from needle_bags.reading.bag_files import read_messages
+from needle_bags.reading.bag_order import raw_as_sent
+from needle_bags.reading.bag_reader import Run, nanoseconds
+from needle_common.errors import UserError
+
+SIDES = ("left", "right")
+TOPICS = {
+    f"stereo/{side}/image_raw{ending}": side for side in SIDES for ending in ("", "/compressed")
+}
+"""Relative topic to the side whose images it carries."""
+
+Stamps = npt.NDArray[np.int64]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlainImage:
+    """What a sensor_msgs/Image has, of an image that was compressed."""
+
+    header: Any
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: npt.NDArray[np.uint8]
+
+
+def plain_image(message: Any) -> Any:
+    """Return an image message with pixels: itself, or a compressed one uncompressed.
+
+    What cannot be uncompressed has no pixels, and its `encoding` says what it was.
+    """
+    if not hasattr(message, "format"):
+        return message
+    encoded = np.frombuffer(message.data, np.uint8)
+    try:
+        pixels = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED) if len(encoded) else None
+    except cv2.error:  # larger than OpenCV takes
+        pixels = None
+    if pixels is None or pixels.ndim != 2 or pixels.dtype != np.uint8:
+        return PlainImage(message.header, 0, 0, str(message.format), 0, np.empty(0, np.uint8))
+    height, width = pixels.shape
+    return PlainImage(message.header, height, width, "mono8", width, pixels.ravel())
+
+
+def pixels_of(image: Any, path: Path) -> npt.NDArray[np.uint8]:
+    """Return a mono image's pixels (H, W).
+
+    Raises
+    ------
+    UserError
+        If the message has more or fewer than it says; `path` names its bag.
+    """
+    size = (image.height, image.width)
+    if image.step < image.width or len(image.data) != image.height * image.step:
+        raise UserError(
+            f"{path}: an image says it has {size[0]} rows of {size[1]} pixels, and holds "
+            f"{len(image.data)} bytes"
+        )
+    rows = np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
+    return rows[:, : image.width]
+
+
+def exposures(run: Run) -> Stamps:
+    """Return the stamps of the left camera's images [ns], in order.
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    left = {run.namespace + topic for topic, side in TOPICS.items() if side == "left"}
+    sent = raw_as_sent(run.path, left.__contains__, left.__contains__)
+    return np.unique(np.array([stamp_of(message.data) for message in sent], np.int64))
+
+
+def images_at(run: Run, stamps: Stamps) -> Iterator[tuple[int, str, npt.NDArray[np.uint8]]]:
+    """Yield (index into `stamps`, side, mono image (H, W)) of images of exactly these stamps.
+
+    Parameters
+    ----------
+    run : Run
+        The run; its bag is read again.
+    stamps : (N,) int64
+        Times of exposure [ns].
+
+    Raises
+    ------
+    UserError
+        If the bag cannot be read.
+    """
+    wanted = {int(stamp): index for index, stamp in enumerate(stamps)}
+    names = {run.namespace + topic: side for topic, side in TOPICS.items()}
+    for topic, _, message in read_messages(run.path, lambda name: name in names):
+        index = wanted.get(nanoseconds(message.header.stamp))
+        if index is None:
+            continue
+        image = plain_image(message)
+        if image.encoding == "mono8":
+            yield index, names[topic], pixels_of(image, run.path)

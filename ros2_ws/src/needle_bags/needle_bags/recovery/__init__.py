@@ -1,0 +1,1 @@
+"""Bags made whole of what can be read in them."""

@@ -1,0 +1,1 @@
+"""The recorder's and the player's ROS side."""

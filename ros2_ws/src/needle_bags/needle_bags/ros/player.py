@@ -1,0 +1,398 @@
+"""Plays a bag; nothing of it reaches a rig."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import sys
+import time
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, Final, cast
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool
+from tqdm import tqdm
+
+from needle_bags.format.bag_metadata import BagTopic
+from needle_bags.player.playable import message_class, unplayable
+from needle_bags.player.playback import PlaybackClock, ReadAhead
+from needle_bags.player.player_options import (
+    MAX_RATE,
+    MIN_RATE,
+    PlayerOptions,
+    parse_options,
+    require_fits,
+)
+from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
+from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
+from needle_bags.reading.bag_files import BagContents, raw_messages, read_contents
+from needle_bags.ros.conversions import recorded_offer
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.process.end_request import EndRequest
+from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
+from needle_common.ros.conversions import RELIABLE, to_stamp
+from needle_common.ros.discovery import AnsweringNodes, full_name
+from needle_common.ros.parameters import NodeParameters
+from needle_common.settings.parameter_fields import check_fields, parameter
+
+CLOCK: Final = "/clock"
+# How long a rig that is there has to show itself before the first message; how much longer those
+# who listen have to learn of our publishers; and how often the graph is looked at then [s].
+DISCOVERY: Final = 2.0
+MATCHING: Final = 3.0
+LOOK_PERIOD: Final = 0.1
+ACKNOWLEDGED: Final = 5.0
+PATIENCE: Final = 0.02  # the longest that a signal, a key or a service call waits [s]
+_NANOSECONDS: Final = 1_000_000_000
+RATE_STEP: Final = 1.1
+SEEK_STEP: Final = 5 * _NANOSECONDS
+
+Message = tuple[str, int, bytes]
+
+
+@dataclasses.dataclass(frozen=True)
+class PlayerParameters:
+    """What can be set while it plays; the rest are options."""
+
+    rate: float = parameter(
+        1.0, unit="-", description="How many times faster.", lower=MIN_RATE, upper=MAX_RATE
+    )
+    seek: float = parameter(
+        0.0, unit="s", description="Set it to go there, after the first message.", lower=0.0
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
+
+
+class RigAppearedError(Exception):
+    """A rig came up while topics are played under their own names."""
+
+
+class Player(Node):
+    """Publishes a bag's messages when they are due."""
+
+    def __init__(self, options: PlayerOptions, contents: BagContents) -> None:
+        super().__init__("player")
+        self._options = options
+        self._contents = contents
+        self.start = contents.start + round(options.start * 1e9)
+        end = min(options.end, (contents.end - contents.start) / 1e9)
+        self.end = contents.start + round(end * 1e9)
+        self._topics = self._playable()
+        self._senders: dict[str, Publisher] = {}
+        self._diagnostics = DiagnosticsPublisher(self)
+        now = time.monotonic()
+        self.clock = PlaybackClock(options.rate, self.start, now, paused=options.paused)
+        self._clock_publisher: Publisher | None = None
+        self._next_clock = 0.0
+        self._looked_at = 0.0
+        self.beside_rig = False
+        self.messages = 0
+        self.sought: int | None = None  # where playing goes on [ns]
+        self._begin = self.start
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        NodeParameters(self, PlayerParameters)
+        self.set_parameters([Parameter("rate", value=options.rate)])
+        self.add_post_set_parameters_callback(self._on_parameters)
+
+    def _playable(self) -> dict[str, BagTopic]:
+        """Return the topics to play; say why others are left out."""
+        options, known = self._options, self._contents.topics
+        chosen = {name: topic for name, topic in known.items() if name in options.topics}
+        if not chosen:
+            raise UserError(f"{options.bag}: no topic is chosen; it has {', '.join(known)}")
+        if options.clock is not None:
+            chosen.pop(CLOCK, None)
+        playable = {}
+        for name, topic in chosen.items():
+            why = unplayable(topic)
+            if why:
+                self.get_logger().warning(f"{name} is not played: {why}")
+            else:
+                playable[name] = topic
+        if chosen and not playable:
+            raise UserError(f"{options.bag}: none of its topics can be played here")
+        return playable
+
+    def prepare(self, spin: partial[None], end: EndRequest) -> bool:
+        """Look for a rig, make the publishers, and wait for who listens already.
+
+        Returns
+        -------
+        bool
+            False where `end` was wanted meanwhile: then nothing is to be played.
+
+        Raises
+        ------
+        UserError
+            If a ROS remapping would bring a guarded topic to a rig.
+        """
+        self._make_publishers()
+        begin = time.monotonic()
+        while time.monotonic() < begin + DISCOVERY and not (self.beside_rig or end.wanted):
+            spin()
+            if self._rig() is not None:
+                self.get_logger().warning(f"a rig is on this graph: all is played under {REPLAY}")
+                self.beside_rig = True
+                self._make_publishers()
+                begin = time.monotonic()
+        answering = AnsweringNodes(self)
+        while time.monotonic() < begin + DISCOVERY + MATCHING and not end.wanted:
+            if self._all_matched() and answering.all_of(self._listeners()):
+                break
+            spin()
+        answering.close()
+        if end.wanted:
+            return False
+        self._publish_latched(self.start)
+        self.clock.restart(self.start, time.monotonic())
+        return True
+
+    def _make_publishers(self) -> None:
+        for sender in self._senders.values():
+            self.destroy_publisher(sender)
+        if self._clock_publisher is not None:
+            self.destroy_publisher(self._clock_publisher)
+        self._senders = {name: self._publisher(topic) for name, topic in self._topics.items()}
+        if self._options.clock is not None:
+            name = played_name(CLOCK, "rosgraph_msgs/msg/Clock", {}, beside_rig=self.beside_rig)
+            self._clock_publisher = self.create_publisher(Clock, name, RELIABLE)
+
+    def _publisher(self, topic: BagTopic) -> Publisher:
+        name = played_name(
+            topic.name, topic.type_name, self._options.remaps, beside_rig=self.beside_rig
+        )
+        publisher = self.create_publisher(
+            message_class(topic.type_name),
+            name,
+            recorded_offer(topic.type_name, topic.offered_qos),
+        )
+        # Remappings of the ROS command line come after ours.
+        final = publisher.topic_name
+        if not final.startswith(f"{REPLAY}/") and (
+            self.beside_rig
+            or is_guarded(final, topic.type_name)
+            or is_guarded(topic.name, topic.type_name)
+        ):
+            raise UserError(f"{topic.name} may not be played as {final}: a rig would obey it")
+        return publisher
+
+    def _all_matched(self) -> bool:
+        return all(
+            publisher.get_subscription_count() >= self.count_subscribers(publisher.topic_name)
+            for publisher in self._senders.values()
+        )
+
+    def _listeners(self) -> set[str]:
+        """Return the full names of the nodes that subscribe to what is played."""
+        return {
+            full_name(info.node_namespace, info.node_name)
+            for sender in self._senders.values()
+            for info in self.get_subscriptions_info_by_topic(sender.topic_name)
+            if not info.node_name.startswith("_")
+        } - {self.get_fully_qualified_name()}
+
+    def _publish_latched(self, before: int) -> None:
+        """Publish what late joiners would have got at a time of recording [ns]."""
+        latched = {
+            name
+            for name, topic in self._topics.items()
+            if any(offer.durability == "transient_local" for offer in topic.offered_qos)
+        }
+        if before == self._contents.start or not latched:
+            return
+        last: dict[str, Message] = {}
+        for message in raw_messages(self._options.bag, latched, self._contents.start, before):
+            last[message[0]] = message
+        for message in sorted(last.values(), key=lambda one: one[1]):
+            self.publish(message)
+
+    def read(self) -> Iterator[Message]:
+        """Yield the messages to play, in order, from where playing begins."""
+        return raw_messages(self._options.bag, set(self._topics), self._begin, self.end + 1)
+
+    def seek(self, time: int) -> None:
+        """Go on at another time of recording [ns], or at the nearest that the bag has."""
+        self.sought = min(max(time, self._contents.start), self.end)
+
+    def begin(self) -> None:
+        """Go to where playing goes on: where somebody wanted, or the start."""
+        self._begin = self.start if self.sought is None else self.sought
+        if self.sought is not None:
+            self._publish_latched(self._begin)
+        self.sought = None
+        self.clock.restart(self._begin, time.monotonic())
+
+    def press(self, key: str) -> None:
+        """Do what a key in the terminal stands for."""
+        now = time.monotonic()
+        if key == PAUSE:
+            self.pause(not self.clock.is_paused)
+        elif key in (FASTER, SLOWER):
+            rate = self.clock.rate * (RATE_STEP if key == FASTER else 1.0 / RATE_STEP)
+            self.set_parameters([Parameter("rate", value=min(max(rate, MIN_RATE), MAX_RATE))])
+        elif key in (BACK, ON):
+            self.seek(self.clock.time(now) + (SEEK_STEP if key == ON else -SEEK_STEP))
+
+    def publish(self, message: Message) -> None:
+        """Send one message."""
+        self._senders[message[0]].publish(message[2])
+        self.messages += 1
+
+    def look_around(self) -> None:
+        """Publish the clock and the state; see whether a rig has come up.
+
+        Raises
+        ------
+        RigAppearedError
+            If one has, while topics are played under their own names.
+        """
+        now = time.monotonic()
+        if self._clock_publisher is not None and now >= self._next_clock:
+            self._next_clock = now + 1.0 / cast(float, self._options.clock)
+            self._clock_publisher.publish(Clock(clock=to_stamp(self.clock.time(now))))
+        if now - self._looked_at < LOOK_PERIOD:
+            return
+        self._looked_at = now
+        rig = None if self.beside_rig else self._rig()
+        if rig is not None:
+            raise RigAppearedError(rig)
+        state = "paused" if self.clock.is_paused else "playing"
+        values = {"bag": str(self._options.bag), "messages": str(self.messages)}
+        self._diagnostics.set("playback", Diagnostic(Level.OK, state, values))
+
+    def pause(self, paused: bool) -> None:
+        """Stop or go on."""
+        self.clock.pause(paused, time.monotonic())
+
+    def finish(self) -> None:
+        """Wait until all that listen have everything."""
+        timeout = Duration(seconds=ACKNOWLEDGED)
+        for publisher in self._senders.values():
+            publisher.wait_for_all_acked(timeout)
+
+    def _rig(self) -> str | None:
+        """Return what makes a rig of this graph."""
+        for name, _ in self.get_topic_names_and_types():
+            if marks_a_rig(name):
+                for info in self.get_publishers_info_by_topic(name):
+                    if info.node_name != self.get_name():
+                        return f"{info.node_name} publishes {name}"
+        return None
+
+    def _on_parameters(self, changes: list[Parameter[Any]]) -> None:
+        for change in changes:
+            if change.name == "rate":
+                self.clock.set_rate(change.value, time.monotonic())
+            elif change.name == "seek":
+                self.seek(self._contents.start + round(change.value * _NANOSECONDS))
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> Any:
+        self.pause(request.data)
+        response.success = True
+        response.message = "paused" if request.data else "playing"
+        return response
+
+
+def _play(player: Player, loop: bool, end: EndRequest) -> int:
+    executor = executor_of(player)
+    bar = tqdm(
+        total=round((player.end - player.start) / _NANOSECONDS, 1),
+        unit="s",
+        disable=None,
+        leave=False,
+        bar_format="{desc} {bar} {n:.1f}/{total:.1f} s, space bar and arrows",
+    )
+    with bar, Keys() as keys:
+        if not player.prepare(partial(executor.spin_once, 0.05), end):
+            return EXIT_DONE
+        while True:
+            with contextlib.closing(ReadAhead(player.read)) as source:
+                message = source.next()
+                while message is not None and player.sought is None:
+                    # A turn of the executor costs more than a message: take it now and then.
+                    wait = player.clock.wait(message[1], time.monotonic())
+                    turn = time.monotonic() + PATIENCE
+                    while wait == 0.0 and message is not None and time.monotonic() < turn:
+                        player.publish(message)
+                        message = source.next()
+                        if message is not None:
+                            wait = player.clock.wait(message[1], time.monotonic())
+                    executor.spin_once(min(wait, PATIENCE))
+                    player.look_around()
+                    if end.wanted:
+                        return EXIT_DONE
+                    for key in keys.pressed():
+                        player.press(key)
+                    elapsed = player.clock.time(time.monotonic()) - player.start
+                    bar.n = min(bar.total, elapsed / _NANOSECONDS)
+                    bar.set_description("paused" if player.clock.is_paused else "playing")
+            if not loop and player.sought is None:
+                player.finish()
+                return EXIT_DONE
+            player.begin()
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the player; returns the exit code."""
+    argv = list(sys.argv if args is None else args)
+    own, ros = _split(argv[1:])
+
+    def command() -> int:
+        options = parse_options(own)
+        contents = read_contents(options.bag)
+        require_fits(options, contents)
+
+        def spin(node: Node, end: EndRequest) -> int:
+            player = cast(Player, node)
+            try:
+                code = _play(player, options.loop, end)
+            except RigAppearedError as error:
+                print(
+                    f"error: a rig came up on this graph ({error}): playing ended; give one of "
+                    "the two a ROS_DOMAIN_ID of its own",
+                    file=sys.stderr,
+                )
+                return EXIT_MISSED
+            print(f"played {player.messages} messages of {options.bag}")
+            return code
+
+        return run_node(
+            lambda: Player(options, contents),
+            help_text="",
+            parameters=PlayerParameters,
+            args=[argv[0], *ros],
+            spin=spin,
+        )
+
+    return run_command(command)
+
+
+def _split(arguments: list[str]) -> tuple[list[str], list[str]]:
+    """Return (own arguments, those from `--ros-args` to `--`).
+
+    rclpy's own way takes every `A:=B` for a remapping of its own.
+    """
+    own: list[str] = []
+    ros: list[str] = []
+    inside = False
+    for argument in arguments:
+        inside = (inside or argument == "--ros-args") and argument != "--"
+        if inside:
+            ros.append(argument)
+        elif argument != "--":
+            own.append(argument)
+    return own, ros
+
+
+if __name__ == "__main__":
+    sys.exit(main())

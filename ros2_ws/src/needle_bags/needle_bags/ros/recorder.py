@@ -1,0 +1,324 @@
+"""Records every topic of the graph, with what is needed to repeat the run, into one bag."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import yaml
+from diagnostic_msgs.msg import DiagnosticStatus
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from std_srvs.srv import Trigger
+
+from needle_bags.format.bag_metadata import BagTopic
+from needle_bags.recording.allocator import keep_freed_memory
+from needle_bags.recording.not_understood import NotUnderstood
+from needle_bags.recording.provenance import commit, distribution, versions
+from needle_bags.recording.recorder_health import RecorderHealth
+from needle_bags.recording.recording import Received, Recording
+from needle_bags.ros.graph_topics import GraphTopics
+from needle_bags.ros.parameter_snapshots import ParameterSnapshots
+from needle_bags.ros.recorder_parameters import PARAMETERS_OF, RecorderParameters
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.files.bag_directory import recover_hint
+from needle_common.process.end_request import EndRequest
+from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.ros.parameters import NodeParameters
+
+HELP = """
+recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
+
+Topics that appear later are recorded too, images included, but for pictures that were drawn for a
+person to look at (`exclude_regex`). The bag also carries the message definitions, all nodes'
+parameters and their changes, versions and commit. Ctrl-C ends the recording and completes the
+bag. Written out ten times a second: what a crash or kill -9 leaves is made whole by
+`ros2 run needle_bags recover BAG`.
+
+  ros2 run needle_bags recorder --ros-args -p bag:=bags/my_run
+  ros2 run needle_bags recorder --ros-args -p topics:='[/needle/tip, /joint_states]'
+  ros2 run needle_bags recorder --ros-args -p snapshot_seconds:=20.0
+
+With `snapshot_seconds` the last seconds are kept in memory, and written only when somebody asks
+(service ~/snapshot, std_srvs/Trigger) or a second after a device/status says FAULT or ESTOPPED.
+Each snapshot goes into the same bag; what was written is not kept for the next.
+
+Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost,
+what came cannot be understood (it is recorded all the same) or the disk is nearly full. Down to
+`reserve` the recording ends, the bag is completed, and the node stays to say so; the rest of the
+graph goes on.
+Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters.
+"""
+
+GRAPH_PERIOD = 0.1
+# What the graph still sends when all nodes end together is waited for this long.
+LAST_WORDS = 0.3
+LAST_WORDS_LIMIT = 1.0
+REPORT_PERIOD = 0.5
+# What is said of a fault comes a little after it [s].
+AFTERMATH = 1.0
+PARAMETER_EVENTS = "/parameter_events"
+DEVICE_STATUS = "/device/status"
+FAULTS = ("FAULT", "ESTOPPED")
+
+
+class Recorder(Node):
+    """Subscribes to whatever the graph has and hands it to a `Recording`."""
+
+    def __init__(self) -> None:
+        super().__init__("recorder")
+        self._settings = NodeParameters(self, RecorderParameters).values
+        bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")
+        calibration = _read_calibration(self._settings.calibration_file)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._topics = GraphTopics(self, self._settings.choice, self._take_topic, self._take)
+        self._not_understood = NotUnderstood()
+        self._recent = self._settings.recent
+        self._states: dict[str, str] = {}
+        self._snapshot_due: tuple[float, str] | None = None
+        self._nodes: list[str] = []
+        self._told: str = ""
+        self.bag = Path(bag)
+        self.recording = Recording(
+            self.bag,
+            distribution=distribution(),
+            max_file_size=self._settings.max_file_size,
+            compression=self._settings.compression,
+            reserve=self._settings.reserve,
+        )
+        self._health = RecorderHealth(self.recording, self.bag)
+        try:
+            self._write_provenance(calibration)
+            self._snapshots = ParameterSnapshots(self, self._take_parameters)
+            if self._recent is not None:
+                self.create_service(Trigger, "~/snapshot", self._on_snapshot)
+            self._poll_graph()
+            self.create_timer(GRAPH_PERIOD, self._poll_graph, clock=STEADY_CLOCK)
+            self.create_timer(REPORT_PERIOD, self.report, clock=STEADY_CLOCK)
+        except BaseException:
+            self.recording.close()
+            raise
+        self.get_logger().info(f"recording into {self.bag}")
+
+    def _write_provenance(self, calibration: str) -> None:
+        texts = {
+            "run_info": self._settings.run_info,
+            "versions": json.dumps(versions()),
+            "commit": commit(),
+            "calibration": calibration,
+        }
+        for key, text in texts.items():
+            self.recording.set_custom_data(key, text)
+        self.recording.add_record("needle_run", texts)
+        if calibration:
+            self.recording.add_file(
+                "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()
+            )
+
+    def _take_parameters(self, node: str, values: dict[str, Any]) -> None:
+        document = {node: {"ros__parameters": values}}
+        self.recording.add_record("parameters", {"node": node, "yaml": yaml.safe_dump(document)})
+        self._nodes.append(node)
+        self._diagnostics.set(PARAMETERS_OF, Diagnostic(Level.OK, ", ".join(self._nodes)))
+
+    def _take_parameter_event(self, message: Received) -> None:
+        changes = self._snapshots.take_event(deserialize_message(message.data, ParameterEvent))
+        for change in changes:
+            record = {key: yaml.safe_dump(value).split("\n")[0] for key, value in change.items()}
+            self.recording.add_record("parameter_change", record)
+
+    def _poll_graph(self) -> None:
+        if self.recording.error is not None:
+            self._topics.leave()
+        else:
+            self._topics.poll()
+            self._snapshots.poll()
+
+    def _take_topic(self, topic: BagTopic) -> None:
+        self.recording.add_topic(topic)
+        latched = any(offer.durability == "transient_local" for offer in topic.offered_qos)
+        if self._recent is not None and latched:
+            self._recent.latch(topic.name)
+
+    def _take(self, message: Received) -> None:
+        if self._recent is None:
+            self.recording.append(message)
+        else:
+            self._recent.put(message)
+            if message.topic.endswith(DEVICE_STATUS):
+                self._understand(message, self._take_device_status)
+        if message.topic == PARAMETER_EVENTS:
+            self._understand(message, self._take_parameter_event)
+
+    def _understand(self, message: Received, take: Callable[[Received], None]) -> None:
+        """Look into a message that is recorded, whatever is in it."""
+        try:
+            take(message)
+        except Exception as error:  # noqa: BLE001
+            self.note_not_understood(message.topic, error)
+
+    def note_not_understood(self, where: str, error: Exception) -> None:
+        """Count and tell what came from outside and could not be handled."""
+        if self._not_understood.add(where, error):
+            self.get_logger().warning(f"not understood: {where}: {error}")
+        self._diagnostics.set("input", self._not_understood.diagnostic())
+
+    def _take_device_status(self, message: Received) -> None:
+        status = deserialize_message(message.data, DiagnosticStatus)
+        state = next((pair.value for pair in status.values if pair.key == "state"), "")
+        if state in FAULTS and self._states.get(message.topic) != state:
+            why = f"{message.topic} says {state}"
+            self._snapshot_due = (time.monotonic() + AFTERMATH, why)
+        self._states[message.topic] = state
+
+    def _on_snapshot(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = self._write_snapshot("asked for")
+        response.success = self.recording.error is None
+        return response
+
+    def _write_snapshot(self, why: str) -> str:
+        """Hand over what is in memory; return what is said of it."""
+        if self._recent is None:
+            return ""
+        self._snapshot_due = None
+        seconds = self._recent.seconds
+        messages = self._recent.take()
+        self.recording.append_all(messages)
+        said = f"{len(messages)} messages of the last {seconds:.1f} s into {self.bag}: {why}"
+        record = {"why": why, "messages": str(len(messages)), "time_ns": str(time.time_ns())}
+        self.recording.add_record("snapshot", record)
+        self.get_logger().info(f"snapshot: {said}")
+        return said
+
+    def report(self) -> None:
+        """Publish the recording's health; write a snapshot that is due."""
+        if self._snapshot_due is not None and time.monotonic() >= self._snapshot_due[0]:
+            self._write_snapshot(self._snapshot_due[1])
+        recording = self.recording
+        lost = self._lost()
+        values = {
+            "bag": str(self.bag),
+            "topics": str(len(self._topics)),
+            "messages": str(recording.messages_received),
+            "messages_waiting": str(recording.messages_waiting),
+            "messages_lost": str(sum(lost.values())),
+            "size_bytes": str(recording.bytes_received),
+        }
+        if self._recent is not None:
+            values["in_memory_s"] = f"{self._recent.seconds:.1f}"
+            values["in_memory_bytes"] = str(self._recent.memory)
+        refused = list(self._topics.refused.values())
+        level, message = self._health.look(REPORT_PERIOD, lost, refused)
+        self._diagnostics.set("bag", Diagnostic(level, message, values))
+        # Once for each kind of trouble: the figures at the end of a message change.
+        kind = message.partition(":")[0]
+        if level is Level.OK or kind == self._told:
+            return
+        self._told = kind
+        if level is Level.ERROR:
+            self.get_logger().error(message)
+        else:
+            self.get_logger().warning(message)
+
+    def _lost(self) -> dict[str, int]:
+        """Return how many messages of which topic are not in the bag."""
+        lost = self._topics.lost
+        for name, count in list(self.recording.dropped.items()):
+            lost[name] = lost.get(name, 0) + count
+        return lost
+
+    def finish(self) -> int:
+        """Complete the bag; return the exit code and say one line about it."""
+        self._topics.describe_all()
+        if self._snapshot_due is not None:
+            self._write_snapshot(self._snapshot_due[1])
+        if self._snapshots.changes:
+            changes = yaml.safe_dump(self._snapshots.changes)
+            self.recording.set_custom_data("parameter_changes", changes)
+        parameters = yaml.safe_dump(self._snapshots.document())
+        self.recording.set_custom_data("parameters", parameters)
+        self.recording.add_file(
+            "parameters.yaml", "application/yaml", parameters.encode(), time.time_ns()
+        )
+        lost = self._lost()
+        if lost:
+            self.recording.set_custom_data("messages_lost", json.dumps(lost))
+        self.recording.close()
+        count = self.recording.messages_received
+        lost = self._lost()
+        if self.recording.error is not None:
+            state = (
+                "the bag is whole up to there"
+                if self.recording.is_whole
+                else recover_hint(self.bag)
+            )
+            print(f"error: recording ended: {self.recording.error}; {state}", file=sys.stderr)
+        else:
+            print(f"recorded {count} messages of {len(self._topics)} topics into {self.bag}")
+        if lost:
+            print(f"warning: messages lost: {json.dumps(lost)}", file=sys.stderr)
+        return EXIT_DONE if self.recording.error is None else EXIT_MISSED
+
+
+def _read_calibration(path: str) -> str:
+    if not path:
+        return ""
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserError(f"calibration_file: cannot read {path}: {error}") from error
+
+
+def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
+    """Let the executor do one thing; what others sent that it cannot do does not end the node."""
+    try:
+        executor.spin_once(timeout_sec=timeout)
+    except ExternalShutdownException:
+        raise
+    except Exception as error:  # noqa: BLE001
+        recorder.note_not_understood("a service or the graph", error)
+
+
+def main(args: list[str] | None = None) -> int:
+    """Run the recorder; returns the exit code."""
+    keep_freed_memory()
+
+    def spin(node: Node, end: EndRequest) -> int:
+        recorder = cast(Recorder, node)
+        executor = SingleThreadedExecutor()
+        executor.add_node(recorder)
+        try:
+            while not end.wanted:
+                _spin_once(executor, recorder, 0.1)
+            limit = time.monotonic() + LAST_WORDS_LIMIT
+            quiet = time.monotonic() + LAST_WORDS
+            while time.monotonic() < min(quiet, limit):
+                before = recorder.recording.messages_received
+                _spin_once(executor, recorder, 0.05)
+                if recorder.recording.messages_received > before:
+                    quiet = time.monotonic() + LAST_WORDS
+            return recorder.finish()
+        finally:
+            recorder.recording.close()
+
+    return run_node(
+        Recorder,
+        help_text=HELP,
+        parameters=RecorderParameters,
+        args=args,
+        spin=spin,
+        # A bag is made whole however long its disk takes.
+        grace=None,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,89 @@
+"""The recorder's parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_bags.format.bag_writer import COMPRESSIONS
+from needle_bags.format.topic_choice import TopicChoice
+from needle_bags.recording.recent_messages import RecentMessages
+from needle_bags.recording.recording import RESERVE
+from needle_common.errors import UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+
+# The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
+PARAMETERS_OF = "parameters_of"
+
+
+@dataclasses.dataclass(frozen=True)
+class RecorderParameters:
+    """What the recorder can be told."""
+
+    bag: str = fixed_parameter("", "-", "The bag's directory; empty: a new time-stamped one here.")
+    topics: tuple[str, ...] = fixed_parameter(
+        (), "-", "Names of topics to record; with neither these nor a regex: all.", texts=True
+    )
+    regex: str = fixed_parameter("", "-", "Topics in whose name this is found are recorded, too.")
+    exclude_regex: str = fixed_parameter(
+        "/annotated_image$",
+        "-",
+        "Topics in whose name this is found are not recorded, unless `topics` names them.",
+    )
+    snapshot_seconds: float = fixed_parameter(
+        0.0,
+        "s",
+        "Keep so much in memory and write it only when asked or on a fault; 0: write all.",
+        0.0,
+        3600.0,
+    )
+    snapshot_size: int = fixed_parameter(
+        500_000_000,
+        "B",
+        "Memory for it: images may fill it before the seconds are over.",
+        1_000_000,
+        2**40,
+    )
+    calibration_file: str = fixed_parameter(
+        "", "-", "A file to keep in the bag as calibration.yaml; a tracker that runs says its own."
+    )
+    run_info: str = fixed_parameter(
+        "", "-", "Text about the run to keep in the bag: YAML `key: value` lines or JSON."
+    )
+    max_file_size: int = fixed_parameter(
+        4_000_000_000,
+        "B",
+        "Messages in one data file, after which another is begun; 0: no bound.",
+        lower=0,
+    )
+    compression: str = fixed_parameter(
+        "none",
+        "-",
+        "Of the data: zstd takes a third of a core for noisy images.",
+        choices=COMPRESSIONS,
+    )
+    reserve: int = fixed_parameter(
+        RESERVE,
+        "B",
+        "Free space at which the recording ends; at most a tenth of the disk.",
+        lower=0,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
+        if not all(isinstance(name, str) for name in self.topics):
+            raise UserError(f"topics = {list(self.topics)} are not names")
+        _ = self.choice
+
+    @property
+    def choice(self) -> TopicChoice:
+        """The topics to record."""
+        names = (name if name.startswith("/") else f"/{name}" for name in self.topics)
+        return TopicChoice(tuple(names), self.regex, self.exclude_regex)
+
+    @property
+    def recent(self) -> RecentMessages | None:
+        """What keeps the last seconds, empty; None where everything is written."""
+        if not self.snapshot_seconds:
+            return None
+        return RecentMessages(self.snapshot_seconds, self.snapshot_size)

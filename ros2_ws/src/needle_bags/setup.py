@@ -1,0 +1,32 @@
+"""Install script of needle_bags; colcon calls it."""
+
+from glob import glob
+
+from setuptools import find_packages, setup
+
+PACKAGE = "needle_bags"
+
+setup(
+    name=PACKAGE,
+    version="0.1.0",
+    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
+    package_data={PACKAGE: ["py.typed"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
+        (f"share/{PACKAGE}", ["package.xml"]),
+        (f"share/{PACKAGE}/config", glob("config/*")),
+        (f"share/{PACKAGE}/launch", glob("launch/*.py")),
+    ],
+    zip_safe=False,
+    maintainer="Needle steering maintainers",
+    maintainer_email="maintainers@needle-steering.invalid",
+    description="Bags of the rig: recorder, player, recovery, and reading.",
+    license="Apache-2.0",
+    entry_points={
+        "console_scripts": [
+            "recorder = needle_bags.executables:recorder",
+            "player = needle_bags.executables:player",
+            "recover = needle_bags.executables:recover",
+        ]
+    },
+)

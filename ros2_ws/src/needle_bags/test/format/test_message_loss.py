@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import pytest
+
+from needle_bags.format.message_loss import CERTAIN_AFTER, SequenceGaps
+
+
+@pytest.mark.parametrize(
+    ("numbers", "missing"),
+    [
+        ((1, 2, 3, 4), 0),
+        ((7, 8, 9), 0),  # the recorder came late
+        ((1, 2, 5, 6), 2),
+        ((1, 3, 5), 2),
+        ((1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 20), 9),
+        ((1, 2, 1001, 3), 0),  # a second publisher that was not announced
+        ((8, 9, 1, 2, 3), 0),  # the publisher was started anew
+        ((5, 6, 6, 7), 0),  # a repeat
+    ],
+)
+def test_gaps(numbers: Sequence[int], missing: int) -> None:
+    gaps = SequenceGaps()
+    for number in numbers:
+        gaps.take(number)
+    assert gaps.missing == missing
+
+
+def test_a_jump_just_before_another_publisher_is_known_is_no_gap() -> None:
+    gaps = SequenceGaps()
+    for number in (1, 2, 3, 50):
+        gaps.take(number)
+    gaps.forget()
+    gaps.take(51)
+    assert gaps.missing == 0
+
+
+def test_a_gap_stays_when_publishers_change_later() -> None:
+    gaps = SequenceGaps()
+    for number in (1, *range(4, 5 + CERTAIN_AFTER)):
+        gaps.take(number)
+    gaps.forget()
+    assert gaps.missing == 2

@@ -1,0 +1,157 @@
+from __future__ import annotations
+
+import math
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from needle_bags.player.playback import READ_AHEAD, PlaybackClock, ReadAhead
+from needle_bags.player.player_options import parse_options
+from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
+from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, keys_in
+from needle_common.errors import UserError
+
+SECOND = 1_000_000_000
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+POSE = "geometry_msgs/msg/PoseStamped"
+POINT = "geometry_msgs/msg/PointStamped"
+
+
+def test_the_clock_runs_at_its_rate() -> None:
+    clock = PlaybackClock(2.0, 10 * SECOND, now=100.0)
+    assert clock.time(101.5) == 13 * SECOND
+    assert clock.wait(14 * SECOND, 101.5) == pytest.approx(0.5)
+    assert clock.wait(12 * SECOND, 101.5) == 0.0
+
+
+def test_a_pause_takes_no_time() -> None:
+    clock = PlaybackClock(1.0, 0, now=0.0)
+    clock.pause(True, 2.0)
+    assert clock.time(50.0) == 2 * SECOND
+    assert clock.wait(3 * SECOND, 50.0) == math.inf
+    clock.pause(False, 60.0)
+    assert clock.wait(3 * SECOND, 60.25) == pytest.approx(0.75)
+
+
+def test_another_rate_counts_from_now() -> None:
+    clock = PlaybackClock(1.0, 0, now=0.0)
+    clock.set_rate(4.0, 2.0)
+    assert clock.time(3.0) == 6 * SECOND
+    clock.pause(True, 3.0)
+    clock.set_rate(0.5, 9.0)
+    assert clock.time(9.0) == 6 * SECOND
+    clock.pause(False, 10.0)
+    assert clock.wait(7 * SECOND, 10.0) == pytest.approx(2.0)
+
+
+def test_arrows_are_keys_of_their_own() -> None:
+    assert keys_in(" \x1b[A\x1bOBx\x1b[C\x1b[D") == [PAUSE, FASTER, SLOWER, "x", ON, BACK]
+
+
+def test_beginning_paused() -> None:
+    clock = PlaybackClock(1.0, 5 * SECOND, now=0.0, paused=True)
+    assert clock.time(9.0) == 5 * SECOND
+    clock.restart(5 * SECOND, 9.0)
+    assert clock.is_paused
+
+
+def test_reading_ahead_keeps_order_and_bounds() -> None:
+    read: list[int] = []
+    full = threading.Event()
+
+    def items() -> Iterator[int]:
+        for number in range(1000):
+            read.append(number)
+            if number == READ_AHEAD:
+                full.set()
+            yield number
+
+    source = ReadAhead(items)
+    assert full.wait(10.0)
+    assert len(read) <= READ_AHEAD + 2
+    taken = [source.next() for _ in range(1001)]
+    assert taken == [*range(1000), None]
+    source.close()
+
+
+def test_reading_ahead_hands_on_errors_and_ends_early() -> None:
+    def broken() -> Iterator[int]:
+        yield 1
+        raise UserError("broken")
+
+    source = ReadAhead(broken)
+    assert source.next() == 1
+    with pytest.raises(UserError, match="broken"):
+        source.next()
+    source.close()
+    endless = ReadAhead(lambda: iter(range(10**9)))
+    endless.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "type_name"),
+    [
+        ("/device/joint_trajectory", TRAJECTORY),
+        ("/bench/device/joint_trajectory", TRAJECTORY),
+        ("/somewhere/else", TRAJECTORY),
+        ("/device/hold", "sensor_msgs/msg/Joy"),
+        ("/device/estop", "std_msgs/msg/Bool"),
+        ("/target_plane", POSE),
+        ("/rig/target_plane", POSE),
+        ("/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
+    ],
+)
+def test_what_a_rig_obeys_is_played_under_replay(name: str, type_name: str) -> None:
+    assert is_guarded(name, type_name)
+    assert played_name(name, type_name, {}) == f"/replay{name}"
+    assert played_name(name, type_name, {name: "/mine"}) == "/replay/mine"
+
+
+@pytest.mark.parametrize("name", ["/needle/tip", "/joint_states", "/clock", "/my_target_plane"])
+def test_other_topics_keep_their_names_unless_a_rig_is_there(name: str) -> None:
+    assert played_name(name, POINT, {}) == name
+    assert played_name(name, POINT, {}, beside_rig=True) == f"/replay{name}"
+
+
+def test_nothing_is_remapped_to_what_a_rig_obeys() -> None:
+    remaps = {"/needle/pose": "/target_plane", "/flag": "/device/estop"}
+    assert played_name("/needle/pose", POSE, remaps) == "/replay/target_plane"
+    assert played_name("/flag", "std_msgs/msg/Bool", remaps) == "/replay/device/estop"
+
+
+def test_a_replayed_name_stays() -> None:
+    assert played_name("/replay/device/hold", "sensor_msgs/msg/Joy", {}) == "/replay/device/hold"
+    assert marks_a_rig("/bench/device/status")
+    assert not marks_a_rig("/replay/device/status")
+
+
+def test_options() -> None:
+    line = "bag --rate 0.5 --start 1 --end 2 --topics needle/tip /clock --remap a:=/b --loop"
+    options = parse_options(line.split())
+    assert options.bag == Path("bag")
+    assert options.topics.names == ("/needle/tip", "/clock")
+    assert options.remaps == {"/a": "/b"}
+    assert options.loop
+    assert options.clock is None
+    assert parse_options(["bag", "--clock"]).clock == 40.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("", "required: BAG"),
+        ("bag --rate 0", "rate = 0 is outside"),
+        ("bag --rate nan", "rate = nan"),
+        ("bag --start 3 --end 3", "--end 3 s is not after --start 3 s"),
+        ("bag --remap a:b", "not of the form A:=B"),
+        ("bag --speed 2", "unrecognized arguments: --speed 2"),
+        ("bag --clock 0", "--clock = 0 Hz"),
+    ],
+)
+def test_bad_options_are_one_line(arguments: str, words: str) -> None:
+    with pytest.raises(UserError) as caught:
+        parse_options(arguments.split())
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,1 @@
+"""What the operator stand-in does, in which order."""

@@ -1,0 +1,309 @@
+"""What the operator stand-in does, in which order, and when it gives up: no ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+
+from needle_common.process.claim import WAY_OUT
+
+
+@dataclasses.dataclass(frozen=True)
+class ServiceCall:
+    """One service to call.
+
+    Attributes
+    ----------
+    service : str
+        Its relative name.
+    data : bool or None
+        The request of a std_srvs/SetBool; None for a std_srvs/Trigger.
+    """
+
+    service: str
+    data: bool | None = None
+
+
+HOME = ServiceCall("device/home")
+ENABLE = ServiceCall("device/enable", True)
+START = ServiceCall("plane_controller/start")
+PREPARATION = (ServiceCall("device/confirm_needle_out", True), HOME, ENABLE, START)
+DISABLE = ServiceCall("device/enable", False)
+# A rig that has not found all its partners yet refuses with this beginning: ask again.
+NOT_YET = "waiting for"
+RETRY_AFTER = 0.1
+# An answer can be lost for good: a server whose process does not know the client yet drops it, and
+# neither side is told. So long it is waited for before the call is made again [s].
+ASK_AGAIN = 1.0
+# What device/home answers when it has begun; anything else: there is nothing to wait for.
+HOMING = "homing"
+# Any other refusal may rest on news that are still under way (joints, the answer before this one).
+REFUSAL_PATIENCE = 2.0
+# A press that the device has not taken, or has forgotten because messages came late, counts again
+# only after a release: so long it is waited for the press, and so long it is then released [s].
+PRESS_PATIENCE = 2.0
+RELEASE_TIME = 0.25
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How the run ended.
+
+    Attributes
+    ----------
+    done : bool
+        Whether the controller reached its depth.
+    reason : str
+        One line for the person at the terminal.
+    prepared : bool
+        Whether the rig got ready at all.
+    interrupted : bool
+        Whether a signal ended it.
+    """
+
+    done: bool
+    reason: str
+    prepared: bool = True
+    interrupted: bool = False
+
+
+class OperatorSequence:
+    """Prepares the rig, keeps the hold while it steers, and ends with an outcome.
+
+    A call whose answer does not come is made again. Confirming and enabling twice is the same as
+    once; whether homing and start were taken is told by the statuses, before they are asked again.
+
+    All times are readings of one steady clock [s].
+
+    Parameters
+    ----------
+    now : float
+        Time of the start.
+    wait_timeout : float
+        How long the rig may take to get ready (partners, each service call's answer) [s].
+    stall_timeout : float
+        How long steering may show no progress [s].
+    look_around : float
+        How long another device has to show itself before anything is called [s].
+    """
+
+    def __init__(
+        self, now: float, *, wait_timeout: float, stall_timeout: float, look_around: float = 0.0
+    ) -> None:
+        self._wait_timeout = wait_timeout
+        self._stall_timeout = stall_timeout
+        self._deadline = now + wait_timeout
+        self._missing: Sequence[str] = ("everything",)
+        self._prepared = 0
+        self._pending = False
+        self._asked = False
+        self._retry_at = now + look_around
+        self._refusal = ""
+        self._refused_since: float | None = None
+        self._homed = False
+        self._moving = False
+        self._simulated = False
+        self._speaker = ""
+        self._devices: Sequence[str] = ()
+        self._homed_since_call = False
+        self._homing_seen = False
+        self._starts: int | None = None
+        self._starts_before = 0
+        self._progress: tuple[str, ...] = ()
+        self._progress_at = now
+        self._hold_counts = False
+        self._press_since = now
+        self._released_until = now
+        self.presses_again = 0
+        self.insertion = 0.0
+        self.depth: float | None = None
+        self.waits_because = ""
+        self.outcome: Outcome | None = None
+
+    @property
+    def steering(self) -> bool:
+        """Whether the preparation is over and the run is not."""
+        return self._prepared == len(PREPARATION) and self.outcome is None
+
+    def hold(self, now: float) -> bool:
+        """Return whether the hold is pressed."""
+        return self.steering and now >= self._released_until and self._may_act
+
+    @property
+    def touched(self) -> bool:
+        """Whether the drives may have been enabled, so that they must be disabled."""
+        return self._prepared >= 2
+
+    def see_missing(self, missing: Sequence[str]) -> None:
+        """Take the list of partners that are not there (empty: all are)."""
+        self._missing = missing
+
+    def next_call(self, now: float) -> ServiceCall | None:
+        """Return the service to call now; its answer goes to `take_answer`."""
+        waits = bool(self._missing) or now < self._retry_at or not self._may_act
+        if waits or self.outcome is not None or self._prepared == len(PREPARATION):
+            return None
+        call = PREPARATION[self._prepared]
+        if call == HOME and self._asked and self._moving:
+            return None
+        if call == ENABLE and not self._homed:
+            return None
+        if call == START and self._starts is None:
+            return None
+        self._homed_since_call = False
+        if not self._asked:
+            self._homing_seen = not self._homed
+            self._starts_before = self._starts or 0
+        self._asked = self._pending = True
+        self._retry_at = now + ASK_AGAIN
+        return call
+
+    def take_answer(self, call: ServiceCall, success: bool, message: str, now: float) -> None:
+        """Take an answer to `call`, however late; one to a call that is over changes nothing."""
+        wanted = self._prepared < len(PREPARATION) and call == PREPARATION[self._prepared]
+        if self.outcome is not None or not wanted:
+            return
+        self._pending = False
+        if success:
+            if message == HOMING:
+                # What was heard before the call is no news of this homing.
+                self._homed = self._homed_since_call
+            self._go_on(now)
+            return
+        self._refusal = message
+        self._retry_at = now + RETRY_AFTER
+        if message.startswith(NOT_YET):
+            self._refused_since = None
+        elif self._refused_since is None:
+            self._refused_since = now
+        elif now >= self._refused_since + REFUSAL_PATIENCE:
+            self._end(f"{call.service} was refused: {message}")
+
+    def _go_on(self, now: float) -> None:
+        self._prepared += 1
+        self._asked = self._pending = False
+        self._retry_at = now
+        self._refusal = ""
+        self._refused_since = None
+        self._deadline = now + self._wait_timeout
+        self._progress_at = self._press_since = now
+
+    def see_devices(self, names: Sequence[str]) -> None:
+        """Take who publishes device/status: with more than one, nobody knows what would move."""
+        self._devices = names
+        if len(names) > 1 and (self._prepared or self._asked):
+            self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
+
+    def see_device(self, values: Mapping[str, str], speaker: str, now: float) -> None:
+        """Take the key-values of device/status, and the full name of the node that says them."""
+        self._simulated = values.get("simulated") == "true"
+        self._speaker = speaker
+        if values.get("simulated") == "false":
+            self._end(
+                f"{speaker} is a real device, or not in simulated time (it says simulated = "
+                "false): there a person holds, no stand-in"
+            )
+            return
+        self._moving = values.get("state") == "MOVING"
+        self._homed = values.get("homed") == "true" and not self._moving
+        self._homed_since_call = self._homed
+        self._homing_seen = self._homing_seen or self._moving
+        if self._called(HOME) and self._homed and self._homing_seen:
+            self._go_on(now)
+        counts = bool(values.get("hold_owner"))
+        if self._hold_counts and not counts:
+            self._press_since = now
+        self._hold_counts = counts
+        if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
+            self._end(f"device {values['state']}: {_why(values)}")
+
+    def see_controller(self, values: Mapping[str, str], now: float) -> None:
+        """Take the key-values of needle/controller_status."""
+        self.insertion = _number(values.get("insertion_m")) or 0.0
+        self.depth = _number(values.get("depth_m"))
+        waits = values.get("state") == "WAITING_FOR_TIP"
+        self.waits_because = values.get("reason", "") if waits else ""
+        self._starts = int(_number(values.get("starts")) or 0)
+        started = self._starts > self._starts_before
+        if self._called(START) and started:
+            # The status can overtake the answer, which may be lost.
+            self._go_on(now)
+        progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
+        if progress != self._progress:
+            self._progress, self._progress_at = progress, now
+        if self.steering and started:
+            self._judge(values)
+
+    def _judge(self, values: Mapping[str, str]) -> None:
+        state = values.get("state", "")
+        if state == "DONE":
+            self.outcome = Outcome(
+                True, f"inserted {self.insertion * 1e3:.1f} mm in {values.get('step')} steps"
+            )
+        elif state == "FAULT":
+            self._end(f"plane_controller FAULT: {_why(values)}")
+        elif state == "IDLE":
+            self._end(f"plane_controller stopped: {_why(values)}")
+
+    def _called(self, call: ServiceCall) -> bool:
+        """Whether `call` has been made and its success is not known yet."""
+        return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
+
+    def interrupt(self) -> None:
+        """Take a signal to end."""
+        if self.outcome is None:
+            self.outcome = Outcome(False, "interrupted", interrupted=True)
+
+    def check_time(self, now: float) -> None:
+        """Press again where the hold does not count; end the run where the rig took too long."""
+        if self.outcome is not None:
+            return
+        if self.hold(now) and not self._hold_counts and now >= self._press_since + PRESS_PATIENCE:
+            self.presses_again += 1
+            self._released_until = self._press_since = now + RELEASE_TIME
+        if self._prepared < len(PREPARATION):
+            if now >= self._deadline:
+                self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
+        elif now >= self._progress_at + self._stall_timeout:
+            state = self._progress[0] if self._progress else "silent"
+            why = f": {self.waits_because}" if self.waits_because else ""
+            self._end(
+                f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
+                f"(plane_controller is {state}{why})"
+            )
+
+    @property
+    def _may_act(self) -> bool:
+        """Whether the only device that is there has said that it is simulated."""
+        return self._simulated and list(self._devices) == [self._speaker]
+
+    def hangs(self) -> str:
+        """Return what the preparation waits for."""
+        call = PREPARATION[self._prepared].service
+        if self._missing:
+            return "missing " + ", ".join(self._missing)
+        if self._pending:
+            return f"no answer from {call}"
+        if call == START.service and self._starts is None:
+            return "needle/controller_status has not been heard"
+        if not self._may_act:
+            names = ", ".join(self._devices)
+            return f"device/status of one simulated device is wanted, of {names} it is there"
+        return self._refusal or f"device/status does not say homed, {call} has to wait"
+
+    def _end(self, reason: str) -> None:
+        if self.outcome is None:
+            self.outcome = Outcome(False, reason, prepared=self._prepared == len(PREPARATION))
+
+
+def _why(values: Mapping[str, str]) -> str:
+    return values.get("reason") or values.get("fault") or "no reason given"
+
+
+def _number(text: str | None) -> float | None:
+    try:
+        number = float(text) if text else math.nan
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

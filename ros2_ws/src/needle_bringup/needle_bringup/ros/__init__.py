@@ -1,0 +1,1 @@
+"""The operator stand-in, and what the launch files share."""

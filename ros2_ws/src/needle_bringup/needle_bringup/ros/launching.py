@@ -1,0 +1,72 @@
+"""What both launch files share; the one module that needs `launch`, which PyPI does not have."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from launch import LaunchDescription
+from needle_bringup.simulation.launch_nodes import refuse_misspelt
+from needle_bringup.simulation.rig_configuration import PACKAGES
+from needle_bringup.simulation.simulate import RECORDER_GRACE
+from needle_common.settings.parameter_files import Parameters
+
+
+def describe(
+    arguments: Sequence[DeclareLaunchArgument],
+    nodes: Callable[[Mapping[str, str]], Parameters],
+) -> LaunchDescription:
+    """Return a graph that ends as soon as one of its nodes does.
+
+    Parameters
+    ----------
+    arguments : sequence of DeclareLaunchArgument
+        What the user can say, beside `namespace`; misspelt, it ends the launch likewise.
+    nodes : callable
+        Takes launch argument -> text, returns node -> parameter -> value; what it raises ends the
+        launch before a node is started.
+    """
+
+    def start(context: Any) -> list[Node]:
+        declared = [*(one.name for one in arguments), "namespace"]
+        refuse_misspelt(context.launch_configurations, declared)
+        given = {one.name: LaunchConfiguration(one.name).perform(context) for one in arguments}
+        namespace = LaunchConfiguration("namespace").perform(context)
+        return [_node(name, values, namespace) for name, values in nodes(given).items()]
+
+    namespace = DeclareLaunchArgument(
+        "namespace", default_value="", description="namespace of all nodes"
+    )
+    return LaunchDescription([*arguments, namespace, OpaqueFunction(function=start)])
+
+
+def _node(name: str, values: Mapping[str, Any], namespace: str) -> Node:
+    # One by one: a parameter file would have to name the node with its namespace, and what is
+    # named otherwise runs on its defaults.
+    ros_arguments = []
+    for parameter, value in _flat(values):
+        ros_arguments += ["-p", f"{parameter}:={json.dumps(value)}"]
+    # The recorder writes out what it still holds.
+    patience = {"sigterm_timeout": str(RECORDER_GRACE)} if name == "recorder" else {}
+    return Node(
+        package=PACKAGES[name],
+        executable=name,
+        namespace=namespace,
+        ros_arguments=ros_arguments,
+        output="screen",
+        on_exit=Shutdown(reason=f"{name} has ended"),
+        **patience,
+    )
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value

@@ -1,0 +1,1 @@
+"""One simulated run: its nodes, their parameters, their end."""

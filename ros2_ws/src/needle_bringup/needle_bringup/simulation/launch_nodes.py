@@ -1,0 +1,153 @@
+"""Which nodes the launch files start, with which parameters: from launch arguments. No ROS here."""
+
+from __future__ import annotations
+
+import difflib
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from needle_bags.format.bag_writer import refuse_existing_bag
+from needle_bringup.simulation.rig_configuration import NODES, command_line_parameters, merge
+from needle_bringup.simulation.simulate_options import parse
+from needle_common.errors import UserError
+from needle_common.settings.parameter_files import Parameters, read_parameters
+
+# Parameter that no file may set -> the launch argument that does.
+_OF_SIMULATION = {
+    "level": "level",
+    "seed": "seed",
+    "real_time_factor": "real_time_factor",
+    "lock_step": "real_time_factor",
+    "preset": "controller",
+    "bag": "bag",
+    "pty": "can",
+    "channel": "can",
+}
+_CLOSE = 0.84  # names that have so much in common are one, misspelt; ros_namespace is none
+_OF_RIG = {"calibration_file": "calibration", "bag": "bag"}
+
+
+def refuse_misspelt(given: Iterable[str], declared: Sequence[str]) -> None:
+    """Refuse launch arguments that are close to a declared one: launch takes any, in silence.
+
+    Others may be those of a launch file that includes this one.
+
+    Parameters
+    ----------
+    given : iterable of str
+        The names that launch knows.
+    declared : sequence of str
+        Those of the launch file.
+
+    Raises
+    ------
+    UserError
+        Names the argument, and the one that is meant.
+    """
+    for name in given:
+        meant = difflib.get_close_matches(name.lower(), declared, n=1, cutoff=_CLOSE)
+        if name not in declared and meant:
+            raise UserError(f"unknown argument {name}:=, did you mean {meant[0]}:=?")
+
+
+def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
+    """Return the nodes of simulation.launch.py: those of `simulate`, with the same parameters.
+
+    Parameters
+    ----------
+    arguments : mapping
+        Launch argument -> text: level, seed, real_time_factor, controller, operator, bag, can and
+        params.
+
+    Returns
+    -------
+    dict
+        Node -> parameter -> value.
+
+    Raises
+    ------
+    UserError
+        If an argument cannot be meant so, a file is missing, or the bag is there already.
+    """
+    words = []
+    for name in ("level", "seed", "real_time_factor", "controller"):
+        words += [f"--{name.replace('_', '-')}", arguments[name]]
+    bag = _new_bag(arguments["bag"])
+    parameters = command_line_parameters(parse(words), bag or Path())
+    for name, parameter in (("drive_emulator", "pty"), ("device_driver", "channel")):
+        if name in parameters:
+            parameters[name][parameter] = arguments["can"]
+    if arguments["operator"] == "false":
+        del parameters["operator"]
+    if bag is None:
+        del parameters["recorder"]
+        for values in parameters.values():
+            values.pop("wait_for_recorder", None)
+    return _with_file(parameters, arguments["params"], _OF_SIMULATION)
+
+
+def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
+    """Return the nodes of rig.launch.py.
+
+    Parameters
+    ----------
+    arguments : mapping
+        Launch argument -> text: calibration, drives, bag and params.
+
+    Returns
+    -------
+    dict
+        Node -> parameter -> value.
+
+    Raises
+    ------
+    UserError
+        If a file is missing or is not what it should be, or the bag is there already.
+    """
+    calibration = Path(arguments["calibration"]).expanduser().absolute()
+    if not calibration.is_file():
+        raise UserError(f"calibration:={arguments['calibration']}: no such file")
+    bag = _new_bag(arguments["bag"])
+    parameters: Parameters = {
+        # Hears cameras that publish best effort and such that do not.
+        "stereo_tracker": {"calibration_file": str(calibration), "reliable_images": False},
+        "plane_controller": {},
+    }
+    if bag is not None:
+        parameters["recorder"] = {"bag": str(bag), "run_info": json.dumps(dict(arguments))}
+    if arguments["drives"]:
+        driver = _read("drives", arguments["drives"])
+        if list(driver) != ["device_driver"]:
+            raise UserError(f"drives:={arguments['drives']}: wants one section, device_driver")
+        parameters.update(driver)
+    return _with_file(parameters, arguments["params"], _OF_RIG)
+
+
+def _with_file(parameters: Parameters, file: str, reserved: Mapping[str, str]) -> Parameters:
+    """Return the parameters with a parameter file on top."""
+    if not file:
+        return parameters
+    given = _read("params", file)
+    for node, values in given.items():
+        if node not in parameters:
+            raise UserError(f"params:={file}: {node} is not started with these arguments")
+        for name in values:
+            if name in reserved:
+                raise UserError(f"params:={file}: {node}: {name} is set by {reserved[name]}:=")
+    return merge(parameters, given)
+
+
+def _read(argument: str, file: str) -> Parameters:
+    path = Path(file).expanduser()
+    if not path.is_file():
+        raise UserError(f"{argument}:={file}: no such file")
+    return read_parameters(path, NODES)
+
+
+def _new_bag(text: str) -> Path | None:
+    if not text:
+        return None
+    bag = Path(text).expanduser().absolute()
+    refuse_existing_bag(bag)
+    return bag

@@ -1,0 +1,191 @@
+"""The rig's parameters, and what one run changes in them."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from needle_bringup.simulation.simulate_options import SimulateOptions
+from needle_common.errors import UserError
+from needle_common.settings.parameter_files import Parameters
+
+# Node -> its package, in the order in which they start.
+PACKAGES = {
+    "recorder": "needle_bags",
+    "sim_rig": "needle_sim",
+    "drive_emulator": "needle_sim",
+    "device_driver": "needle_device_driver",
+    "stereo_tracker": "needle_tracker",
+    "plane_controller": "needle_controller",
+    "operator": "needle_bringup",
+}
+NODES = tuple(PACKAGES)
+# Nodes that not every level runs -> the levels that do.
+_LEVELS = {
+    "drive_emulator": ("drive",),
+    "device_driver": ("drive",),
+    "stereo_tracker": ("camera", "drive"),
+}
+
+# A sensor without noise still has this bound for the controllers' design [m].
+SMALLEST_NOISE = 1e-5
+
+# Parameter that simulate sets -> the option that it comes from.
+OPTIONS = {
+    "level": "--level",
+    "seed": "--seed",
+    "initial_pitch": "--initial",
+    "initial_roll": "--initial",
+    "target_offset": "--initial",
+    "torsion_play": "--play-deg",
+    "torsion_lag": "--lag-mm",
+    "real_time_factor": "--real-time-factor",
+    "lock_step": "--real-time-factor",
+    "tip_noise": "--noise-mm",
+    "tip_covariance": "--noise-mm",
+    "tip_noise_bound": "--noise-mm",
+    "measurement_std": "--noise-mm",
+    "bag": "--bag",
+    "preset": "--controller",
+    "depth": "--depth-mm",
+}
+
+# How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
+# seven processes that start on two cores keep one waiting for a second [s].
+PATIENT_WATCHDOG = 5.0
+# The same in real time: as long as on a rig whose motors turn by themselves it may be [s].
+REAL_TIME_WATCHDOG = 0.5
+
+# Parameters of the recorder that leave something out of the bag.
+_CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
+
+
+def merge(*layers: Parameters) -> Parameters:
+    """Return the layers as one; later ones win, parameter by parameter."""
+    merged: Parameters = {}
+    for layer in layers:
+        for node, values in layer.items():
+            merged[node] = {**merged.get(node, {}), **values}
+    return merged
+
+
+def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
+    """Return the nodes that a run needs."""
+    return tuple(node for node in NODES if options.level in _LEVELS.get(node, (options.level,)))
+
+
+def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
+    """Return what the command line sets in the nodes that the run needs.
+
+    Parameters
+    ----------
+    options : SimulateOptions
+        The command line.
+    bag : Path
+        The bag's folder.
+    """
+    sim_rig: dict[str, Any] = {
+        "level": options.level,
+        "seed": options.seed,
+        "initial_pitch": math.radians(options.initial_pitch_deg),
+        "initial_roll": math.radians(options.initial_roll_deg),
+        "torsion_play": math.radians(options.play_deg),
+        "torsion_lag": options.lag_mm * 1e-3,
+        "real_time_factor": options.real_time_factor,
+        "wait_for_recorder": True,
+    }
+    if options.noise_mm is not None:
+        sim_rig["tip_noise"] = options.noise_mm * 1e-3
+    driver: dict[str, Any] = {
+        "link": "slcan",
+        "channel": str(can_adapter()),
+        "autostart": True,
+        "lock_step": options.real_time_factor == 0.0,
+        "wait_for_recorder": True,
+    }
+    driver["watchdog"] = driver["reply_age_limit"] = (
+        PATIENT_WATCHDOG if driver["lock_step"] else REAL_TIME_WATCHDOG
+    )
+    parameters: Parameters = {
+        "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
+        "sim_rig": sim_rig,
+        # Motors that move by a SYNC period with every SYNC repeat a run to the count.
+        "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},
+        "device_driver": driver,
+        "stereo_tracker": {"wait_for_recorder": True},
+        "plane_controller": {
+            "preset": options.controller,
+            "depth": options.depth_mm * 1e-3,
+            "target_offset": -options.initial_x_mm * 1e-3,
+            "wait_for_recorder": True,
+        },
+        "operator": {"wait_for_recorder": True},
+    }
+    if options.noise_mm is not None:
+        # The sensor's own data sheet: the controllers know how far off a tip can be.
+        bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
+        parameters["plane_controller"]["tip_covariance"] = "configured"
+        parameters["plane_controller"]["tip_noise"] = "bounded"
+        parameters["plane_controller"]["tip_noise_bound"] = bound
+        parameters["plane_controller"]["measurement_std"] = bound / math.sqrt(3.0)
+    for node, values in parameters.items():
+        values["use_sim_time"] = node != "recorder"
+    return {node: parameters[node] for node in nodes_of(options)}
+
+
+def can_adapter() -> Path:
+    """Return where this process' emulated CAN adapter is plugged in; gone when it has ended."""
+    return Path(tempfile.gettempdir()) / f"needle_can_{os.getpid()}"
+
+
+def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> None:
+    """Refuse a parameter file that contradicts the command line.
+
+    Raises
+    ------
+    UserError
+        If the file sets what an option sets, a node that this level does not run, or what the
+        recorder leaves out.
+    """
+    reserved = command_line_parameters(options, Path())
+    for node, values in given.items():
+        if node not in reserved:
+            raise UserError(f"{path}: {node} does not run at level {options.level}")
+        for name in values:
+            if name in reserved[node]:
+                option = OPTIONS.get(name)
+                hint = f"use {option}" if option else "simulate sets it itself"
+                raise UserError(f"{path}: {node}: {name} does not go into the file, {hint}")
+    chosen = [name for name in given.get("recorder", {}) if name in _CHOICES]
+    if chosen:
+        why = "simulate waits for a recorder of everything and reports the whole run"
+        raise UserError(f"{path}: recorder: {chosen[0]} does not go into the file: {why}")
+
+
+def run_info(options: SimulateOptions) -> dict[str, Any]:
+    """Return what the bag says about how it was made."""
+    return {
+        "level": options.level,
+        "controller": options.controller,
+        "seed": options.seed,
+        "initial_x_mm": options.initial_x_mm,
+        "initial_pitch_deg": options.initial_pitch_deg,
+        "initial_roll_deg": options.initial_roll_deg,
+        "noise_mm": options.noise_mm,
+        "depth_mm": options.depth_mm,
+        "play_deg": options.play_deg,
+        "lag_mm": options.lag_mm,
+        "real_time_factor": options.real_time_factor,
+    }
+
+
+def write_parameters(path: Path, parameters: Parameters) -> None:
+    """Write a ROS parameter file."""
+    document = {node: {"ros__parameters": values} for node, values in parameters.items()}
+    path.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")

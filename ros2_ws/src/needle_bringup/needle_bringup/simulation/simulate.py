@@ -1,0 +1,351 @@
+"""Supervises one simulated run: starts the nodes, waits, ends them, reports. No ROS in here."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from types import FrameType, ModuleType
+
+from needle_bringup.operator.progress import PROGRESS_FD
+from needle_bringup.simulation.installed import find_executable
+from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.rig_configuration import (
+    NODES,
+    PACKAGES,
+    command_line_parameters,
+    merge,
+    nodes_of,
+    refuse_reserved,
+    write_parameters,
+)
+from needle_bringup.simulation.simulate_options import SimulateOptions, parse
+from needle_common.commands.cli import (
+    EXIT_BAD_INPUT,
+    EXIT_DONE,
+    EXIT_MISSED,
+    JsonValue,
+    run_command,
+    write_json,
+)
+from needle_common.errors import UserError
+from needle_common.process.ros_domain import own_domain
+from needle_common.settings.parameter_files import Parameters, read_parameters
+
+LOGS = "logs"
+PARAMETERS = "parameters.yaml"
+METADATA = "metadata.yaml"
+SUMMARY = "summary.json"
+REPORT = "report.html"
+POLL = 0.05
+# When the nodes have started, one core has time for this process [s].
+QUIET_AFTER = 4.0
+# rclpy's own log files would double those in LOGS.
+ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
+# The recorder writes out what it still holds: a slow disk may take its time.
+RECORDER_GRACE = 30.0
+# Set by scripts/simulate: when the command was given, in seconds since the epoch.
+STARTED_AT = "NEEDLE_STARTED_AT"
+
+
+class NodeFailedError(UserError):
+    """A node that ended before its time.
+
+    Parameters
+    ----------
+    node : NodeProcess
+        Which one.
+    """
+
+    def __init__(self, node: NodeProcess) -> None:
+        self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != "operator"
+        where = "" if self.is_bad_input else f" (all it said is in {node.log})"
+        super().__init__(node.describe_end() + where)
+
+
+class Interruption:
+    """SIGINT, SIGTERM and SIGHUP as a flag that is looked at between steps."""
+
+    def __init__(self) -> None:
+        self._seen = False
+        self._at_once = False
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # nohup's wish is to outlive the terminal
+            if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
+                continue
+            signal.signal(number, self._take)
+
+    @contextlib.contextmanager
+    def at_once(self) -> Iterator[None]:
+        """Let a signal raise KeyboardInterrupt wherever the context is, not only in `check`."""
+        self._at_once = True
+        try:
+            self.check()
+            yield
+        finally:
+            self._at_once = False
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal has come."""
+        if self._seen:
+            raise KeyboardInterrupt
+
+    def _take(self, _number: int, _frame: FrameType | None) -> None:
+        first = not self._seen
+        self._seen = True
+        if first and self._at_once:
+            raise KeyboardInterrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `simulate`; returns its exit code."""
+    interruption = Interruption()
+    if STARTED_AT in os.environ:
+        _end_with_parent()
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: simulate(parse(words), interruption))
+
+
+def simulate(options: SimulateOptions, interruption: Interruption) -> int:
+    """Run one simulation as asked.
+
+    Parameters
+    ----------
+    options : SimulateOptions
+        What to run.
+    interruption : Interruption
+        Tells when to give up.
+
+    Returns
+    -------
+    int
+        0 converged, 1 ran but missed.
+
+    Raises
+    ------
+    UserError
+        Where something is broken or missing.
+    KeyboardInterrupt
+        After an interrupt, when everything has ended.
+    """
+    started_at = float(os.environ.get(STARTED_AT) or time.time())
+    given: Parameters = {}
+    if options.params is not None:
+        given = read_parameters(options.params, NODES)
+        refuse_reserved(options.params, given, options)
+    executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
+    bag = _make_folder(options)
+    parameters = merge(command_line_parameters(options, bag), given)
+    interruption.check()
+    try:
+        with own_domain() as domain:
+            write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
+            done = _run_nodes(executables, bag, domain, interruption)
+        return _report(options, bag, started_at, interruption, done=done)
+    except NodeFailedError as error:
+        # Bad input leaves nothing behind; what broke leaves its logs.
+        if error.is_bad_input:
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
+    except KeyboardInterrupt:
+        if not (bag / METADATA).exists():
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
+
+
+def _run_nodes(
+    executables: dict[str, str], bag: Path, domain: int, interruption: Interruption
+) -> bool:
+    """Run the graph until the operator ends; whether the needle reached its depth."""
+    logs = bag / LOGS
+    logs.mkdir()
+    progress = os.dup(sys.stderr.fileno())
+    environment = {
+        **os.environ,
+        "ROS_DOMAIN_ID": str(domain),
+        # Nodes write into their log files; only the operator's progress goes to the terminal.
+        PROGRESS_FD: str(progress),
+        "PYTHONUNBUFFERED": "1",
+        # Small matrices: threads only get in each other's way, and in the way of the other nodes.
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+    }
+    nodes: dict[str, NodeProcess] = {}
+    print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
+    failure: NodeProcess | None = None
+    try:
+        for name, executable in executables.items():
+            interruption.check()
+            nodes[name] = NodeProcess(
+                name,
+                [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
+                environment=environment,
+                log=logs / f"{name}.log",
+                pass_fds=[progress] if name == "operator" else [],
+            )
+        operator = nodes["operator"]
+        begin = time.monotonic()
+        while operator.exit_code is None and failure is None:
+            interruption.check()
+            if time.monotonic() - begin > QUIET_AFTER:
+                _import_report()
+            failure = _first_dead(nodes)
+            wait_for([operator], POLL)
+        failure = failure or _first_dead(nodes)
+        if failure is None and operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
+            failure = operator
+        if failure is not None:
+            raise NodeFailedError(failure)
+        return operator.exit_code == EXIT_DONE
+    finally:
+        os.close(progress)
+        _stop_nodes(nodes)
+
+
+def _first_dead(nodes: dict[str, NodeProcess]) -> NodeProcess | None:
+    """Return a node that ended although it should run."""
+    for name, node in nodes.items():
+        if name != "operator" and node.exit_code is not None:
+            return node
+    return None
+
+
+def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
+    """End the operator, then the others, then the recorder that still records their ends.
+
+    The driver switches the drives off before they, too, are gone.
+    """
+    operator, recorder = nodes.get("operator"), nodes.get("recorder")
+    driver = nodes.get("device_driver")
+    rest = [node for node in nodes.values() if node not in (operator, driver, recorder)]
+    warnings = stop([operator]) if operator else []
+    warnings += stop([driver]) if driver else []
+    warnings += stop(rest)
+    warnings += stop([recorder], RECORDER_GRACE) if recorder else []
+    if recorder is not None and recorder.exit_code == EXIT_MISSED:
+        said = [line for line in recorder.tail(3) if line.startswith("error: ")]
+        warnings += [line.removeprefix("error: ") for line in said] or [recorder.describe_end()]
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def _report(
+    options: SimulateOptions,
+    bag: Path,
+    started_at: float,
+    interruption: Interruption,
+    *,
+    done: bool,
+) -> int:
+    """Make summary and report from the bag; the exit code."""
+    with interruption.at_once():
+        report, bag_reader, run_summary = _import_report()
+        run = bag_reader.read_run(bag)
+        summary = run_summary.summarize(run)
+        report.write_report(run, summary)
+        summary["wall_s"] = time.time() - started_at
+        for path in (bag / SUMMARY, options.json):
+            if path is not None:
+                write_json(path, summary)
+    print(describe(summary, bag))
+    return EXIT_DONE if summary["converged"] else EXIT_MISSED
+
+
+def shown(path: Path) -> Path:
+    """Return a path as short as it can be typed: relative where it is below the current folder."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+
+
+def _import_report() -> tuple[ModuleType, ...]:
+    """Import what makes the report: a second of work, best done while there is time to spare."""
+    names = (
+        "needle_analysis.report.report",
+        "needle_bags.reading.bag_reader",
+        "needle_analysis.run.run_summary",
+    )
+    return tuple(importlib.import_module(name) for name in names)
+
+
+def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
+    """Return the result as a person reads it.
+
+    Parameters
+    ----------
+    summary : mapping
+        The content of summary.json.
+    bag : Path
+        The run's folder.
+    """
+
+    def figure(key: str, digits: int = 2) -> str:
+        value = summary.get(key)
+        return f"{value:.{digits}f}" if isinstance(value, (int, float)) else "-"
+
+    if summary.get("reached_depth"):
+        verdict = "CONVERGED" if summary.get("converged") else "MISSED"
+        away = f"{figure('r1_final_mm')} mm from the plane"
+        head = [f"{verdict}: the tip ends {away} (goal: within 1 mm)"]
+    else:
+        reason = summary.get("reason") or "no reason given"
+        head = [
+            f"NOT FINISHED: stopped at {figure('insertion_final_mm', 1)} mm: {reason}",
+            f"  r1 there          {figure('r1_final_mm')} mm",
+        ]
+    lines = [
+        *head,
+        f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
+        f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms",
+        f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
+        f"{figure('depth_error_p95_mm')} mm (95th percentile)",
+        f"  speed             {figure('steps_per_s', 1)} steps/s; {figure('wall_s', 1)} s in all",
+        f"  report            {shown(bag / REPORT)}",
+    ]
+    if summary.get("watchdog_trips"):
+        trips = summary["watchdog_trips"]
+        lines.append(f"  watchdogs         tripped {trips} times: this run may not repeat exactly")
+    return "\n".join(lines)
+
+
+def _make_folder(options: SimulateOptions) -> Path:
+    if options.bag is not None:
+        folders = [options.bag]
+    else:
+        name = time.strftime(f"%Y-%m-%d_%H-%M-%S_{options.level}_{options.controller}")
+        root = _checkout() / "bags"
+        folders = [root / name, *(root / f"{name}_{number}" for number in range(2, 100))]
+    for folder in folders:
+        try:
+            folder.mkdir(parents=True)
+        except FileExistsError:
+            continue
+        except OSError as error:
+            raise UserError(f"cannot make the folder {folder}: {error.strerror}") from error
+        return folder
+    raise UserError(f"{folders[0]} exists already; give a new folder")
+
+
+def _checkout() -> Path:
+    """Return the checkout's folder; the current one where the package runs without it."""
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "scripts" / "simulate").is_file():
+            return folder
+    return Path.cwd()
+
+
+def _end_with_parent() -> None:
+    """Take SIGTERM when scripts/simulate is killed outright."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM)
+    if os.getppid() == 1:
+        os.kill(os.getpid(), signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,194 @@
+"""The command line of `simulate`: what it understands, and what it refuses in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from needle_common.commands.options import (
+    CommandParser,
+    join_start,
+    number,
+    output_file,
+    start,
+    whole_number,
+)
+from needle_common.errors import UserError
+
+DESCRIPTION = """\
+Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
+
+Starts recorder, sim_rig, stereo_tracker, plane_controller and operator (at level drive also
+drive_emulator and device_driver) as processes of their own, shows how far the needle is in, and
+leaves a folder that holds the bag (open it with rosbags, mcap, Foxglove, PlotJuggler or
+`ros2 bag`), report.html with its figures, summary.json, the parameters and the nodes' logs.
+"""
+
+EPILOG = """\
+examples:
+  scripts/simulate
+      camera images, controller best, start 3 mm beside the plane, 120 mm deep
+  scripts/simulate --level tip --seed 7
+      no images: the tip is measured with the paper's +-1 mm noise; quicker
+  scripts/simulate --level drive
+      camera images, and the device driver moves two emulated CANopen drives
+  scripts/simulate --controller open_loop --level tip --noise-mm 0
+      no steering: where the needle goes by itself (14.6 mm beside the plane; exit code 1)
+  scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
+      another start: 5 mm above the plane, pitched 4 deg down, rolled by 30 deg
+  scripts/simulate --params my_rig.yaml
+      with a ROS parameter file on top of the rig's configuration, such as
+        plane_controller: {ros__parameters: {max_rotation_per_length: 300.0}}
+
+exit codes: 0 converged (|r1| <= 1 mm at the end), 1 ran but missed, 2 bad input or something
+missing, 130 interrupted.
+"""
+
+LEVELS = ("tip", "camera", "drive")
+CONTROLLERS = (
+    "best", "paper", "open_loop",
+    "kalman", "measured_pitch", "extended_kalman", "orientation_fit",
+)  # fmt: skip
+"""plane_controller's presets; named here again, for to import them takes half a second."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulateOptions:
+    """What one run of `simulate` was asked for; mm and degrees, as the user writes them."""
+
+    level: str = "camera"
+    controller: str = "best"
+    initial_x_mm: float = -3.0
+    initial_pitch_deg: float = 2.0
+    initial_roll_deg: float = 15.0
+    noise_mm: float | None = None
+    depth_mm: float = 120.0
+    play_deg: float = 0.0
+    lag_mm: float = 0.0
+    real_time_factor: float = 0.0
+    seed: int = 1
+    bag: Path | None = None
+    params: Path | None = None
+    json: Path | None = None
+
+
+def parse(arguments: Sequence[str]) -> SimulateOptions:
+    """Return the options of a command line (without the program's name).
+
+    Raises
+    ------
+    UserError
+        Anything that cannot be run as asked.
+    """
+    given = _parser().parse_args(join_start(arguments))
+    _one_of("--level", given.level, LEVELS)
+    _one_of("--controller", given.controller, CONTROLLERS)
+    noise = None
+    if given.level == "tip":
+        noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
+    elif given.noise_mm is not None:
+        raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
+    x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
+    factor = number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
+    return SimulateOptions(
+        level=given.level,
+        controller=given.controller,
+        initial_x_mm=x_mm,
+        initial_pitch_deg=pitch_deg,
+        initial_roll_deg=roll_deg,
+        noise_mm=noise,
+        depth_mm=number("--depth-mm", given.depth_mm, 1.0, 150.0, "mm"),
+        play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
+        lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
+        real_time_factor=factor,
+        seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
+        bag=_new_bag(given.bag),
+        params=_readable(given.params),
+        json=output_file("--json", given.json),
+    )
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("simulate", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add(
+        "--level",
+        default="camera",
+        metavar="tip|camera|drive",
+        help="what is simulated: only "
+        "the tip's measurement, the stereo images of it, or also the drives that the device driver "
+        "moves over a CAN bus (default: camera)",
+    )
+    add(
+        "--controller",
+        default="best",
+        metavar="paper|best|open_loop",
+        help="how the needle is turned: as in the paper, by the best controller known here, or not "
+        f"at all (default: best); for comparison also {', '.join(CONTROLLERS[3:])}",
+    )
+    add(
+        "--initial",
+        default="-3,2,15",
+        metavar="X_MM,PITCH_DEG,ROLL_DEG",
+        help="where the needle starts, seen from the wanted plane (default: -3,2,15)",
+    )
+    add(
+        "--noise-mm",
+        metavar="A",
+        help="level tip: the measured tip is off by up to A mm in each direction (default: 1.0)",
+    )
+    add("--depth-mm", default="120", metavar="D", help="how far to insert (default: 120)")
+    add(
+        "--play-deg",
+        default="0",
+        metavar="D",
+        help="tissue: base and tip angle differ by up to D deg before the tip follows (default: 0)",
+    )
+    add(
+        "--lag-mm",
+        default="0",
+        metavar="L",
+        help="tissue: the tip's angle follows the base's with this length constant (default: 0)",
+    )
+    add(
+        "--real-time-factor",
+        default="0",
+        metavar="F",
+        help="1: as slow as the real rig; 0: in "
+        "lock step, as fast as the nodes answer, repeatable (default: 0)",
+    )
+    add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
+    add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")
+    add(
+        "--seed",
+        default="1",
+        metavar="N",
+        help="seed of all noise: same seed, same run (default: 1)",
+    )
+    add("--json", metavar="FILE", help="write the result there too, as one flat JSON object")
+    return parser
+
+
+def _one_of(name: str, value: str, known: Sequence[str]) -> None:
+    if value not in known:
+        raise UserError(f"{name} {value!r} is not one of {', '.join(known)}")
+
+
+def _new_bag(text: str | None) -> Path | None:
+    if text is None:
+        return None
+    path = Path(text).expanduser()
+    # lexists: a dangling link is in the way as well
+    if path.exists() or path.is_symlink():
+        raise UserError(f"--bag {text}: exists already; give a new folder")
+    return path.absolute()
+
+
+def _readable(text: str | None) -> Path | None:
+    if text is None:
+        return None
+    path = Path(text).expanduser()
+    if not path.is_file():
+        raise UserError(f"--params {text}: no such file")
+    return path

@@ -1,0 +1,425 @@
+import pytest
+
+from needle_bringup.operator.operator_sequence import (
+    ASK_AGAIN,
+    ENABLE,
+    HOME,
+    PREPARATION,
+    START,
+    OperatorSequence,
+    Outcome,
+    ServiceCall,
+)
+
+CONFIRM = PREPARATION[0]
+DISABLED = {"homed": "true", "state": "DISABLED"}
+
+
+def fresh() -> OperatorSequence:
+    """Return a sequence before a simulated device that is alone."""
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, {}, 0.0)
+    sequence.see_controller({"state": "IDLE", "starts": "0"}, 0.0)
+    return sequence
+
+
+def see(sequence: OperatorSequence, values: dict[str, str], now: float) -> None:
+    sequence.see_device({"simulated": "true"} | values, "/sim_rig", now)
+
+
+def outcome(sequence: OperatorSequence) -> Outcome | None:
+    """Return the outcome; a call, so that mypy does not take it for settled once it was None."""
+    return sequence.outcome
+
+
+def answer(sequence: OperatorSequence, message: str = "") -> None:
+    """Let the next call be made and agreed to."""
+    call = sequence.next_call(1.0)
+    assert call is not None
+    sequence.take_answer(call, True, message, 1.0)
+
+
+def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
+    sequence.see_missing([])
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    calls = []
+    while (call := sequence.next_call(now)) is not None:
+        calls.append(call)
+        sequence.take_answer(call, True, "", now)
+    return calls
+
+
+def steering(**values: str) -> dict[str, str]:
+    said = {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"}
+    return said | {"starts": "1"} | values
+
+
+def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, {"homed": "true"}, 1.0)
+    for expected in PREPARATION:
+        assert not sequence.hold(1.0)
+        assert sequence.next_call(1.0) == expected
+        assert sequence.next_call(1.0) is None, "one call at a time"
+        sequence.take_answer(expected, True, "", 1.0)
+    assert sequence.hold(1.0)
+
+
+def test_calls_nothing_while_a_partner_is_missing() -> None:
+    sequence = fresh()
+    assert sequence.next_call(1.0) is None
+    sequence.see_missing(["service device/home"])
+    assert sequence.next_call(1.0) is None
+    sequence.check_time(29.9)
+    assert outcome(sequence) is None
+    sequence.check_time(30.0)
+    assert sequence.outcome is not None
+    assert not sequence.outcome.done
+    assert "service device/home" in sequence.outcome.reason
+    assert not sequence.touched
+
+
+def test_asks_again_where_the_rig_is_not_ready_yet_and_gives_up_where_it_refuses() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    assert sequence.next_call(1.0) == PREPARATION[0]
+    sequence.take_answer(CONFIRM, False, "waiting for a subscriber of joint_states", 1.0)
+    assert sequence.next_call(1.05) is None
+    assert sequence.next_call(20.0) == PREPARATION[0]
+    sequence.take_answer(CONFIRM, False, "waiting for a subscriber of joint_states", 20.0)
+    assert sequence.next_call(20.2) == PREPARATION[0]
+    sequence.take_answer(CONFIRM, False, "the needle is in", 20.2)
+    assert outcome(sequence) is None, "what it rests on may have changed meanwhile"
+    assert sequence.next_call(22.2) == PREPARATION[0]
+    sequence.take_answer(CONFIRM, False, "the needle is in", 22.2)
+    assert sequence.outcome is not None
+    assert "the needle is in" in sequence.outcome.reason
+    assert sequence.next_call(23.0) is None
+
+
+def test_a_service_that_never_answers_is_named() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    sequence.next_call(1.0)
+    sequence.check_time(31.0)
+    assert sequence.outcome is not None
+    assert "no answer from device/confirm_needle_out" in sequence.outcome.reason
+
+
+def test_waits_for_homing_before_it_enables() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    for _ in range(2):
+        answer(sequence)
+    assert sequence.next_call(1.0) is None
+    see(sequence, {"homed": "true"}, 1.0)
+    assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
+
+
+def test_done_is_success_and_releases_the_hold() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(), 2.0)
+    assert sequence.hold(2.0)
+    sequence.see_controller(steering(state="DONE", step="120", insertion_m="0.12"), 3.0)
+    assert sequence.outcome is not None
+    assert sequence.outcome.done
+    assert not sequence.hold(3.0)
+
+
+def test_the_done_of_an_earlier_run_does_not_count() -> None:
+    sequence = fresh()
+    sequence.see_controller(steering(state="DONE"), 0.5)
+    prepare(sequence)
+    sequence.see_controller(steering(state="DONE"), 2.0)
+    assert sequence.outcome is None
+
+
+def test_fault_release_and_stop_end_the_run_with_their_reason() -> None:
+    for state, reason in (("FAULT", "curvature lost"), ("IDLE", "stopped by hand")):
+        sequence = fresh()
+        prepare(sequence)
+        sequence.see_controller(steering(), 2.0)
+        sequence.see_controller(steering(state=state, reason=reason), 3.0)
+        assert sequence.outcome is not None
+        assert not sequence.outcome.done
+        assert reason in sequence.outcome.reason
+        assert not sequence.hold(3.0)
+    for state in ("FAULT", "ESTOPPED"):
+        sequence = fresh()
+        prepare(sequence)
+        see(sequence, {"homed": "true", "state": state, "reason": "button"}, 1.0)
+        assert sequence.outcome is not None
+        assert "button" in sequence.outcome.reason
+
+
+def test_the_idle_before_steering_is_no_stop() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(state="IDLE", starts="0"), 2.0)
+    assert sequence.outcome is None
+
+
+def test_no_progress_releases_the_hold() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    sequence.see_controller(steering(), 10.0)
+    sequence.see_controller(steering(), 60.0)
+    sequence.check_time(69.9)
+    assert outcome(sequence) is None
+    sequence.check_time(70.0)
+    assert not sequence.hold(70.0)
+    assert sequence.outcome is not None
+    assert "no progress for 60 s at 3.0 mm" in sequence.outcome.reason
+
+
+def test_a_press_that_does_not_count_any_more_is_released_and_pressed_again() -> None:
+    sequence = fresh()
+    prepare(sequence, 1.0)
+    see(sequence, {"homed": "true", "state": "HOLDING", "hold_owner": "operator"}, 1.1)
+    sequence.check_time(9.0)
+    assert sequence.hold(9.0), "a hold that counts stays pressed"
+    see(sequence, {"homed": "true", "state": "HOLDING", "hold_owner": ""}, 9.0)
+    sequence.check_time(10.9)
+    assert sequence.hold(10.9), "news may be under way"
+    sequence.check_time(11.0)
+    assert not sequence.hold(11.0)
+    sequence.check_time(11.2)
+    assert sequence.hold(11.25)
+    sequence.check_time(13.2)
+    assert sequence.presses_again == 1
+    see(sequence, {"homed": "true", "state": "MOVING", "hold_owner": "operator"}, 13.2)
+    sequence.check_time(20.0)
+    assert sequence.hold(20.0)
+    assert sequence.presses_again == 1
+
+
+def test_a_press_that_was_never_taken_is_tried_again() -> None:
+    sequence = fresh()
+    prepare(sequence, 1.0)
+    sequence.check_time(3.0)
+    assert not sequence.hold(3.0)
+    assert sequence.hold(3.25)
+
+
+def test_an_interrupt_ends_it_at_any_time_and_keeps_its_first_outcome() -> None:
+    sequence = fresh()
+    sequence.interrupt()
+    assert sequence.outcome is not None
+    assert sequence.outcome.interrupted
+    sequence.see_missing([])
+    assert sequence.next_call(1.0) is None
+    finished = fresh()
+    prepare(finished)
+    finished.see_controller(steering(state="DONE"), 3.0)
+    finished.interrupt()
+    assert finished.outcome is not None
+    assert finished.outcome.done
+
+
+def test_a_fault_that_overtakes_the_answer_to_start_ends_the_run() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, DISABLED, 1.0)
+    for _ in PREPARATION[:-1]:
+        answer(sequence)
+    assert sequence.next_call(1.0) == START
+    sequence.see_controller(steering(state="FAULT", reason="the needle is gone"), 1.0)
+    assert sequence.outcome is not None
+    assert "the needle is gone" in sequence.outcome.reason
+    assert sequence.outcome.prepared
+
+
+@pytest.mark.parametrize("prepared", range(len(PREPARATION) + 1))
+def test_a_device_that_is_real_ends_it_whenever_it_is_heard(prepared: int) -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, {"homed": "true"}, 1.0)
+    for _ in range(prepared):
+        answer(sequence)
+    sequence.see_device({"homed": "true", "simulated": "false"}, "/device_driver", 1.0)
+    assert sequence.outcome is not None
+    assert "/device_driver is a real device" in sequence.outcome.reason
+    assert sequence.next_call(2.0) is None
+    assert not sequence.hold(2.0)
+
+
+def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulated() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/device_driver"])
+    assert sequence.next_call(1.0) is None, "nothing is known of it yet"
+    see(sequence, {}, 1.0)
+    assert sequence.next_call(1.0) is None, "another said that"
+    sequence.see_devices(["/sim_rig", "/device_driver"])
+    assert sequence.next_call(1.0) is None
+    assert outcome(sequence) is None, "one that was killed counts for a while"
+    sequence.check_time(30.0)
+    assert sequence.outcome is not None
+    assert "/sim_rig, /device_driver" in sequence.outcome.reason
+
+
+def test_a_second_device_ends_it_and_one_that_took_the_place_is_not_held() -> None:
+    sequence = fresh()
+    prepare(sequence)
+    assert sequence.hold(2.0)
+    sequence.see_devices(["/device_driver"])
+    assert not sequence.hold(2.0), "it has not said what it is"
+    sequence.see_devices(["/device_driver", "/sim_rig"])
+    assert sequence.outcome is not None
+    assert "more than one device: /device_driver, /sim_rig" in sequence.outcome.reason
+
+
+def test_a_homing_under_way_is_waited_for_whatever_was_heard_before_it() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    answer(sequence, "needle out")
+    assert sequence.next_call(1.0) == ServiceCall("device/home")
+    sequence.take_answer(HOME, True, "homing", 1.0)
+    assert sequence.next_call(1.0) is None
+    # A device may say that it is homed, from last time, while it looks for its switches.
+    for homed in ("false", "true"):
+        see(sequence, {"homed": homed, "state": "MOVING"}, 2.0)
+        assert sequence.next_call(2.0) is None
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 3.0)
+    assert sequence.next_call(3.0) == ServiceCall("device/enable", True)
+
+
+def test_the_end_of_a_homing_may_overtake_its_answer() -> None:
+    sequence = fresh()
+    sequence.see_missing([])
+    answer(sequence, "needle out")
+    assert sequence.next_call(1.0) == HOME
+    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+    sequence.take_answer(HOME, True, "homing", 1.0)
+    assert sequence.next_call(1.0) == ServiceCall("device/enable", True)
+
+
+def test_a_start_that_ends_at_once_is_not_waited_for() -> None:
+    """STEERING, then IDLE: a latched status of depth 1 may show the second alone."""
+    for overtakes in (False, True):
+        sequence = fresh()
+        sequence.see_controller(steering(state="IDLE", starts="1", reason="stopped"), 0.5)
+        sequence.see_missing([])
+        see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
+        for _ in PREPARATION[:-1]:
+            answer(sequence)
+        assert sequence.next_call(1.0) == START
+        ended = steering(state="IDLE", starts="2", reason="the needle was drawn back")
+        if overtakes:
+            sequence.see_controller(ended, 1.0)
+        sequence.take_answer(START, True, "", 1.0)
+        if not overtakes:
+            sequence.see_controller(ended, 1.0)
+        assert sequence.outcome is not None
+        assert "the needle was drawn back" in sequence.outcome.reason
+
+
+def test_what_was_said_before_this_start_is_of_another_run() -> None:
+    for state in ("DONE", "FAULT", "IDLE"):
+        sequence = fresh()
+        old = steering(state=state, starts="1")
+        sequence.see_controller(old, 0.5)
+        prepare(sequence)
+        sequence.see_controller(old, 2.0)
+        assert outcome(sequence) is None
+        sequence.see_controller(steering(starts="2"), 2.0)
+        sequence.see_controller(steering(state="DONE", starts="2"), 3.0)
+        assert sequence.outcome is not None
+        assert sequence.outcome.done
+
+
+def test_before_it_acts_another_device_has_time_to_show_itself() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0, look_around=2.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, {}, 0.1)
+    assert sequence.next_call(1.9) is None
+    assert sequence.next_call(2.0) == PREPARATION[0]
+
+
+def reach(wanted: ServiceCall) -> OperatorSequence:
+    """Return a sequence that has just made the call, for the first time, at 1.0 s."""
+    sequence = fresh()
+    sequence.see_missing([])
+    see(sequence, DISABLED, 1.0)
+    for _ in range(PREPARATION.index(wanted)):
+        answer(sequence)
+    assert sequence.next_call(1.0) == wanted
+    return sequence
+
+
+@pytest.mark.parametrize("call", PREPARATION)
+def test_a_call_whose_answer_was_lost_is_made_again(call: ServiceCall) -> None:
+    sequence = reach(call)
+    assert sequence.next_call(0.9 + ASK_AGAIN) is None
+    assert sequence.next_call(1.0 + ASK_AGAIN) == call
+    sequence.take_answer(call, True, "", 2.1)
+    assert sequence.next_call(2.1) != call
+
+
+@pytest.mark.parametrize("call", PREPARATION[:-1])
+def test_a_late_answer_is_to_its_own_call_alone(call: ServiceCall) -> None:
+    sequence = reach(call)
+    assert sequence.next_call(1.0 + ASK_AGAIN) == call
+    sequence.take_answer(call, True, "", 2.1)
+    following = sequence.next_call(2.1)
+    assert following == PREPARATION[PREPARATION.index(call) + 1]
+    sequence.take_answer(call, True, "", 2.2)
+    assert not sequence.steering
+    assert sequence.next_call(2.2) is None, "that one has not been answered"
+    sequence.take_answer(call, False, "the device is MOVING", 2.3)
+    assert sequence.next_call(2.5) is None
+
+
+def test_a_homing_whose_answer_was_lost_is_not_asked_for_again_while_it_moves() -> None:
+    sequence = reach(HOME)
+    see(sequence, {"homed": "true", "state": "MOVING"}, 1.2)
+    assert sequence.next_call(5.0) is None
+    see(sequence, DISABLED, 9.0)
+    assert sequence.next_call(9.0) == ENABLE
+
+
+def test_homed_from_before_the_call_is_no_answer_to_it() -> None:
+    sequence = reach(HOME)
+    # What was under way when the call was made.
+    see(sequence, DISABLED | {"needle_out_confirmed": "true"}, 1.1)
+    assert sequence.next_call(1.2) is None
+    assert sequence.next_call(1.0 + ASK_AGAIN) == HOME
+
+
+def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
+    sequence = reach(START)
+    sequence.see_controller(steering(starts="0", state="IDLE"), 1.1)
+    assert not sequence.hold(1.1)
+    sequence.see_controller(steering(), 1.2)
+    assert sequence.hold(1.2)
+    sequence.take_answer(START, False, "already steering", 1.3)
+    assert outcome(sequence) is None
+    assert sequence.next_call(9.0) is None
+
+
+def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:
+    sequence = OperatorSequence(0.0, wait_timeout=30.0, stall_timeout=60.0)
+    sequence.see_missing([])
+    sequence.see_devices(["/sim_rig"])
+    see(sequence, DISABLED, 1.0)
+    for _ in PREPARATION[:-1]:
+        answer(sequence)
+    assert sequence.next_call(1.0) is None
+    assert "needle/controller_status" in sequence.hangs()
+    sequence.see_controller(steering(state="DONE", starts="4"), 1.1)
+    assert sequence.next_call(1.1) == START
+    sequence.take_answer(START, True, "", 1.1)
+    assert outcome(sequence) is None
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "two", ""])
+def test_figures_that_are_none_end_nothing(text: str) -> None:
+    sequence = reach(START)
+    sequence.see_controller(steering(starts=text, insertion_m=text, depth_m=text), 1.1)
+    assert outcome(sequence) is None
+    assert not sequence.steering

@@ -1,0 +1,129 @@
+import math
+from pathlib import Path
+
+import pytest
+import yaml
+
+from needle_bringup.simulation.rig_configuration import (
+    PACKAGES,
+    command_line_parameters,
+    merge,
+    nodes_of,
+    refuse_reserved,
+    write_parameters,
+)
+from needle_bringup.simulation.simulate_options import SimulateOptions
+from needle_common.errors import UserError
+from needle_common.settings.parameter_files import NODES, read_parameters
+from needle_controller.ros.parameters import PlaneControllerParameters
+
+
+def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
+    options = SimulateOptions(initial_x_mm=-3.0, initial_pitch_deg=2.0, depth_mm=80.0)
+    parameters = command_line_parameters(options, Path("bags/x"))
+    assert parameters["plane_controller"]["target_offset"] == pytest.approx(0.003)
+    assert parameters["plane_controller"]["depth"] == pytest.approx(0.08)
+    assert parameters["sim_rig"]["initial_pitch"] == pytest.approx(math.radians(2.0))
+
+
+def test_only_the_nodes_of_the_level_run() -> None:
+    everywhere = {"recorder", "sim_rig", "plane_controller", "operator"}
+    assert set(nodes_of(SimulateOptions(level="tip"))) == everywhere
+    assert set(nodes_of(SimulateOptions(level="camera"))) == everywhere | {"stereo_tracker"}
+    drives = {"drive_emulator", "device_driver"}
+    assert set(nodes_of(SimulateOptions(level="drive"))) == everywhere | {"stereo_tracker"} | drives
+
+
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+def test_driver_and_drives_meet_and_a_lapse_pauses_in_lock_step_only(factor: float) -> None:
+    options = SimulateOptions(level="drive", real_time_factor=factor)
+    parameters = command_line_parameters(options, Path("bags/x"))
+    assert parameters["device_driver"]["channel"] == parameters["drive_emulator"]["pty"]
+    assert parameters["device_driver"]["lock_step"] is (factor == 0.0)
+
+
+def test_later_layers_win_one_parameter_at_a_time() -> None:
+    merged = merge({"a": {"x": 1, "y": 2}}, {"a": {"y": 3}, "b": {}})
+    assert merged == {"a": {"x": 1, "y": 3}, "b": {}}
+
+
+def test_a_written_file_reads_back(tmp_path: Path) -> None:
+    parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
+    write_parameters(tmp_path / "p.yaml", parameters)
+    assert read_parameters(tmp_path / "p.yaml") == parameters
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("controller: {ros__parameters: {x: 1}}", "unknown node 'controller'"),
+        ("plane_controller: {parameters: {x: 1}}", "ros__parameters"),
+        ("plane_controller: {ros__parameters: [1]}", "NAME: VALUE"),
+        ("[1, 2", "not YAML"),
+        ("just text", "not a ROS parameter file"),
+        ("", "not a ROS parameter file"),
+    ],
+)
+def test_a_bad_file_is_named_in_one_line(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(text)
+    with pytest.raises(UserError) as caught:
+        read_parameters(path)
+    assert named in str(caught.value)
+    assert str(path) in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_file_may_not_contradict_the_command_line() -> None:
+    path = Path("p.yaml")
+    options = SimulateOptions(level="tip", noise_mm=1.0)
+    with pytest.raises(UserError, match="--depth-mm"):
+        refuse_reserved(path, {"plane_controller": {"depth": 0.1}}, options)
+    with pytest.raises(UserError, match="does not run at level tip"):
+        refuse_reserved(path, {"stereo_tracker": {}}, options)
+    with pytest.raises(UserError, match="recorder: topics does not go into the file: simulate wa"):
+        refuse_reserved(path, {"recorder": {"topics": ["/needle/tip"]}}, options)
+    refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)
+
+
+def test_every_yaml_of_the_package_parses() -> None:
+    folder = Path(__file__).parents[2] / "config"
+    for path in folder.glob("*.yaml"):
+        assert yaml.safe_load(path.read_text())
+
+
+def test_the_controller_knows_the_sensor_of_its_level() -> None:
+    tip = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.5), Path("bag"))
+    assert tip["plane_controller"]["tip_covariance"] == "configured"
+    assert tip["plane_controller"]["tip_noise"] == "bounded"
+    assert tip["plane_controller"]["tip_noise_bound"] == pytest.approx(0.0005)
+    exact = command_line_parameters(SimulateOptions(level="tip", noise_mm=0.0), Path("bag"))
+    assert exact["plane_controller"]["tip_noise_bound"] > 0.0
+    camera = command_line_parameters(SimulateOptions(), Path("bag"))
+    assert "tip_noise" not in camera["plane_controller"]
+
+
+def test_by_hand_is_the_rig_that_simulate_runs() -> None:
+    # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
+    # time, recording and the emulated adapter: nothing of it describes the rig.
+    set_by_simulate = command_line_parameters(SimulateOptions(level="drive"), Path("bag"))
+    of_run = {
+        "use_sim_time",
+        "wait_for_recorder",
+        "level",
+        "seed",
+        "real_time_factor",
+        "preset",
+    }
+    of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
+    told = {node: set(values) - of_run for node, values in set_by_simulate.items()}
+    assert told["sim_rig"] == of_needle
+    assert told["plane_controller"] == {"depth", "target_offset"}
+    assert told["stereo_tracker"] == set()
+    defaults = PlaneControllerParameters()
+    assert defaults.tip_covariance == "from_tip_pose"
+    assert SimulateOptions().depth_mm == pytest.approx(defaults.depth * 1e3)
+
+
+def test_the_nodes_of_a_run_are_known_by_hand_too() -> None:
+    assert set(PACKAGES) <= set(NODES)

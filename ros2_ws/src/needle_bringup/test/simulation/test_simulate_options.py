@@ -1,0 +1,66 @@
+from pathlib import Path
+
+import pytest
+
+from needle_bringup.simulation.simulate_options import CONTROLLERS, SimulateOptions, parse
+from needle_common.errors import UserError
+from needle_controller.presets.control_settings import PRESETS
+
+
+def test_every_preset_of_the_controller_can_be_asked_for() -> None:
+    assert sorted(CONTROLLERS) == sorted(PRESETS)
+
+
+def test_the_defaults_are_the_designed_ones() -> None:
+    assert parse([]) == SimulateOptions(level="camera", controller="best", depth_mm=120.0)
+
+
+@pytest.mark.parametrize("words", [["--initial", "-3,2,15"], ["--initial=-3,2,15"]])
+def test_initial_takes_a_value_that_begins_with_a_minus(words: list[str]) -> None:
+    options = parse(words)
+    start = (options.initial_x_mm, options.initial_pitch_deg, options.initial_roll_deg)
+    assert start == (-3.0, 2.0, 15.0)
+
+
+def test_noise_belongs_to_level_tip() -> None:
+    assert parse(["--level", "tip"]).noise_mm == 1.0
+    assert parse(["--level", "tip", "--noise-mm", "0"]).noise_mm == 0.0
+    assert parse([]).noise_mm is None
+    with pytest.raises(UserError, match="--noise-mm"):
+        parse(["--level", "camera", "--noise-mm", "0"])
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--controller", "worst"], "worst"),
+        (["--level", "x"], "'x'"),
+        (["--initial", "-3,2"], "X_MM,PITCH_DEG,ROLL_DEG"),
+        (["--initial", "-3,nan,2"], "PITCH_DEG"),
+        (["--initial", "-.5,-inf,2"], "PITCH_DEG"),
+        (["--initial", "--seed"], "--initial"),
+        (["--depth-mm", "nan"], "--depth-mm"),
+        (["--depth-mm", "1e9"], "--depth-mm"),
+        (["--depth-mm", "deep"], "'deep'"),
+        (["--play-deg", "-1"], "--play-deg"),
+        (["--lag-mm", "inf"], "--lag-mm"),
+        (["--real-time-factor", "-1"], "--real-time-factor"),
+        (["--seed", "1.5"], "--seed"),
+        (["--seed", "-1"], "--seed"),
+        (["--params", "/no/such/file"], "/no/such/file"),
+        (["--json", "/no/such/folder/x.json"], "/no/such/folder"),
+        (["--depth", "5"], "--depth"),
+        (["more"], "more"),
+    ],
+)
+def test_what_cannot_be_run_is_named_in_one_line(words: list[str], named: str) -> None:
+    with pytest.raises(UserError) as caught:
+        parse(words)
+    assert named in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_an_existing_bag_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="exists already"):
+        parse(["--bag", str(tmp_path)])
+    assert parse(["--bag", str(tmp_path / "new")]).bag == tmp_path / "new"

@@ -1,0 +1,1 @@
+"""Command lines: entry points, options, exit codes, one-line errors."""

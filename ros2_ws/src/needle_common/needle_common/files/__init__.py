@@ -1,0 +1,1 @@
+"""Files from outside: read within bounds, checked, and replaced whole."""

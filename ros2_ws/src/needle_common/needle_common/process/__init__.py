@@ -1,0 +1,1 @@
+"""What a process has of the machine: its end, its names, its folders, its ROS domain."""

@@ -1,0 +1,1 @@
+"""What the rig's nodes share of ROS."""

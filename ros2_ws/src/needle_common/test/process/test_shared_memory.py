@@ -1,0 +1,50 @@
+"""What killed processes leave in shared memory is taken away; what somebody uses stays."""
+
+import fcntl
+from pathlib import Path
+
+from needle_common.process.ros_domain import own_domain, ports_of
+from needle_common.process.shared_memory import dead_ports, remove_dead_ports
+
+PORTS = range(7400, 7410)
+
+
+def make_port(folder: Path, port: int) -> Path:
+    """Make the three files of a port; return the one that its listener locks."""
+    lock = folder / f"fastrtps_port{port}_el"
+    for path in (lock, folder / f"fastrtps_port{port}", folder / f"sem.fastrtps_port{port}_mutex"):
+        path.write_bytes(b"")
+    return lock
+
+
+def test_dead_ports_go_and_others_stay(tmp_path: Path) -> None:
+    make_port(tmp_path, 7400)
+    listener = make_port(tmp_path, 7401)
+    make_port(tmp_path, 7410)
+    with listener.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7400"]
+        remove_dead_ports(PORTS, tmp_path)
+        assert dead_ports(PORTS, tmp_path) == []
+        assert (tmp_path / "fastrtps_port7401").exists()
+    assert dead_ports(PORTS, tmp_path) == ["fastrtps_port7401"]
+    remove_dead_ports(PORTS, tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "fastrtps_port7410",
+        "fastrtps_port7410_el",
+        "sem.fastrtps_port7410_mutex",
+    }
+
+
+def test_a_port_whose_lock_is_gone_goes_too(tmp_path: Path) -> None:
+    make_port(tmp_path, 7400).unlink()
+    remove_dead_ports(PORTS, tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_domain_is_left_as_clean_as_it_is_found() -> None:
+    with own_domain() as domain:
+        assert dead_ports(ports_of(domain)) == []
+        port = Path("/dev/shm") / f"fastrtps_port{ports_of(domain)[11]}"
+        port.write_bytes(b"")
+    assert not port.exists()

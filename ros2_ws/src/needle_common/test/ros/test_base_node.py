@@ -1,0 +1,104 @@
+"""A node's start and end, without a graph."""
+
+import dataclasses
+import os
+import signal
+
+import pytest
+from rclpy.node import Node
+
+from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_ERROR
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.process.end_request import ENDING_SIGNALS
+from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+
+
+@dataclasses.dataclass(frozen=True)
+class NoParameters:
+    """None."""
+
+
+def run(create: type[Node], *words: str) -> int:
+    return run_node(create, help_text="HELP", parameters=NoParameters, args=["node", *words])
+
+
+class Signalled(Node):
+    """Gets signals in the middle of a callback, which it ends."""
+
+    def __init__(self) -> None:
+        super().__init__("signalled")
+        self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
+
+    def _on_timer(self) -> None:
+        for number in ENDING_SIGNALS:
+            os.kill(os.getpid(), number)
+        assert self.context.ok()
+        DiagnosticsPublisher(self).set("part", Diagnostic(Level.OK, "last words"))
+
+    def destroy_node(self) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        super().destroy_node()
+
+
+class Fails(Node):
+    """Has a fault of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("fails")
+        self.create_timer(1e-3, self._on_timer, clock=STEADY_CLOCK)
+
+    def _on_timer(self) -> None:
+        raise RuntimeError("a fault of its own")
+
+
+class Refuses(Node):
+    """Does not like its parameters."""
+
+    def __init__(self) -> None:
+        raise UserError("rate = 0 Hz, must be > 0")
+
+
+class MissesAnother(Node):
+    """Misses what ended on the same signal."""
+
+    def __init__(self) -> None:
+        super().__init__("misses_another")
+        os.kill(os.getpid(), signal.SIGINT)
+        raise UserError("the link is lost")
+
+
+def test_what_is_missed_after_a_signal_is_no_bad_input() -> None:
+    assert run(MissesAnother) == EXIT_DONE
+
+
+def test_signals_in_a_callback_and_at_the_end_are_a_clean_end() -> None:
+    assert run(Signalled) == EXIT_DONE
+
+
+def test_a_fault_in_a_callback_is_an_internal_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Fails) == EXIT_INTERNAL_ERROR
+    assert "RuntimeError: a fault of its own (test_base_node.py:" in capsys.readouterr().err
+
+
+def test_bad_parameters_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Refuses) == EXIT_BAD_INPUT
+    assert capsys.readouterr().err == "error: rate = 0 Hz, must be > 0\n"
+
+
+@pytest.mark.parametrize("word", ["--help", "-h"])
+def test_help_is_given_without_a_context(word: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Refuses, word) == EXIT_DONE
+    assert capsys.readouterr().out.startswith("HELP\n")
+
+
+def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Refuses, "--fast") == EXIT_BAD_INPUT
+    assert "'--fast'" in capsys.readouterr().err
+
+
+def test_a_parameter_before_ros_args_is_said_to_go_after(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(Refuses, "-p", "x:=1") == EXIT_BAD_INPUT
+    assert "'-p'; it goes after --ros-args" in capsys.readouterr().err

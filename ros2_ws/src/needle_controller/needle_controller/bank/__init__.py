@@ -1,0 +1,1 @@
+"""The hypothesis filter of preset `best`."""

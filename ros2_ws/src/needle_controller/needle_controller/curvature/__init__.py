@@ -1,0 +1,1 @@
+"""The curvature of the needle's path from tips of pure insertion."""

@@ -1,0 +1,248 @@
+"""Tips of one insertion, read from a CSV or straight from a bag, for `identify_curvature`."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_controller.model.arrays import Array
+
+_COORDINATES = ("x_m", "y_m", "z_m")
+_LARGEST_COORDINATE = 1.0
+_NANOSECONDS = 1_000_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class InsertionRecord:
+    """Tips of one insertion in the order they were seen.
+
+    Attributes
+    ----------
+    tips : ndarray, shape (K, 3)
+        Measured tips in `rig` [m].
+    insertion : ndarray, shape (K,), or None
+        Inserted length at each [m]; None where it was not recorded.
+    rotation : ndarray, shape (K,), or None
+        Rotation of the base at each [rad]; None where it was not recorded.
+    """
+
+    tips: Array
+    insertion: Array | None
+    rotation: Array | None
+
+    def between(self, least: float, most: float) -> InsertionRecord:
+        """Return the part from one inserted length to another, without what comes after a return.
+
+        Parameters
+        ----------
+        least, most : float
+            Inserted lengths [m].
+
+        Raises
+        ------
+        UserError
+            The insertion was not recorded, but a part of it is wanted.
+        """
+        if self.insertion is None:
+            if least > 0.0 or math.isfinite(most):
+                raise UserError("--from-mm and --until-mm want an insertion, which is not recorded")
+            return self
+        kept = (self.insertion >= least) & (self.insertion <= most)
+        # A needle drawn back follows its path in reverse: nothing new is cut.
+        deepest = np.flatnonzero(self.insertion >= np.max(self.insertion, initial=0.0) - 1e-6)
+        kept[int(deepest[-1]) + 1 if len(deepest) else 0 :] = False
+        rotation = None if self.rotation is None else self.rotation[kept]
+        return InsertionRecord(self.tips[kept], self.insertion[kept], rotation)
+
+    def check_pure(self, tolerance: float) -> None:
+        """Check that the base did not turn.
+
+        Parameters
+        ----------
+        tolerance : float
+            What it may have [rad].
+
+        Raises
+        ------
+        UserError
+            It turned: says by how much and from where on.
+        """
+        if self.rotation is None or len(self.rotation) == 0:
+            return
+        turned = np.abs(self.rotation - self.rotation[0])
+        if np.max(turned) <= tolerance:
+            return
+        where = ""
+        if self.insertion is not None:
+            first = float(self.insertion[int(np.argmax(turned > tolerance))])
+            where = f" from {1e3 * first:.1f} mm of insertion on (--until-mm takes what is before)"
+        raise UserError(
+            f"this is no pure insertion: the base turned by {math.degrees(np.max(turned)):.2f} "
+            f"deg, wants <= {math.degrees(tolerance):.2f} deg{where}"
+        )
+
+
+def read_record(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
+    """Read a CSV of tips or a bag.
+
+    Parameters
+    ----------
+    path : Path
+        A CSV with the columns x_m, y_m, z_m and, if there are any, insertion_m, rotation_rad, valid
+        and name; or the directory of a rosbag2 bag with `needle/tip` and `joint_states`.
+    insertion_file : Path, optional
+        A CSV name,insertion_m for a CSV of tips with names.
+
+    Raises
+    ------
+    UserError
+        What cannot be read, with the line and the value.
+    """
+    if path.is_dir():
+        if insertion_file is not None:
+            raise UserError("--insertion goes with a CSV of tips; a bag has joint_states")
+        return read_bag(path)
+    if not path.exists():
+        raise UserError(f"{path}: no such file or bag")
+    return read_csv(path, insertion_file)
+
+
+def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
+    """Read a CSV of tips; see `read_record`."""
+    rows = _rows(path)
+    columns = set(rows[0][1]) if rows else set()
+    missing = [name for name in _COORDINATES if name not in columns]
+    if missing:
+        there = ", ".join(sorted(columns)) or "nothing"
+        raise UserError(f"{path}: column {missing[0]} is missing (has {there})")
+    of_name = None if insertion_file is None else _insertions(insertion_file)
+    if of_name is not None and "name" not in columns:
+        raise UserError(f"{path}: column name is missing, which --insertion goes by")
+    tips, insertion, rotation = [], [], []
+    for line, row in rows:
+        if row.get("valid", "1").strip() in ("0", "false", "False"):
+            continue
+        if all(not row[name].strip() for name in _COORDINATES):
+            continue
+        tips.append([_number(path, line, row, name) for name in _COORDINATES])
+        for value, name in zip(tips[-1], _COORDINATES, strict=True):
+            if abs(value) > _LARGEST_COORDINATE:
+                bound = _LARGEST_COORDINATE
+                raise OutOfBoundsError(f"{path}:{line}: {name}", value, -bound, bound, "m")
+        if of_name is not None:
+            if row["name"] not in of_name:
+                raise UserError(f"{insertion_file}: no insertion for {row['name']}")
+            insertion.append(of_name[row["name"]])
+        elif "insertion_m" in columns:
+            insertion.append(_number(path, line, row, "insertion_m"))
+        if "rotation_rad" in columns:
+            rotation.append(_number(path, line, row, "rotation_rad"))
+    return InsertionRecord(
+        np.array(tips, dtype=float).reshape(-1, 3),
+        np.array(insertion) if insertion else None,
+        np.array(rotation) if rotation else None,
+    )
+
+
+def read_bag(path: Path) -> InsertionRecord:
+    """Read tips and joints of a bag; see `read_record`.
+
+    Tips get insertion and rotation of their stamp, interpolated; those outside the recorded joints
+    are left out.
+    """
+    # Here, for reading a CSV does without.
+    from needle_common.files.bag_directory import BagDirectory  # noqa: PLC0415
+
+    tips: dict[int, list[float]] = {}
+    joints: dict[int, list[float]] = {}
+
+    def is_wanted(topic: str) -> bool:
+        return ("/" + topic.lstrip("/")).endswith(("/needle/tip", "/joint_states"))
+
+    with BagDirectory(path) as bag:
+        store = bag.typestore()
+        for sent in bag.messages(is_wanted):
+            message = bag.deserialize(store, sent)
+            try:
+                if sent.topic.endswith("needle/tip"):
+                    _take_tip(path, message, tips)
+                else:
+                    _take_joints(message, joints)
+            except AttributeError as error:
+                raise UserError(f"{path}: {sent.topic} is of another type: {error}") from error
+    for topic, found in (("needle/tip", tips), ("joint_states", joints)):
+        if not found:
+            raise UserError(f"{path}: the bag holds nothing on {topic}")
+    times = np.array(sorted(joints), dtype=np.int64)
+    values = np.array([joints[t] for t in times.tolist()])
+    stamps = np.array([t for t in sorted(tips) if times[0] <= t <= times[-1]], dtype=np.int64)
+    at, known = (stamps - times[0]).astype(float), (times - times[0]).astype(float)
+    return InsertionRecord(
+        np.array([tips[t] for t in stamps.tolist()]).reshape(-1, 3),
+        np.interp(at, known, values[:, 0]),
+        np.interp(at, known, values[:, 1]),
+    )
+
+
+def _take_tip(path: Path, message: Any, tips: dict[int, list[float]]) -> None:
+    position = [float(message.point.x), float(message.point.y), float(message.point.z)]
+    if not np.all(np.isfinite(position)):
+        raise UserError(f"{path}: a tip is not finite: {position}")
+    if message.header.frame_id != "rig":
+        raise UserError(f"{path}: a tip is in frame '{message.header.frame_id}', wants 'rig'")
+    tips.setdefault(_nanoseconds(message), position)
+
+
+def _take_joints(message: Any, joints: dict[int, list[float]]) -> None:
+    position: Mapping[str, float] = dict(zip(message.name, message.position, strict=False))
+    if "insertion_joint" in position and "rotation_joint" in position:
+        joints.setdefault(
+            _nanoseconds(message),
+            [float(position["insertion_joint"]), float(position["rotation_joint"])],
+        )
+
+
+def _nanoseconds(message: Any) -> int:
+    return int(message.header.stamp.sec) * _NANOSECONDS + int(message.header.stamp.nanosec)
+
+
+def _rows(path: Path) -> list[tuple[int, dict[str, str]]]:
+    """Return (line number, column to text) of every row."""
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.DictReader(file, restval="")
+            rows = []
+            for row in reader:
+                extra = row.pop(None, None)
+                if extra is not None:
+                    raise UserError(f"{path}:{reader.line_num}: more fields than columns")
+                rows.append((reader.line_num, {k.strip(): v for k, v in row.items()}))
+            return rows
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path} cannot be read: {error}") from error
+
+
+def _insertions(path: Path) -> dict[str, float]:
+    rows = _rows(path)
+    for column in ("name", "insertion_m"):
+        if rows and column not in rows[0][1]:
+            raise UserError(f"{path}: column {column} is missing")
+    return {row["name"]: _number(path, line, row, "insertion_m") for line, row in rows}
+
+
+def _number(path: Path, line: int, row: Mapping[str, str], name: str) -> float:
+    text = row[name].strip()
+    try:
+        value = float(text)
+    except ValueError:
+        raise UserError(f"{path}:{line}: {name} = '{text}' is not a number") from None
+    if not math.isfinite(value):
+        raise UserError(f"{path}:{line}: {name} = {text} is not finite")
+    return value

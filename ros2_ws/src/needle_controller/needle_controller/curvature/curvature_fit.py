@@ -1,0 +1,288 @@
+"""Curvature of the needle's path from tips of pure insertion, with its uncertainty.
+
+Under insertion without rotation the needle follows a circle of radius 1 / kappa ([KC09] IV-B). A
+tip after the inserted length l is
+
+    p(l) = p0 + d sin(kappa l) / kappa + n (1 - cos(kappa l)) / kappa
+
+with the entry p0, the heading d there and the direction n the needle bends to. The most likely arc
+is found by Gauss-Newton on p0, two angles of d and the two components of kappa n across d: in these
+the problem is almost linear, has no singular point at kappa = 0, and the unknown roll needs no
+guess. What is known of heading and entry are priors. Tips that the arc explains badly lose weight,
+so that a few outliers do no harm.
+
+Leading axes broadcast.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_controller.curvature.insertion_arc import (
+    BEND,
+    ENTRY,
+    HEADING,
+    UNKNOWNS,
+    arc_points,
+    frame,
+    headings,
+)
+from needle_controller.model.arrays import Array
+
+FEWEST_TIPS = 8
+SHORTEST_ARC = 0.01
+"""Fewer tips, or a shorter insertion [m], say nothing of the curvature."""
+_ITERATIONS = 30
+_ROBUST_ITERATIONS = 5
+_SMALLEST_NOISE = 1e-9
+_ARBITRARY_START = 1e-3
+# Median of a tip's squared distance, in variances of a coordinate, of normal and uniform noise:
+# about halfway between the two.
+_MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
+# Units in which the unknowns are of one size.
+_SCALE: Array = np.array([1.0, 1.0, 1.0, 20.0, 20.0, 1e3, 1e3])
+
+
+@dataclasses.dataclass(frozen=True)
+class CurvatureFitSettings:
+    """What is known beside the tips.
+
+    Attributes
+    ----------
+    heading : tuple of float
+        Direction in which the needle enters.
+    heading_std : float
+        How well it is known, about each axis across it [rad]; infinite where it is not.
+    entry : tuple of float
+        The entry point [m].
+    entry_std : float
+        How well it is known, along each axis [m]; infinite where it is not.
+    measurement_std : float, optional
+        Standard deviation of one measured coordinate [m]; estimated from the residuals if not
+        given.
+    outlier_limit : float
+        A tip farther from the arc than this many standard deviations of a coordinate loses weight,
+        with the 4th power of its distance; infinite for plain least squares.
+    repeating_error : float
+        What all tips may be off together, bowed along the arc (a calibration's error), which the
+        residuals cannot show [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
+    """
+
+    heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    heading_std: float = math.radians(5.0)
+    entry: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    entry_std: float = 0.0005
+    measurement_std: float | None = None
+    outlier_limit: float = 4.0
+    repeating_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check every field; raises OutOfBoundsError or UserError with the value."""
+        tiny = float(np.nextafter(0.0, 1.0))
+        checked = [
+            ("heading_std", self.heading_std, "rad"),
+            ("entry_std", self.entry_std, "m"),
+            ("outlier_limit", self.outlier_limit, "-"),
+        ]
+        if self.measurement_std is not None:
+            checked.append(("measurement_std", self.measurement_std, "m"))
+        for name, value, unit in checked:
+            if not value >= tiny:
+                raise OutOfBoundsError(name, value, tiny, math.inf, unit)
+        if not 0.0 <= self.repeating_error < math.inf:
+            raise OutOfBoundsError("repeating_error", self.repeating_error, 0.0, math.inf, "m")
+        if not abs(float(np.linalg.norm(self.heading)) - 1.0) < 1e-6:
+            raise UserError(f"heading = {self.heading} is not of unit length")
+        if not np.all(np.isfinite(self.entry)):
+            raise UserError(f"entry = {self.entry} is not finite")
+
+
+@dataclasses.dataclass(frozen=True)
+class CurvatureFit:
+    """What tips of pure insertion say of the curvature.
+
+    Attributes
+    ----------
+    curvature : ndarray, shape (...)
+        kappa [1/m].
+    std : ndarray, shape (...)
+        Its standard deviation [1/m].
+    measurement_std : ndarray, shape (...)
+        Standard deviation of one measured coordinate, assumed or from the residuals [m].
+    weights : ndarray, shape (..., K)
+        Weight of each tip, near 1 as a rule and near 0 for an outlier.
+    misses : ndarray, shape (..., K, 3)
+        What each tip is off the arc, across it [m].
+    entry : ndarray, shape (..., 3)
+        The arc's start [m].
+    entry_std : ndarray, shape (...)
+        Its standard deviation along the worst axis [m].
+    heading : ndarray, shape (..., 3)
+        The direction there.
+    heading_std : ndarray, shape (...)
+        Its standard deviation about the worst axis [rad].
+    """
+
+    curvature: Array
+    std: Array
+    measurement_std: Array
+    weights: Array
+    misses: Array
+    entry: Array
+    entry_std: Array
+    heading: Array
+    heading_std: Array
+
+    @property
+    def radius(self) -> Array:
+        """1 / kappa [m]; infinite for a straight line."""
+        with np.errstate(divide="ignore"):
+            return np.asarray(1.0 / self.curvature)
+
+    def radius_interval(self, deviations: float = 1.96) -> tuple[Array, Array]:
+        """Return the least and the largest believable 1 / kappa [m], by default with 95 %.
+
+        Parameters
+        ----------
+        deviations : float
+            Half the width of the interval of kappa in standard deviations.
+        """
+        least = np.maximum(self.curvature - deviations * self.std, 0.0)
+        with np.errstate(divide="ignore"):
+            return 1.0 / (self.curvature + deviations * self.std), 1.0 / least
+
+
+def fit_curvature(
+    tips: npt.ArrayLike,
+    insertion: npt.ArrayLike | None,
+    settings: CurvatureFitSettings | None = None,
+) -> CurvatureFit:
+    """Return the most likely curvature of an arc through tips of pure insertion.
+
+    Parameters
+    ----------
+    tips : array_like, shape (..., K, 3)
+        Measured tips [m].
+    insertion : array_like, shape (K,) or (..., K), or None
+        Length inserted since the entry at each of them [m]. None where it is not known: then each
+        tip belongs to the nearest point of the arc, and only its distance across counts.
+    settings : CurvatureFitSettings, optional
+        What is known beside them.
+
+    Returns
+    -------
+    CurvatureFit
+        With its uncertainty.
+
+    Raises
+    ------
+    UserError
+        Too few tips, too short an arc, or something that is not finite.
+    """
+    settings = CurvatureFitSettings() if settings is None else settings
+    tips = checked_tips(tips)
+    axes = frame(np.asarray(settings.heading, dtype=float))
+    precision = np.zeros(UNKNOWNS)
+    precision[ENTRY] = settings.entry_std**-2.0
+    precision[HEADING] = settings.heading_std**-2.0
+    # In the frame of the known heading, about the known entry.
+    measured = (tips - np.asarray(settings.entry, dtype=float)) @ axes
+    known = insertion is not None
+    if insertion is None:
+        # Where the arc begins along itself is then arbitrary: near the entry's place.
+        precision[2] = max(precision[2], _ARBITRARY_START**-2.0)
+        length = measured[..., 2] - np.zeros(())
+    else:
+        length = np.broadcast_to(np.asarray(insertion, dtype=float), tips.shape[:-1])
+    _check_length(length)
+    unknowns = np.zeros((*tips.shape[:-2], UNKNOWNS))
+    weights = np.ones(tips.shape[:-1])
+    sigma = np.full(tips.shape[:-2], settings.measurement_std or 1e-3)
+    for iteration in range(_ITERATIONS):
+        expected, slopes, tangent = arc_points(unknowns, length)
+        residual = measured - expected
+        along = np.sum(residual * tangent, axis=-1, keepdims=True)
+        if not known:
+            residual = residual - along * tangent
+            across = np.sum(slopes * tangent[..., None], axis=-2, keepdims=True)
+            slopes = slopes - tangent[..., None] * across
+            length = length + along[..., 0]
+        if settings.measurement_std is None:
+            robust = iteration < _ROBUST_ITERATIONS
+            sigma = _noise(residual, weights, directions=3 if known else 2, robust=robust)
+        squared = np.sum(residual**2, axis=-1) / sigma[..., None] ** 2
+        weights = np.minimum(1.0, (settings.outlier_limit**2 / np.maximum(squared, 1e-9)) ** 2)
+        scaled = weights[..., None, None] * slopes
+        normal = np.einsum("...kij,...kil->...jl", scaled, slopes)
+        gradient = np.einsum("...kij,...ki->...j", scaled, residual)
+        weighed = precision * sigma[..., None] ** 2
+        normal = normal + np.eye(UNKNOWNS) * weighed[..., None, :]
+        inverse = np.linalg.inv(normal * _SCALE[:, None] * _SCALE) * _SCALE[:, None] * _SCALE
+        change = np.einsum("...ij,...j->...i", inverse, gradient - weighed * unknowns)
+        unknowns = unknowns + change
+        if iteration > _ROBUST_ITERATIONS and np.all(np.abs(change[..., BEND]) < 1e-9):
+            break
+    covariance = inverse * (sigma**2)[..., None, None]
+    curvature, std = _length(unknowns[..., BEND], covariance[..., BEND, BEND])
+    span = np.max(length, axis=-1) - np.min(length, axis=-1)
+    std = np.hypot(std, 8.0 * settings.repeating_error / span**2)
+    variances = np.diagonal(covariance, axis1=-2, axis2=-1)
+    return CurvatureFit(
+        curvature=curvature,
+        std=std,
+        measurement_std=sigma,
+        weights=weights,
+        misses=(residual - along * tangent) @ axes.T,
+        entry=unknowns[..., ENTRY] @ axes.T + np.asarray(settings.entry, dtype=float),
+        entry_std=np.sqrt(np.max(variances[..., ENTRY], axis=-1)),
+        heading=headings(unknowns[..., HEADING])[..., :, 2] @ axes.T,
+        heading_std=np.sqrt(np.max(variances[..., HEADING], axis=-1)),
+    )
+
+
+def checked_tips(tips: npt.ArrayLike) -> Array:
+    """Return tips as an array, shape (..., K, 3); raises UserError for too few or not finite."""
+    tips = np.asarray(tips, dtype=float)
+    count = tips.shape[-2] if tips.ndim >= 2 else 0
+    if count < FEWEST_TIPS:
+        raise UserError(f"{count} tips are too few for a curvature, wants >= {FEWEST_TIPS}")
+    if not np.all(np.isfinite(tips)):
+        raise UserError("a tip is not finite")
+    return tips
+
+
+def _check_length(length: Array) -> None:
+    if not np.all(np.isfinite(length)):
+        raise UserError("an insertion is not finite")
+    span = float(np.min(np.max(length, axis=-1) - np.min(length, axis=-1)))
+    if span < SHORTEST_ARC:
+        raise UserError(
+            f"{span:.4g} m of insertion are too short for a curvature, wants >= {SHORTEST_ARC:g} m"
+        )
+
+
+def _noise(residual: Array, weights: Array, *, directions: int, robust: bool) -> Array:
+    """Return the standard deviation of one coordinate, from the tips that are no outliers."""
+    squared = np.sum(residual**2, axis=-1)
+    if robust:
+        variance = np.median(squared, axis=-1) / _MEDIAN_SQUARED[directions]
+    else:
+        good = weights >= 1.0
+        degrees = np.maximum(directions * np.sum(good, axis=-1) - UNKNOWNS, 1.0)
+        variance = np.sum(np.where(good, squared, 0.0), axis=-1) / degrees
+    return np.asarray(np.sqrt(np.maximum(variance, _SMALLEST_NOISE**2)))
+
+
+def _length(bend: Array, covariance: Array) -> tuple[Array, Array]:
+    """Return the length of a noisy vector of two components, and its standard deviation."""
+    length = np.sqrt(np.sum(bend**2, axis=-1))
+    unit = bend / np.maximum(length, 1e-12)[..., None]
+    # Of a straight line no direction is known: the mean over all.
+    mean = 0.5 * np.trace(covariance, axis1=-2, axis2=-1)
+    along = np.einsum("...i,...ij,...j->...", unit, covariance, unit)
+    return length, np.sqrt(np.where(length > 1e-9, along, mean))

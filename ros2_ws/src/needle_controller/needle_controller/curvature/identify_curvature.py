@@ -1,0 +1,218 @@
+"""The command `identify_curvature`: the needle's curvature from one pure insertion."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from needle_common.commands.cli import (
+    EXIT_DONE,
+    EXIT_MISSED,
+    JsonValue,
+    finite_or_none,
+    run_command,
+    write_json,
+)
+from needle_common.commands.options import CommandParser, number, output_file
+from needle_common.errors import UserError
+from needle_controller.curvature.arc_order import check_order
+from needle_controller.curvature.circle_fit import circle_curvature
+from needle_controller.curvature.curvature_checks import CheckedFit, fit_checked
+from needle_controller.curvature.curvature_data import InsertionRecord, read_record
+from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+
+DESCRIPTION = """\
+Find the curvature of the needle's path in a tissue, from an insertion without rotation.
+
+Such a needle follows a circle; its radius 1/kappa is what plane_controller's parameter `curvature`
+(kappa, 1/m) comes from. The most likely arc is fitted to the measured tips, and its radius printed
+in mm with the interval that holds it with 95 % probability. Tips far from the arc do not count.
+"""
+
+EPILOG = """\
+what to measure:
+  Push the needle in without turning it, 60 mm or more, a tip every mm. At +-1 mm of noise 60 mm of
+  arc give 1/kappa = 122 mm to about 6 % (one standard deviation), 120 mm to 1 %. On the rig:
+  plane_controller with `preset: open_loop` inserts without turning; record a bag of it.
+
+input:
+  a bag: the directory of a rosbag2 bag with needle/tip and joint_states
+  a CSV: columns x_m, y_m, z_m; with insertion_m the lengths are used, without it each tip is taken
+  to the nearest point of the arc. `ros2 run needle_tracker track_images` writes such a file: rows
+  with valid 0 are left out, --insertion takes the same CSV (name,insertion_m) as there.
+  A column rotation_rad, if there is one, is checked like a bag's rotation joint. Without it tips
+  are refused that leave their arc in order, one after the other, by more than 0.05 mm (or 2.5 times
+  --repeating-error-mm) and more than chance explains. That shows a turn half-way from 20 deg on at
+  stereo_tracker's noise, from 30 deg on at +-1 mm over 120 mm; at +-1 mm over 60 mm hardly any.
+
+examples:
+  ros2 run needle_controller identify_curvature bags/insertion
+  ros2 run needle_controller identify_curvature tips.csv --insertion insertion.csv --json kappa.json
+  ros2 run needle_controller identify_curvature bags/steered --until-mm 40
+      only what was inserted before the base began to turn
+  ros2 run needle_controller identify_curvature tips.csv --entry-std-mm inf --heading-std-deg inf
+      nothing is known of the entry but the tips
+  ros2 run needle_controller identify_curvature bags/insertion --from-mm 5
+      without the first tips of stereo_tracker: before it sees the needle it says where it must be
+
+exit codes: 0 done, 1 the tips cannot tell the path from a straight line, 2 bad input (turned on the
+way, too short, not finite, ...), 130 interrupted.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """What was asked for; mm and degrees, as the user writes them."""
+
+    source: Path
+    insertion: Path | None
+    json: Path | None
+    from_mm: float
+    until_mm: float
+    entry_std_mm: float
+    heading_std_deg: float
+    repeating_error_mm: float
+    rotation_tolerance_deg: float
+
+
+def parse(arguments: Sequence[str]) -> Options:
+    """Return the options of a command line (without the program's name); raises UserError."""
+    parser = CommandParser("identify_curvature", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add("source", type=Path, metavar="BAG_OR_CSV", help="a bag's directory, or a CSV of tips")
+    add("--insertion", type=Path, metavar="FILE", help="CSV name,insertion_m for a CSV of tips")
+    add("--json", type=Path, metavar="FILE", help="write the result to FILE as well")
+    add("--from-mm", default="0", metavar="D", help="leave out what is less deep (default: 0)")
+    add("--until-mm", default="inf", metavar="D", help="leave out what is deeper (default: all)")
+    add(
+        "--entry-std-mm",
+        default="0.5",
+        metavar="S",
+        help="how well it is known that the needle enters at rig's origin at insertion 0, "
+        "standard deviation; inf: not at all (default: 0.5)",
+    )
+    add(
+        "--heading-std-deg",
+        default="5",
+        metavar="S",
+        help="how well it is known that it enters along rig's z axis; inf: not at all (default: 5)",
+    )
+    add(
+        "--repeating-error-mm",
+        default="0.02",
+        metavar="E",
+        help="what all tips may be off together, as by a calibration's error: more tips do not "
+        "make it smaller (default: 0.02)",
+    )
+    add(
+        "--rotation-tolerance-deg",
+        default="1",
+        metavar="R",
+        help="what the base may turn on the way (default: 1)",
+    )
+    given = parser.parse_args(arguments)
+    return Options(
+        source=given.source,
+        insertion=given.insertion,
+        json=output_file("--json", given.json),
+        from_mm=number("--from-mm", given.from_mm, 0.0, 1000.0, "mm"),
+        until_mm=number("--until-mm", given.until_mm, 0.0, math.inf, "mm"),
+        entry_std_mm=number("--entry-std-mm", given.entry_std_mm, 0.001, math.inf, "mm"),
+        heading_std_deg=number("--heading-std-deg", given.heading_std_deg, 0.01, math.inf, "deg"),
+        repeating_error_mm=number(
+            "--repeating-error-mm", given.repeating_error_mm, 0.0, 100.0, "mm"
+        ),
+        rotation_tolerance_deg=number(
+            "--rotation-tolerance-deg", given.rotation_tolerance_deg, 0.0, 10.0, "deg"
+        ),
+    )
+
+
+def identify(options: Options) -> tuple[InsertionRecord, CheckedFit]:
+    """Read, check and fit; raises UserError."""
+    record = read_record(options.source, options.insertion)
+    record = record.between(options.from_mm * 1e-3, options.until_mm * 1e-3)
+    record.check_pure(math.radians(options.rotation_tolerance_deg))
+    settings = CurvatureFitSettings(
+        entry_std=options.entry_std_mm * 1e-3,
+        heading_std=math.radians(options.heading_std_deg),
+        repeating_error=options.repeating_error_mm * 1e-3,
+    )
+    try:
+        checked = fit_checked(record.tips, record.insertion, settings)
+        if record.rotation is None:
+            check_order(checked.fit.misses, settings.repeating_error)
+        return record, checked
+    except UserError as error:
+        raise UserError(f"{options.source}: {error}") from error
+
+
+def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue]:
+    """Return the result as a flat object."""
+    fit = checked.fit
+    low, high = (float(radius) for radius in fit.radius_interval())
+    if record.insertion is not None:
+        arc = float(np.max(record.insertion))
+    else:
+        arc = float(np.linalg.norm(record.tips[-1] - record.tips[0]))
+    return {
+        "radius_mm": finite_or_none(1e3 * float(fit.radius)),
+        "radius_low_mm": 1e3 * low,
+        "radius_high_mm": finite_or_none(1e3 * high),
+        "curvature_per_m": float(fit.curvature),
+        "curvature_std_per_m": float(fit.std),
+        "circle_radius_mm": 1e3 / float(circle_curvature(record.tips)),
+        "arc_mm": 1e3 * arc,
+        "tips": len(record.tips),
+        "outliers": int(np.sum(fit.weights < _OUTLIER_WEIGHT)),
+        "measurement_std_mm": 1e3 * float(fit.measurement_std),
+        "insertion_known": record.insertion is not None,
+        "rotation_known": record.rotation is not None,
+        "warnings": "; ".join(checked.warnings),
+    }
+
+
+_OUTLIER_WEIGHT = 0.5
+
+
+def main(args: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit code."""
+    arguments = sys.argv[1:] if args is None else args
+    return run_command(lambda: _run(arguments))
+
+
+def _run(arguments: Sequence[str]) -> int:
+    options = parse(arguments)
+    record, checked = identify(options)
+    values = summary(record, checked)
+    if options.json is not None:
+        write_json(options.json, values)
+    fit = checked.fit
+    for warning in checked.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if record.rotation is None:
+        print(
+            "warning: whether the base turned is not recorded; the tips follow one arc",
+            file=sys.stderr,
+        )
+    low, high = (1e3 * float(radius) for radius in fit.radius_interval())
+    believable = f"{low:.1f} to {high:.1f} mm" if math.isfinite(high) else f"more than {low:.1f} mm"
+    print(f"1/kappa = {1e3 * float(fit.radius):.1f} mm (95 %: {believable})")
+    print(f"curvature: {float(fit.curvature):.4g}  # 1/m, +- {float(fit.std):.2g}")
+    print(
+        f"{values['tips']} tips over {float(values['arc_mm'] or 0.0):.1f} mm, "
+        f"{values['outliers']} of them outliers, noise {1e3 * float(fit.measurement_std):.3f} mm"
+    )
+    if not math.isfinite(high):
+        print("the tips cannot tell this path from a straight line: insert deeper")
+        return EXIT_MISSED
+    return EXIT_DONE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

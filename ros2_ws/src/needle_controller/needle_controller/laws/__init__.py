@@ -1,0 +1,1 @@
+"""From an estimate to the rotation of the next step."""

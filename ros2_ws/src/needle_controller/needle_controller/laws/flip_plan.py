@@ -1,0 +1,115 @@
+"""A plan of flips: insertion depths at which the bevel is turned to the other side of the plane.
+
+Within the plane the needle bends to the side that the sign of cos(roll) says; turning the bevel
+over at planned depths lets it follow a path of arcs there (Reed et al., Integrated planning and
+image-guided control for planar needle steering, BioRob 2008), while the law keeps it in the plane.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_controller.model.arrays import Array
+
+
+@dataclasses.dataclass(frozen=True)
+class FlipPlan:
+    """Insertion depths at which the bevel is flipped.
+
+    Attributes
+    ----------
+    depths : tuple of float
+        Increasing, above 0 [m]; none by default.
+    first_sign : float
+        Sign of cos(roll) before the first flip, +1 or -1.
+
+    Raises
+    ------
+    UserError
+        Depths that are not finite, not above 0 or not increasing.
+    """
+
+    depths: tuple[float, ...] = ()
+    first_sign: float = 1.0
+
+    def __post_init__(self) -> None:
+        """Check the depths."""
+        before = 0.0
+        for number, depth in enumerate(self.depths, start=1):
+            if not math.isfinite(depth):
+                raise UserError(f"flip {number} at {depth:g} m is not finite")
+            if depth <= before:
+                bound = f"> {before:g} m" + (", the flip before it" if number > 1 else "")
+                raise UserError(f"flip {number} at {depth:g} m, wants {bound}")
+            before = depth
+        if self.first_sign not in (1.0, -1.0):
+            raise UserError(f"first_sign = {self.first_sign:g}, wants 1 or -1")
+
+    def check_within(self, depth: float) -> None:
+        """Check that every flip comes before the needle's end.
+
+        Parameters
+        ----------
+        depth : float
+            Insertion at which steering ends [m].
+
+        Raises
+        ------
+        OutOfBoundsError
+            A flip at that depth or beyond.
+        """
+        if self.depths and not self.depths[-1] < depth:
+            number = len(self.depths)
+            raise OutOfBoundsError(f"flip {number}", self.depths[-1], 0.0, depth, "m")
+
+    def bend_sign(self, insertion: npt.ArrayLike) -> Array:
+        """Return the wanted sign of cos(roll) from an insertion on.
+
+        Parameters
+        ----------
+        insertion : array_like, shape (...)
+            Insertion depth [m]; at a flip's own depth the sign is that after it, to 1 um.
+
+        Returns
+        -------
+        ndarray, shape (...)
+            +1 or -1.
+        """
+        reached = np.asarray(insertion, dtype=float) + DEPTH_TOLERANCE
+        done = np.searchsorted(np.asarray(self.depths, dtype=float), reached, side="right")
+        return np.asarray(np.where(done % 2 == 0, self.first_sign, -self.first_sign))
+
+    def next_flip(self, insertion: float) -> float:
+        """Return the depth of the next flip [m], infinite if there is none."""
+        ahead = [depth for depth in self.depths if depth > insertion + DEPTH_TOLERANCE]
+        return ahead[0] if ahead else math.inf
+
+
+DEPTH_TOLERANCE = 1e-6
+
+
+def evenly_spaced_flips(count: int, depth: float) -> FlipPlan:
+    """Return a plan of flips that divide a depth into `count` + 1 equal parts.
+
+    Parameters
+    ----------
+    count : int
+        Number of flips, >= 0.
+    depth : float
+        Insertion at which steering ends [m].
+
+    Raises
+    ------
+    OutOfBoundsError
+        A negative count, or a depth that is not above 0.
+    """
+    if count < 0:
+        raise OutOfBoundsError("flips", count, 0, math.inf, "-")
+    if not 0.0 < depth < math.inf:
+        raise OutOfBoundsError("depth", depth, float(np.nextafter(0.0, 1.0)), math.inf, "m")
+    return FlipPlan(tuple(depth * (i + 1) / (count + 1) for i in range(count)))

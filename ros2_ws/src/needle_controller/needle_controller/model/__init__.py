@@ -1,0 +1,1 @@
+"""The model of the needle: kinematics, its linearisation, gains, reach, and the plane to follow."""

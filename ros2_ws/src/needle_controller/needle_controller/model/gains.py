@@ -1,0 +1,204 @@
+"""Gains of the law (10) and of the observer (9) from LQG weights ([KC09] III-B).
+
+Both are designed on the system (8) in inserted length, as in the paper, with continuous Riccati
+equations: the weights then mean the same whatever the step. The law's gain is used as it is, after
+a check that holding the input over one step keeps the loop stable. The observer is sampled exactly
+in its error: over any inserted length l its error poles are exp(lambda_i l), lambda_i being those
+of A - L C. A discrete Riccati equation would give a gain for one step length only, while steps are
+shortened, aborted and resumed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import numpy.typing as npt
+from scipy import linalg
+
+from needle_common.errors import UserError
+from needle_controller.model.arrays import Array
+from needle_controller.model.feedback_linearization import A, B, C, transition
+
+_SAME_LENGTH = 12
+"""Digits to which lengths of steps agree."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gains:
+    """What the weights give.
+
+    Attributes
+    ----------
+    feedback : ndarray, shape (3,)
+        K of (10): (1/m^3, 1/m^2, 1/m).
+    observer : ndarray, shape (3,)
+        L of (9) per inserted length: (1/m, 1/m^2, 1/m^3).
+    observer_poles : ndarray of complex, shape (3,)
+        Eigenvalues of A - L C [1/m].
+    """
+
+    feedback: Array
+    observer: Array
+    observer_poles: npt.NDArray[np.complex128]
+
+
+def design_gains(
+    *,
+    state_weights: npt.ArrayLike,
+    input_weight: float,
+    process_noise: npt.ArrayLike,
+    measurement_std: float,
+    step_length: float,
+) -> Gains:
+    """Return the gains of law and observer.
+
+    Parameters
+    ----------
+    state_weights : array_like, shape (3, 3)
+        Cost of s per inserted length, symmetric, nonnegative.
+    input_weight : float
+        Cost of v per inserted length, > 0.
+    process_noise : array_like, shape (3, 3)
+        Covariance of white noise on ds/dl per metre, symmetric, nonnegative.
+    measurement_std : float
+        Standard deviation of one measurement of s1 [m], > 0; one measurement comes every
+        `step_length`.
+    step_length : float
+        Insertion between measurements, over which the rotation rate is held [m], > 0.
+
+    Returns
+    -------
+    Gains
+        Both gains and the observer's poles.
+
+    Raises
+    ------
+    UserError
+        A weight that is not finite, symmetric or nonnegative, a pair of weights that leaves the
+        system without a stabilising gain, or a step too long for the law.
+    """
+    state_weights = checked_weights("state_weights", state_weights)
+    process_noise = checked_weights("process_noise", process_noise)
+    for name, value in (
+        ("input_weight", input_weight),
+        ("measurement_std", measurement_std),
+        ("step_length", step_length),
+    ):
+        if not (np.isfinite(value) and value > 0.0):
+            raise UserError(f"{name} = {value:g} is not a finite number > 0")
+    feedback = _feedback_gain(state_weights, input_weight)
+    # A measurement every step_length carries as much as white noise of this density.
+    density = measurement_std**2 * step_length
+    observer = _observer_gain(process_noise, density)
+    sampled = transition(step_length) - held_input(step_length)[:, None] @ feedback[None, :]
+    radius = float(np.max(np.abs(np.linalg.eigvals(sampled))))
+    if radius >= 1.0:
+        raise UserError(
+            f"the law is unstable when held over step_length = {step_length:g} m "
+            f"(spectral radius {radius:.3g}, wants < 1): lower state_weights or step_length"
+        )
+    poles = np.linalg.eigvals(A - observer[:, None] @ C).astype(complex)
+    return Gains(feedback, observer, poles)
+
+
+def held_input(length: float) -> Array:
+    """Return G, what a unit input v held over an inserted length adds to s, shape (3,)."""
+    return np.array([length**3 / 6.0, length**2 / 2.0, length])
+
+
+def sampled_observer_gain(poles: npt.NDArray[np.complex128], length: npt.ArrayLike) -> Array:
+    """Return the gain on one innovation after an inserted length, with unchanged error poles.
+
+    With q_i = 1 - exp(lambda_i l) and e_k their elementary symmetric polynomials, the error (I -
+    gain C) F(l) of the triple integrator has the poles exp(lambda_i l) for gain = (e1 - e2 + e3,
+    (e2 - 3/2 e3) / l, e3 / l^2). For small l it tends to l L, with L of (9); after no insertion it
+    is 0: a second look at a needle at rest, through the same optics, is not counted as new.
+
+    Parameters
+    ----------
+    poles : ndarray of complex, shape (3,)
+        Eigenvalues of A - L C [1/m].
+    length : array_like, shape (...)
+        Inserted length since the last correction, >= 0 [m].
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Gain on w - C s: (-, 1/m, 1/m^2).
+    """
+    length = np.asarray(length, dtype=float)
+    if length.ndim == 0:
+        # Steps are alike but for rounding, and this is done at every one.
+        return _gain_of_one(tuple(poles.tolist()), float(f"{float(length):.{_SAME_LENGTH}g}"))
+    return _observer_gain_at(poles, length)
+
+
+@functools.lru_cache(maxsize=256)
+def _gain_of_one(poles: tuple[complex, ...], length: float) -> Array:
+    gain = _observer_gain_at(np.array(poles), np.asarray(length))
+    gain.setflags(write=False)
+    return gain
+
+
+def _observer_gain_at(poles: npt.NDArray[np.complex128], length: Array) -> Array:
+    q1, q2, q3 = np.moveaxis(-np.expm1(poles * length[..., None]), -1, 0)
+    e1 = np.real(q1 + q2 + q3)
+    e2 = np.real(q1 * q2 + q1 * q3 + q2 * q3)
+    e3 = np.real(q1 * q2 * q3)
+    safe = np.where(length > 0.0, length, 1.0)
+    return np.stack([e1 - e2 + e3, (e2 - 1.5 * e3) / safe, e3 / safe**2], axis=-1)
+
+
+def checked_weights(name: str, weights: npt.ArrayLike) -> Array:
+    """Return weights as a 3 x 3 array.
+
+    Raises
+    ------
+    UserError
+        If they are not finite, symmetric and nonnegative definite, with the offending value.
+    """
+    matrix = np.asarray(weights, dtype=float)
+    if matrix.shape != (3, 3):
+        raise UserError(f"{name} has shape {matrix.shape}, wants (3, 3)")
+    if not np.all(np.isfinite(matrix)):
+        raise UserError(f"{name} = {matrix.tolist()} is not finite")
+    largest = float(np.max(np.abs(matrix)))
+    if float(np.max(np.abs(matrix - matrix.T))) > 1e-12 * largest:
+        raise UserError(f"{name} = {matrix.tolist()} is not symmetric")
+    smallest = float(np.min(np.linalg.eigvalsh(matrix)))
+    if smallest < -1e-12 * largest:
+        raise UserError(f"{name} has the eigenvalue {smallest:g}, wants >= 0")
+    return matrix
+
+
+# Riccati equations are solved in this unit of length: in metres their entries span ten decades.
+_UNIT = 0.02
+_SCALE = np.array([1.0 / _UNIT, 1.0, _UNIT])
+
+
+def _feedback_gain(weights: Array, input_weight: float) -> Array:
+    """Return K of (10) for the cost s^T weights s + input_weight v^2 per inserted length."""
+    scaled = weights / _SCALE[:, None] / _SCALE * (_UNIT**4 / input_weight)
+    gain = _riccati_gain(A, B, scaled, "state_weights, input_weight")
+    return np.asarray(gain * _SCALE / _UNIT**2)
+
+
+def _observer_gain(process_noise: Array, measurement_density: float) -> Array:
+    """Return L of (9), the steady Kalman gain for white process and measurement noise."""
+    scaled = process_noise * _SCALE[:, None] * _SCALE * (_UNIT**4 / measurement_density)
+    gain = _riccati_gain(A.T, C.T, scaled, "process_noise, measurement_std")
+    return np.asarray(gain / _SCALE / _UNIT**2)
+
+
+def _riccati_gain(a: Array, b: Array, weights: Array, names: str) -> Array:
+    try:
+        solution = linalg.solve_continuous_are(a, b, weights, np.eye(1))
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise UserError(f"{names} give no stabilising gain: {error}") from error
+    gain = np.asarray((b.T @ solution)[0], dtype=float)
+    worst = float(np.max(np.linalg.eigvals(a - b @ gain[None, :]).real))
+    if not worst < 0.0:
+        raise UserError(f"{names} give no stabilising gain (eigenvalue {worst:g}, wants < 0)")
+    return gain

@@ -1,0 +1,156 @@
+"""The needle's generalised coordinates and how they change with insertion ([KC09] (3)-(5)).
+
+Paper symbols: q = (x, y, z, alpha, beta, gamma) are the coordinates (tip position, yaw, pitch,
+roll), r = (x, beta, gamma) the reduced state, kappa the curvature, u the rotation rate per inserted
+length, l the inserted length. All of them are in the frame `target_plane`, whose y-z plane is the
+wanted one. Leading axes broadcast.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_controller.model.arrays import Array
+
+X, Y, Z, YAW, PITCH, ROLL = range(6)
+"""Indices into the coordinates q."""
+REDUCED = (X, PITCH, ROLL)
+"""Indices of the reduced state r within the coordinates q."""
+
+
+def rotation_from_angles(angles: npt.ArrayLike) -> Array:
+    """Return R = Rx(yaw) Ry(pitch) Rz(roll), the tip's orientation.
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        Yaw alpha, pitch beta, roll gamma [rad].
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Columns are the tip's axes in `target_plane`; the third is the heading.
+    """
+    angles = np.asarray(angles, dtype=float)
+    ca, cb, cg = np.moveaxis(np.cos(angles), -1, 0)
+    sa, sb, sg = np.moveaxis(np.sin(angles), -1, 0)
+    rows = [
+        [cb * cg, -cb * sg, sb],
+        [ca * sg + sa * sb * cg, ca * cg - sa * sb * sg, -sa * cb],
+        [sa * sg - ca * sb * cg, sa * cg + ca * sb * sg, ca * cb],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def angles_from_rotation(rotation: npt.ArrayLike) -> Array:
+    """Return yaw, pitch, roll of an orientation: the inverse of `rotation_from_angles`.
+
+    Parameters
+    ----------
+    rotation : array_like, shape (..., 3, 3)
+        Rotation matrices, tip in `target_plane`.
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Yaw and roll in (-pi, pi], pitch in [-pi/2, pi/2] [rad]. At pitch +-pi/2 only the sum or
+        difference of yaw and roll is defined (the singularity of (3)); there they are what rounding
+        makes of them.
+    """
+    rotation = np.asarray(rotation, dtype=float)
+    yaw = np.arctan2(-rotation[..., 1, 2], rotation[..., 2, 2])
+    pitch = np.arcsin(np.clip(rotation[..., 0, 2], -1.0, 1.0))
+    roll = np.arctan2(-rotation[..., 0, 1], rotation[..., 0, 0])
+    return np.stack([yaw, pitch, roll], axis=-1)
+
+
+def angle_axes(angles: npt.ArrayLike) -> Array:
+    """Return the axes in `target_plane` about which yaw, pitch and roll turn the tip.
+
+    A small change of the angles turns the tip by the rotation vector `angle_axes(angles) @ change`;
+    this carries a covariance of the angles into the fixed-axis convention of
+    geometry_msgs/PoseWithCovariance.
+
+    Parameters
+    ----------
+    angles : array_like, shape (..., 3)
+        Yaw, pitch, roll [rad].
+
+    Returns
+    -------
+    ndarray, shape (..., 3, 3)
+        Columns are the unit axes of yaw, pitch and roll.
+    """
+    angles = np.asarray(angles, dtype=float)
+    yaw, pitch = angles[..., 0], angles[..., 1]
+    one, zero = np.ones_like(yaw), np.zeros_like(yaw)
+    about_yaw = np.stack([one, zero, zero], axis=-1)
+    about_pitch = np.stack([zero, np.cos(yaw), np.sin(yaw)], axis=-1)
+    heading = np.stack(
+        [np.sin(pitch), -np.sin(yaw) * np.cos(pitch), np.cos(yaw) * np.cos(pitch)], axis=-1
+    )
+    return np.stack([about_yaw, about_pitch, heading], axis=-1)
+
+
+def coordinate_rates(
+    coordinates: npt.ArrayLike, rotation_rate: npt.ArrayLike, curvature: npt.ArrayLike
+) -> Array:
+    """Return dq/dl, the change of the coordinates per inserted length: (4) with u1 = 1.
+
+    Parameters
+    ----------
+    coordinates : array_like, shape (..., 6)
+        x, y, z [m], yaw, pitch, roll [rad].
+    rotation_rate : array_like, shape (...)
+        Rotation of the base per inserted length, u [rad/m].
+    curvature : array_like, shape (...)
+        Curvature of the needle's path, kappa [1/m].
+
+    Returns
+    -------
+    ndarray, shape (..., 6)
+        Per metre inserted; infinite at pitch +-pi/2, where (3) is singular.
+    """
+    coordinates = np.asarray(coordinates, dtype=float)
+    yaw, pitch, roll = (coordinates[..., i] for i in (YAW, PITCH, ROLL))
+    curvature = np.asarray(curvature, dtype=float)
+    rates = [
+        np.sin(pitch),
+        -np.cos(pitch) * np.sin(yaw),
+        np.cos(yaw) * np.cos(pitch),
+        curvature * np.cos(roll) / np.cos(pitch),
+        curvature * np.sin(roll),
+        -curvature * np.cos(roll) * np.tan(pitch) + np.asarray(rotation_rate, dtype=float),
+    ]
+    return np.stack(np.broadcast_arrays(*rates), axis=-1)
+
+
+def reduced_rates(
+    reduced: npt.ArrayLike, rotation_rate: npt.ArrayLike, curvature: npt.ArrayLike
+) -> Array:
+    """Return dr/dl, the change of the reduced state per inserted length: (5).
+
+    Parameters
+    ----------
+    reduced : array_like, shape (..., 3)
+        Distance from the plane x [m], pitch, roll [rad].
+    rotation_rate : array_like, shape (...)
+        Rotation of the base per inserted length, u [rad/m].
+    curvature : array_like, shape (...)
+        Curvature of the needle's path, kappa [1/m].
+
+    Returns
+    -------
+    ndarray, shape (..., 3)
+        Per metre inserted.
+    """
+    reduced = np.asarray(reduced, dtype=float)
+    pitch, roll = reduced[..., 1], reduced[..., 2]
+    curvature = np.asarray(curvature, dtype=float)
+    rates = [
+        np.sin(pitch),
+        curvature * np.sin(roll),
+        -curvature * np.cos(roll) * np.tan(pitch) + np.asarray(rotation_rate, dtype=float),
+    ]
+    return np.stack(np.broadcast_arrays(*rates), axis=-1)

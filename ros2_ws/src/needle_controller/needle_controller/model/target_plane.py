@@ -1,0 +1,134 @@
+"""The wanted plane: a frame in `rig` whose y-z plane it is."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_common.errors import UserError
+from needle_controller.model.arrays import Array
+from needle_controller.model.reachability import check_offset
+
+_UNIT_TOLERANCE = 1e-3
+RIG = "rig"
+SHORTEST_JUDGED_DEPTH = 0.12
+"""Depth of the insertions of [KC09] IV-B [m]; shorter runs are parts of one."""
+
+
+@dataclasses.dataclass(frozen=True)
+class TargetPlane:
+    """Pose of the frame `target_plane` in `rig`.
+
+    Attributes
+    ----------
+    T_rig_plane : ndarray, shape (4, 4)
+        A rigid transform [m].
+    """
+
+    T_rig_plane: Array
+
+    @property
+    def T_plane_rig(self) -> Array:  # noqa: N802
+        """The inverse: `rig` in `target_plane`, shape (4, 4)."""
+        inverse = np.eye(4)
+        inverse[:3, :3] = self.T_rig_plane[:3, :3].T
+        inverse[:3, 3] = -self.T_rig_plane[:3, :3].T @ self.T_rig_plane[:3, 3]
+        return inverse
+
+    @property
+    def offset(self) -> float:
+        """Signed distance of the plane from the entry point, along its own x axis [m]."""
+        return float(self.T_rig_plane[:3, 0] @ self.T_rig_plane[:3, 3])
+
+    def from_rig(self, position: npt.ArrayLike) -> Array:
+        """Return positions in `target_plane` of positions in `rig`, shape (..., 3) [m]."""
+        shifted = np.asarray(position, dtype=float) - self.T_rig_plane[:3, 3]
+        return np.asarray(shifted @ self.T_rig_plane[:3, :3])
+
+
+def offset_plane(offset: float) -> TargetPlane:
+    """Return the plane x = offset [m] of `rig`: the default one."""
+    transform = np.eye(4)
+    transform[0, 3] = offset
+    return TargetPlane(transform)
+
+
+def plane_from_pose(
+    frame_id: str, position: npt.ArrayLike, quaternion: npt.ArrayLike
+) -> TargetPlane:
+    """Return the plane that a pose asks for.
+
+    Parameters
+    ----------
+    frame_id : str
+        The frame the pose is given in; must be `rig`.
+    position : array_like, shape (3,)
+        Origin of `target_plane` [m].
+    quaternion : array_like, shape (4,)
+        Its orientation, x y z w, of unit length.
+
+    Returns
+    -------
+    TargetPlane
+        The checked plane.
+
+    Raises
+    ------
+    UserError
+        Another frame, numbers that are not finite, a quaternion that is not of unit length, or a
+        plane that the entering needle stands on at right angles.
+    """
+    if frame_id != RIG:
+        raise UserError(f"target_plane is given in frame '{frame_id}', wants '{RIG}'")
+    origin, q = np.asarray(position, dtype=float), np.asarray(quaternion, dtype=float)
+    if not (np.all(np.isfinite(origin)) and np.all(np.isfinite(q))):
+        raise UserError(f"target_plane is not finite: position {origin}, orientation {q}")
+    norm = float(np.linalg.norm(q))
+    if abs(norm - 1.0) > _UNIT_TOLERANCE:
+        raise UserError(f"target_plane's quaternion has length {norm:g}, wants 1")
+    transform = np.eye(4)
+    transform[:3, :3] = _rotation_from_quaternion(q / norm)
+    transform[:3, 3] = origin
+    plane = TargetPlane(transform)
+    # The entering needle's sine of pitch in the plane's coordinates.
+    if abs(transform[2, 0]) > np.sin(np.deg2rad(80.0)):
+        angle = np.rad2deg(np.arcsin(min(1.0, abs(transform[2, 0]))))
+        raise UserError(
+            f"the needle enters at {angle:.0f} deg to target_plane, wants at most 80 deg"
+        )
+    return plane
+
+
+def check_within_reach(plane: TargetPlane, curvature: float, depth: float) -> None:
+    """Check that a needle that is still out could be steered into a plane.
+
+    Parameters
+    ----------
+    plane : TargetPlane
+        The wanted plane.
+    curvature : float
+        kappa [1/m].
+    depth : float
+        Insertion at which steering ends [m]; a run that is shorter than `SHORTEST_JUDGED_DEPTH` is
+        judged as if it went on to there.
+
+    Raises
+    ------
+    UserError
+        The plane is farther than the needle can ever go: says how far it can.
+    """
+    pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
+    check_offset(plane.offset, curvature, max(depth, SHORTEST_JUDGED_DEPTH), pitch)
+
+
+def _rotation_from_quaternion(q: Array) -> Array:
+    x, y, z, w = q
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )

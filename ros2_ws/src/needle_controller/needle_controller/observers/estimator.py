@@ -1,0 +1,119 @@
+"""What every estimator of the needle is to the rest: one interface for one needle and for 10,000.
+
+Everything is in the frame `target_plane`, SI. Leading axes are needles: the node's single needle
+has shape (3,), a study's 10,000 needles (10000, 3).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy.typing as npt
+
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import REDUCED, rotation_from_angles
+
+
+@dataclasses.dataclass(frozen=True)
+class Estimate:
+    """What is known of the needle after the last measurement.
+
+    Attributes
+    ----------
+    coordinates : ndarray, shape (..., 6)
+        x, y, z [m], yaw, pitch, roll [rad]: the pose of the tip.
+    linearized : ndarray, shape (..., 3)
+        The linearized state s of (6).
+    curvature : ndarray, shape (...)
+        Curvature of the needle's path, assumed or estimated [1/m].
+    warnings : tuple of str
+        What a user should know of this estimate; empty as a rule.
+    covariance_of : callable
+        Returns `covariance`; studies of many needles do not pay for what they do not read.
+    """
+
+    coordinates: Array
+    linearized: Array
+    curvature: Array
+    warnings: tuple[str, ...]
+    covariance_of: Callable[[], Array] = dataclasses.field(repr=False)
+
+    @property
+    def reduced(self) -> Array:
+        """The reduced state r = (x, pitch, roll), shape (..., 3)."""
+        return self.coordinates[..., REDUCED]
+
+    @property
+    def position(self) -> Array:
+        """The tip, shape (..., 3) [m]."""
+        return self.coordinates[..., :3]
+
+    @property
+    def rotation(self) -> Array:
+        """The tip's orientation, shape (..., 3, 3)."""
+        return rotation_from_angles(self.coordinates[..., 3:])
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of `coordinates`, in their order, shape (..., 6, 6)."""
+        return self.covariance_of()
+
+
+class Estimator(Protocol):
+    """Estimates the tip's pose from where it was seen and from what the base really did."""
+
+    def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
+        """Start over at a first measurement.
+
+        Parameters
+        ----------
+        tip : array_like, shape (..., 3)
+            The tip [m].
+        joints : array_like, shape (..., 2)
+            Insertion [m] and rotation [rad] of the base at the same instant.
+        """
+
+    def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
+        """Move on by what really happened since the last call, the rotation spread evenly over it.
+
+        Parameters
+        ----------
+        d_insertion : array_like, shape (...)
+            Inserted length, >= 0 [m].
+        d_rotation : array_like, shape (...)
+            Rotation of the base [rad].
+
+        Raises
+        ------
+        ValueError
+            A negative or non-finite insertion: the model holds for forward insertion only.
+        """
+
+    def correct(
+        self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
+    ) -> None:
+        """Take a measurement of the tip.
+
+        Parameters
+        ----------
+        tip : array_like, shape (..., 3)
+            The tip [m]; NaN for a needle whose tip was not found.
+        covariance : array_like, shape (..., 3, 3), optional
+            Its covariance [m^2]; the estimator's own assumption if none is given.
+        age : array_like, shape (...)
+            Length inserted since the exposure [m]; 0 when `advance` stopped at it.
+        """
+
+    def estimate(self) -> Estimate:
+        """Return what is known now."""
+
+    def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803
+        """Express everything in another target plane.
+
+        Parameters
+        ----------
+        T_new_old : array_like, shape (4, 4)
+            The old target plane's pose in the new one.
+        """

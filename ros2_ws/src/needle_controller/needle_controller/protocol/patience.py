@@ -1,0 +1,53 @@
+"""How long what is awaited has not come, and what of the device has not been heard."""
+
+from __future__ import annotations
+
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.step_watch import REST_INSERTION
+
+
+class Patience:
+    """Measures waits on the steady clock; `steady` is everywhere its reading [s].
+
+    Attributes
+    ----------
+    silence : str
+        What of the device has not been heard for long; empty when all is well.
+    """
+
+    def __init__(self) -> None:
+        self.silence = ""
+        self._since: float | None = None
+        self._heard_since: float | None = None
+        self._looked_at: JointSample | None = None
+
+    def restart(self) -> None:
+        """Begin to wait anew."""
+        self._since = self._heard_since = None
+
+    def heard(self) -> bool:
+        """Take that the device is heard; return whether that ends a silence."""
+        self._heard_since = None
+        was_silent, self.silence = bool(self.silence), ""
+        return was_silent
+
+    def waited(self, steady: float, *, moving: bool) -> float:
+        """Return for how long something is awaited, not counting while it moves [s]."""
+        if self._since is None or moving:
+            self._since = steady
+        return steady - self._since
+
+    def unheard(self, steady: float) -> float:
+        """Return for how long the device has not been heard [s]."""
+        if self._heard_since is None:
+            self._heard_since = steady
+        return steady - self._heard_since
+
+    def has_moved(self, latest: JointSample | None) -> bool:
+        """Return whether the joints have moved since the last look."""
+        before, self._looked_at = self._looked_at, latest
+        return (
+            latest is not None
+            and before is not None
+            and abs(latest.insertion - before.insertion) > REST_INSERTION
+        )

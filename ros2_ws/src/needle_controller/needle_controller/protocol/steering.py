@@ -1,0 +1,419 @@
+"""The step protocol: when the needle is moved, by what data, and when not.
+
+States: IDLE -> STEERING <-> WAITING_FOR_TIP -> DONE | FAULT. Events come in, actions go out; time
+is only ever an argument. What is sent depends on stamps, never on the order in which topics
+happened to arrive.
+"""
+
+from __future__ import annotations
+
+import math
+
+from needle_controller.model.reachability import Reachability, reachability
+from needle_controller.protocol.failed_steps import FailedSteps
+from needle_controller.protocol.joint_history import Heard, JointSample
+from needle_controller.protocol.next_step import next_step
+from needle_controller.protocol.patience import Patience
+from needle_controller.protocol.plane_control import PlaneControl
+from needle_controller.protocol.retraction import RetractionWatch
+from needle_controller.protocol.start_conditions import Situation, is_out, obstacle
+from needle_controller.protocol.steering_types import (
+    Action,
+    Awaiting,
+    DeviceStatus,
+    Log,
+    PublishUpdate,
+    Reply,
+    SendStep,
+    State,
+    SteeringSettings,
+)
+from needle_controller.protocol.step_watch import REST_INSERTION, Followed, StepWatch
+from needle_controller.protocol.tip_covariance import TipCovariance
+from needle_controller.protocol.tip_gate import AcceptedTip, Refusal, TipMeasurement
+from needle_controller.protocol.tip_intake import TipIntake
+
+PLANE_TOLERANCE = 1e-3
+"""Distance from the plane at which the needle counts as in it, [KC09] IV-A [m]."""
+_STOPPED_DEVICE = ("FAULT", "ESTOPPED")
+_DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
+
+
+class Steering:
+    """The step protocol of one needle.
+
+    Parameters
+    ----------
+    settings : SteeringSettings
+        The protocol's numbers; may be replaced while it runs.
+    control : PlaneControl
+        Estimator and law.
+
+    Attributes
+    ----------
+    state, awaiting : State, Awaiting
+        Where the protocol is, and what it needs to go on.
+    reason : str
+        Why it is there, or what is amiss.
+    starts : int
+        How often somebody has started it.
+    step : int
+        Steps done.
+    rejection : str
+        Why the last tip was refused; empty once one was used.
+    watchdog_trips : int
+        How often the steady clock, not data, decided.
+    insertion : float
+        At the last used tip [m].
+    reach : Reachability or None
+        Of the plane, at the last used tip.
+    intake : TipIntake
+        Tips and joints.
+    """
+
+    def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
+        self.settings = settings
+        self.control = control
+        self.state = State.IDLE
+        self.awaiting = Awaiting.NOTHING
+        self.reason = "not started"
+        self.starts = 0
+        self.step = 0
+        self.rejection = ""
+        self.watchdog_trips = 0
+        self.insertion = 0.0
+        self.reach: Reachability | None = None
+        self.intake = TipIntake()
+        self._retraction = RetractionWatch()
+        self._device: DeviceStatus | None = None
+        self._ready_step: SendStep | None = None
+        self._sent: SendStep | None = None
+        self._followed: StepWatch | None = None
+        self._failed = FailedSteps()
+        self._patience = Patience()
+
+    @property
+    def silence(self) -> str:
+        """What of the device has not been heard for long; empty when all is well."""
+        return self._patience.silence
+
+    @property
+    def tip_after_ns(self) -> int:
+        """A tip exposed after this is wanted [ns]."""
+        return self.intake.after_ns
+
+    @property
+    def tips_rejected(self) -> int:
+        """Tips that were refused."""
+        return self.intake.refused.total()
+
+    # What a person asks for
+
+    def on_start(self) -> tuple[Reply, list[Action]]:
+        """Begin steering, or say why not."""
+        joints = self.intake.joints.latest
+        why = obstacle(
+            Situation(self._steering, self._device, joints, self._retraction.obstacle),
+            self.control,
+            self.settings,
+        )
+        if why:
+            return Reply(False, why), [Log("warning", f"not started: {why}")]
+        if joints is not None and is_out(joints, self.settings):
+            self.control.restart()
+            self.intake.last = None
+            self.step = 0
+            self._retraction.begin(joints.insertion)
+        self.state, self.reason = State.STEERING, ""
+        self.starts += 1
+        self._failed.forget()
+        self.intake.want_any()
+        return Reply(True, "steering"), [Log("info", "steering"), *self._ask()]
+
+    def on_stop(self) -> tuple[Reply, list[Action]]:
+        """Send no further step; one under way ends with the hold, or by itself."""
+        if not self._steering:
+            return Reply(True, f"was not steering ({self.state.value})"), []
+        return Reply(True, "stopped"), self._leave(State.IDLE, "stopped", "info")
+
+    # What comes in
+
+    def on_joints(self, sample: JointSample) -> list[Action]:
+        """Take a sample of the joints."""
+        before, complaint = self.intake.joints.latest, self.intake.joints.complaint
+        heard = self.intake.joints.add(sample)
+        if heard is Heard.DOUBTED and not complaint:
+            return [Log("warning", self.intake.joints.complaint, "joints")]
+        if heard in {Heard.DOUBTED, Heard.REPEATED}:
+            return []
+        actions = self._heard()
+        if heard is Heard.JUMPED and before is not None:
+            actions += self._take_jump(before, sample)
+        out_below = self.settings.needle_out_insertion
+        tolerance = self.settings.retraction_tolerance
+        if self._retraction.watch(sample.insertion, out_below=out_below, tolerance=tolerance):
+            actions += self._end_by_retraction(sample)
+        return actions + self._watch_step(sample) + self._use_tip()
+
+    def on_tip(self, tip: TipMeasurement) -> list[Action]:
+        """Take a measured tip: used, kept until all that belongs to it has come, or refused."""
+        wanted = self._steering and self.awaiting is Awaiting.TIP
+        refusal = self.intake.offer(tip, self.settings, steering=self._steering, wanted=wanted)
+        return [*(self._refuse(refusal) if refusal is not None else ()), *self._use_tip()]
+
+    def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
+        """Take what a tip's source says of how well it knows the tip of the same stamp."""
+        self.intake.covariances.add(covariance)
+        return self._use_tip()
+
+    def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:
+        """Take the driver's answer to a command; answers to other commands are not ours.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The command's stamp [ns].
+        text : str
+            "succeeded", or why not.
+        sent_ns : int
+            When the device sent it, on its own clock [ns]; 0 where nobody knows.
+        """
+        if self._sent is None or stamp_ns != self._sent.stamp_ns:
+            return []
+        step, self._sent = self._sent, None
+        if not self._steering:
+            return []
+        if text == "succeeded":
+            self._followed = StepWatch(step, sent_ns)
+            return [*self._ask(), *self._watch_step(None), *self._use_tip()]
+        actions: list[Action] = [Log("warning", f"step {self.step + 1} {text}", "abort")]
+        self.reason = f"step {text}"
+        why = self._failed.aborted(text, moved=self._moved_since_command())
+        if why:
+            return actions + self._leave(State.FAULT, why, "error")
+        return actions + self._ask() + self._use_tip()
+
+    def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
+        """Take that the device made another step in place of the one under way: of a recording.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            The other command's stamp [ns].
+        end : JointSample
+            Where it led.
+        """
+        if self._sent is not None:
+            self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
+
+    def on_device(self, status: DeviceStatus) -> list[Action]:
+        """Take the driver's state."""
+        self._device = status
+        actions = self._heard()
+        if not self._steering:
+            return actions
+        if status.state in _STOPPED_DEVICE:
+            why = f"device is {status.state}: {status.reason}"
+            return actions + self._leave(State.FAULT, why, "error")
+        if status.state in _DISABLED_DEVICE:
+            return actions + self._leave(State.IDLE, f"device is {status.state}", "warning")
+        if self.awaiting is Awaiting.HOLD and status.hold_owner:
+            actions += self._ask()
+        elif self.awaiting is Awaiting.DEVICE:
+            actions += self._send()
+        return actions
+
+    def on_time(self, steady: float) -> list[Action]:
+        """Watch the age of what is awaited.
+
+        Parameters
+        ----------
+        steady : float
+            Now, on the steady clock [s].
+        """
+        if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
+            self._patience.restart()
+            return []
+        moving = self.awaiting is Awaiting.RESULT and self._is_moving()
+        waited = self._patience.waited(steady, moving=moving)
+        if self.awaiting is Awaiting.RESULT:
+            return self._watch_result(waited, steady)
+        return self._watch_tip(waited, steady)
+
+    # What follows
+
+    @property
+    def _steering(self) -> bool:
+        return self.state in {State.STEERING, State.WAITING_FOR_TIP}
+
+    def _is_moving(self) -> bool:
+        """Return whether the device says so, or the joints do since the last look."""
+        has_moved = self._patience.has_moved(self.intake.joints.latest)
+        return has_moved or (self._device is not None and self._device.state == "MOVING")
+
+    def _watch_tip(self, waited: float, steady: float) -> list[Action]:
+        actions: list[Action] = []
+        if (refusal := self.intake.watch(steady, self.settings.tip_timeout)) is not None:
+            self.watchdog_trips += 1
+            actions = [*self._refuse(refusal), *self._use_tip()]
+        if waited < self.settings.tip_timeout or self.state is State.WAITING_FOR_TIP:
+            return actions
+        self.state = State.WAITING_FOR_TIP
+        self.watchdog_trips += 1
+        self.reason = f"no good tip for {self.settings.tip_timeout:g} s"
+        if self._followed is not None:
+            self.reason = f"joint_states do not show the end of step {self.step + 1}"
+        elif self.rejection:
+            self.reason += f"; the last one was refused: {self.rejection}"
+        return [*actions, Log("warning", f"WAITING_FOR_TIP: {self.reason}")]
+
+    def _watch_result(self, waited: float, steady: float) -> list[Action]:
+        """Give up on an answer that is lost; say so when the device says nothing at all."""
+        timeout = self.settings.result_timeout
+        if waited >= timeout:
+            self.watchdog_trips += 1
+            why = (
+                f"no device/result for step {self.step + 1} in {timeout:g} s, and the device does "
+                "not move: the command or its answer is lost"
+            )
+            return self._leave(State.FAULT, why, "error")
+        if self._patience.unheard(steady) < timeout or self.silence:
+            return []
+        # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
+        self._patience.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        return [Log("warning", self.silence)]
+
+    def _heard(self) -> list[Action]:
+        return [Log("info", "the device is heard again")] if self._patience.heard() else []
+
+    def _ask(self) -> list[Action]:
+        """Ask for a tip of the needle at rest, or for the hold that must come first."""
+        self._ready_step = None
+        if self._device is None or not self._device.hold_owner:
+            self.awaiting = Awaiting.HOLD
+            return []
+        latest = self.intake.joints.latest
+        if self._followed is None and latest is not None:
+            # Wherever a motion ended, it was over by then.
+            self.intake.want_after(latest.stamp_ns)
+        self.awaiting = Awaiting.TIP
+        self._patience.restart()
+        return []
+
+    def _watch_step(self, sample: JointSample | None) -> list[Action]:
+        """Look whether the joints have followed the step that succeeded."""
+        watch = self._followed
+        if watch is None:
+            return []
+        if (followed := watch.look(self.intake.joints, sample)) is Followed.NOT_YET:
+            return []
+        self._followed = None
+        self.intake.want_after(watch.end_ns)
+        if followed is Followed.ARRIVED or sample is None:
+            self.step += 1
+            self._failed.forget()
+            return []
+        why, is_enough = self._failed.unfollowed(watch.step, sample)
+        if is_enough:
+            return self._leave(State.FAULT, why, "error")
+        self.reason = why
+        return [Log("warning", why, "unfollowed")]
+
+    def _refuse(self, refusal: Refusal) -> list[Action]:
+        self.rejection = refusal.text
+        if self._steering:
+            self.reason = f"tip refused: {refusal.text}"
+        return [Log("warning", f"tip refused: {refusal.text}", f"tip {refusal.fault.value}")]
+
+    def _use_tip(self) -> list[Action]:
+        actions: list[Action] = []
+        while self._steering and self.awaiting is Awaiting.TIP and self._followed is None:
+            taken = self.intake.take(self.settings)
+            if taken is None:
+                break
+            if isinstance(taken, AcceptedTip):
+                return actions + self._step_from(taken)
+            actions += self._refuse(taken)
+        return actions
+
+    def _step_from(self, accepted: AcceptedTip) -> list[Action]:
+        tip, joints, settings = accepted.tip, accepted.joints, self.settings
+        self.rejection = ""
+        self.insertion = joints.insertion
+        update = self.control.update(tip.position, joints, accepted.covariance)
+        self.reach = reachability(
+            update.estimate.reduced,
+            update.estimate.curvature,
+            insertion=joints.insertion,
+            end=settings.depth,
+            tolerance=PLANE_TOLERANCE,
+        )
+        self.reason = "; ".join(update.estimate.warnings)
+        actions: list[Action] = [PublishUpdate(tip.stamp_ns, update)]
+        if self.state is State.WAITING_FOR_TIP:
+            self.state = State.STEERING
+            actions.append(Log("info", "STEERING: a good tip came"))
+        rate = float(update.command.rotation_rate)
+        self._ready_step = next_step(tip.stamp_ns, joints, rate, settings)
+        if self._ready_step is None:
+            text = f"insertion {joints.insertion:.6g} m reached"
+            return actions + self._leave(State.DONE, text, "info")
+        return actions + self._send()
+
+    def _send(self) -> list[Action]:
+        step, device = self._ready_step, self._device
+        if step is None or device is None or not device.hold_owner:
+            # The step was for a needle somebody held: ask anew when somebody does.
+            self._ready_step = None
+            self.awaiting = Awaiting.HOLD
+            return []
+        if device.state != "HOLDING":
+            self.awaiting = Awaiting.DEVICE
+            return []
+        if self.intake.has_moved_on(self.settings.step_length):
+            self._ready_step = None
+            self.awaiting = Awaiting.TIP
+            return self._use_tip()
+        self._ready_step, self._sent = None, step
+        self.awaiting = Awaiting.RESULT
+        self._patience.restart()
+        return [step]
+
+    def _moved_since_command(self) -> bool:
+        latest, last = self.intake.joints.latest, self.intake.last
+        return (
+            latest is not None
+            and last is not None
+            and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
+        )
+
+    def _take_jump(self, before: JointSample, sample: JointSample) -> list[Action]:
+        """Take that the joints are in another place, or time, without a way there."""
+        settings, gap = self.settings, (sample.stamp_ns - before.stamp_ns) * 1e-9
+        tolerance = settings.retraction_tolerance
+        if gap > 0.0 and sample.is_at(before, settings.step_length + tolerance, math.inf):
+            # They were silent, no more.
+            return []
+        if gap < 0.0:
+            self.intake.forget_stamps()
+        away = self._retraction.jump(before, sample, tolerance)
+        why = self._retraction.obstacle if away else f"the clock of joint_states went {gap:.4g} s"
+        if not self._steering:
+            return [Log("warning", why)]
+        return self._leave(State.IDLE, why, "warning")
+
+    def _end_by_retraction(self, sample: JointSample) -> list[Action]:
+        self.control.restart()
+        self.intake.last = None
+        if not self._steering:
+            return []
+        why = f"needle retracted to {sample.insertion:.4g} m: draw it out before steering again"
+        return self._leave(State.IDLE, why, "warning")
+
+    def _leave(self, state: State, reason: str, severity: str) -> list[Action]:
+        self.state, self.reason = state, reason
+        self.awaiting = Awaiting.NOTHING
+        self._patience.silence = ""
+        self.intake.forget_waiting()
+        self._ready_step = self._sent = self._followed = None
+        return [Log(severity, f"{state.value}: {reason}" if reason else state.value)]

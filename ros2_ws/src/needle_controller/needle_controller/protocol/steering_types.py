@@ -1,0 +1,138 @@
+"""What goes into the step protocol of `steering`, and what comes out of it, as plain data."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+from needle_controller.protocol.plane_control import ControlUpdate
+
+TIP_COVARIANCES = ("configured", "from_tip_pose")
+"""Where a tip's covariance comes from."""
+
+
+class State(enum.Enum):
+    """The controller's states."""
+
+    IDLE = "IDLE"
+    STEERING = "STEERING"
+    WAITING_FOR_TIP = "WAITING_FOR_TIP"
+    DONE = "DONE"
+    FAULT = "FAULT"
+
+
+class Awaiting(enum.Enum):
+    """What the next action needs."""
+
+    NOTHING = "nothing"
+    HOLD = "hold"
+    TIP = "tip"
+    DEVICE = "device"
+    RESULT = "result"
+
+
+@dataclasses.dataclass(frozen=True)
+class SteeringSettings:
+    """The protocol's numbers.
+
+    Attributes
+    ----------
+    step_length : float
+        Insertion of one step [m].
+    nominal_speed : float
+        Insertion speed at speed scale 1 [m/s].
+    depth : float
+        Insertion at which steering ends [m].
+    tip_covariance : str
+        One of `TIP_COVARIANCES`: whether a tip is used with the configured noise, or with the
+        covariance that came with it and not without.
+    tip_timeout : float
+        Time without a good tip after which the state is WAITING_FOR_TIP [s], steady clock.
+    result_timeout : float
+        Time without an answer from a device that does not move, after which the state is FAULT [s],
+        steady clock.
+    tip_margin : float
+        What noise may add to a tip's place [m].
+    needle_out_insertion : float
+        Insertion below which the needle counts as out [m].
+    retraction_tolerance : float
+        Backward motion that counts as a retraction [m].
+    """
+
+    step_length: float
+    nominal_speed: float
+    depth: float
+    tip_covariance: str
+    tip_timeout: float
+    result_timeout: float
+    tip_margin: float
+    needle_out_insertion: float
+    retraction_tolerance: float
+
+
+@dataclasses.dataclass(frozen=True)
+class DeviceStatus:
+    """What the driver says of itself.
+
+    Attributes
+    ----------
+    state, homed, hold_owner, reason : str, bool, str, str
+        As in `device/status`.
+    insertion, rotation : float or None
+        Where it has the joints [m], [rad]; None where it does not say.
+    """
+
+    state: str
+    homed: bool
+    hold_owner: str
+    reason: str = ""
+    insertion: float | None = None
+    rotation: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class SendStep:
+    """Send one trajectory point.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the tip that caused it [ns].
+    insertion, rotation : float
+        Wanted joints, absolute [m], [rad].
+    duration : float
+        Time from start [s].
+    """
+
+    stamp_ns: int
+    insertion: float
+    rotation: float
+    duration: float
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishUpdate:
+    """Publish estimate and control input, stamped with the tip's exposure."""
+
+    stamp_ns: int
+    update: ControlUpdate
+
+
+@dataclasses.dataclass(frozen=True)
+class Log:
+    """Say something; `severity` is info, warning or error, `kind` throttles repetitions."""
+
+    severity: str
+    text: str
+    kind: str = ""
+
+
+Action = SendStep | PublishUpdate | Log
+
+
+@dataclasses.dataclass(frozen=True)
+class Reply:
+    """Answer to a service call."""
+
+    success: bool
+    message: str

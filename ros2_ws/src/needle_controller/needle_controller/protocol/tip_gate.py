@@ -1,0 +1,156 @@
+"""Which measured tips may move the needle."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+
+import numpy as np
+
+from needle_controller.model.arrays import Array
+from needle_controller.model.target_plane import RIG
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.tip_covariance import TipCovariance
+
+STAMP_AHEAD_NS = 1_000_000_000
+"""A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
+
+
+class Fault(enum.Enum):
+    """What can be wrong with a tip; each is counted and logged for itself."""
+
+    FRAME = "frame"
+    NOT_FINITE = "not_finite"
+    NOT_NEWER = "not_newer"
+    TOO_FAR = "too_far"
+    JUMP = "jump"
+    BEFORE_JOINTS = "before_joints"
+    AHEAD_OF_JOINTS = "ahead_of_joints"
+    NO_JOINTS = "no_joints"
+    NO_COVARIANCE = "no_covariance"
+    BAD_COVARIANCE = "bad_covariance"
+
+
+@dataclasses.dataclass(frozen=True)
+class TipMeasurement:
+    """A measured tip as it came.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of exposure [ns].
+    frame_id : str
+        Frame of `position`; must be `rig`.
+    position : ndarray, shape (3,)
+        The tip [m].
+    """
+
+    stamp_ns: int
+    frame_id: str
+    position: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class AcceptedTip:
+    """A tip to be used, with the joints at its exposure.
+
+    Attributes
+    ----------
+    tip : TipMeasurement
+        As it came.
+    joints : JointSample
+        The joints at its exposure.
+    covariance : TipCovariance or None
+        What came with it; None for the configured noise.
+    """
+
+    tip: TipMeasurement
+    joints: JointSample
+    covariance: TipCovariance | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Refusal:
+    """A tip that is not used, and why."""
+
+    tip: TipMeasurement
+    fault: Fault
+    text: str
+
+
+def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> Refusal | None:
+    """Return why a tip cannot be used whatever the needle did, None if it can.
+
+    Parameters
+    ----------
+    tip : TipMeasurement
+        The tip.
+    last : AcceptedTip or None
+        The last tip that was used.
+    """
+    if tip.frame_id != RIG:
+        return Refusal(tip, Fault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
+    if not np.all(np.isfinite(tip.position)):
+        return Refusal(tip, Fault.NOT_FINITE, f"tip is not finite: {tip.position}")
+    if last is not None and tip.stamp_ns <= last.tip.stamp_ns:
+        behind = (last.tip.stamp_ns - tip.stamp_ns) * 1e-9
+        text = f"tip's stamp is not newer than the last used one's ({behind:g} s behind)"
+        return Refusal(tip, Fault.NOT_NEWER, text)
+    return None
+
+
+def refuse_stamp(
+    tip: TipMeasurement, oldest: JointSample | None, latest: JointSample | None
+) -> Refusal | None:
+    """Return why the joints at a tip's exposure will never be known, None if they may be.
+
+    Parameters
+    ----------
+    tip : TipMeasurement
+        A tip that the joints kept do not bracket.
+    oldest, latest : JointSample or None
+        The ends of what is kept.
+    """
+    if oldest is not None and tip.stamp_ns < oldest.stamp_ns:
+        return Refusal(tip, Fault.BEFORE_JOINTS, "tip is older than any joint_states kept")
+    if latest is not None and tip.stamp_ns > latest.stamp_ns + STAMP_AHEAD_NS:
+        ahead = (tip.stamp_ns - latest.stamp_ns) * 1e-9
+        text = f"tip's stamp is {ahead:.4g} s ahead of joint_states"
+        return Refusal(tip, Fault.AHEAD_OF_JOINTS, text)
+    return None
+
+
+def refuse_position(
+    tip: TipMeasurement, joints: JointSample, last: AcceptedTip | None, margin: float
+) -> Refusal | None:
+    """Return why no needle with these joints can have its tip there, None if one can.
+
+    Parameters
+    ----------
+    tip : TipMeasurement
+        A finite tip in `rig`, whose origin is the entry point.
+    joints : JointSample
+        The joints at its exposure.
+    last : AcceptedTip or None
+        The last tip that was used.
+    margin : float
+        What noise may add [m].
+    """
+    distance = float(np.linalg.norm(tip.position))
+    reach = max(joints.insertion, 0.0) + margin
+    if distance > reach:
+        text = (
+            f"tip is {distance:.4g} m from the entry point, wants <= {reach:.4g} m "
+            f"(insertion {joints.insertion:.4g} m + margin {margin:.4g} m)"
+        )
+        return Refusal(tip, Fault.TOO_FAR, text)
+    if last is not None:
+        jump = float(np.linalg.norm(tip.position - last.tip.position))
+        allowed = abs(joints.insertion - last.joints.insertion) + margin
+        if jump > allowed:
+            text = (
+                f"tip jumped {jump:.4g} m since the last used one, wants <= {allowed:.4g} m "
+                f"(insertion since then + margin {margin:.4g} m)"
+            )
+            return Refusal(tip, Fault.JUMP, text)
+    return None

@@ -1,0 +1,1 @@
+"""plane_controller's ROS side."""

@@ -1,0 +1,184 @@
+"""plane_controller's messages, to and from plain data."""
+
+from __future__ import annotations
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3,
+    Vector3Stamped,
+)
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.ros.conversions import to_nanoseconds, to_stamp, values_of
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import angle_axes
+from needle_controller.model.target_plane import TargetPlane, plane_from_pose
+from needle_controller.observers.estimator import Estimate
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.plane_control import ControlUpdate
+from needle_controller.protocol.steering import Steering
+from needle_controller.protocol.steering_types import DeviceStatus, SendStep, State
+from needle_controller.protocol.tip_covariance import TipCovariance
+from needle_controller.protocol.tip_gate import TipMeasurement
+
+TARGET_PLANE = "target_plane"
+INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
+_LEVELS = {State.FAULT: Level.ERROR, State.WAITING_FOR_TIP: Level.WARN}
+
+
+def to_joint_sample(message: JointState, sent_ns: int) -> JointSample:
+    """Return the two joints of a JointState, found by name, with the time of its sending [ns].
+
+    Raises
+    ------
+    UserError
+        If one of them is missing or not finite.
+    """
+    position = dict(zip(message.name, message.position, strict=False))
+    missing = [name for name in (INSERTION_JOINT, ROTATION_JOINT) if name not in position]
+    if missing:
+        raise UserError(f"joint_states without {' and '.join(missing)}: {list(message.name)}")
+    insertion, rotation = position[INSERTION_JOINT], position[ROTATION_JOINT]
+    if not (np.isfinite(insertion) and np.isfinite(rotation)):
+        raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
+    # rclpy gives plain floats where rosbags gives numpy's.
+    stamp_ns = to_nanoseconds(message.header.stamp)
+    return JointSample(stamp_ns, float(insertion), float(rotation), sent_ns)
+
+
+def to_tip(message: PointStamped) -> TipMeasurement:
+    """Return a measured tip as it came, nothing checked."""
+    point = message.point
+    return TipMeasurement(
+        to_nanoseconds(message.header.stamp),
+        message.header.frame_id,
+        np.array([point.x, point.y, point.z]),
+    )
+
+
+def to_tip_covariance(message: PoseWithCovarianceStamped) -> TipCovariance:
+    """Return covariance and direction of a measured tip as they came, nothing checked."""
+    covariance = np.array(message.pose.covariance).reshape(6, 6)
+    q = message.pose.pose.orientation
+    return TipCovariance(
+        to_nanoseconds(message.header.stamp),
+        message.header.frame_id,
+        covariance[:3, :3],
+        # The z axis of the pose.
+        direction=np.array(
+            [
+                2.0 * (q.x * q.z + q.w * q.y),
+                2.0 * (q.y * q.z - q.w * q.x),
+                q.w * q.w + q.z * q.z - q.x * q.x - q.y * q.y,
+            ]
+        ),
+        direction_covariance=covariance[3:, 3:],
+    )
+
+
+def to_plane(message: PoseStamped) -> TargetPlane:
+    """Return the plane a message asks for; raises UserError as `plane_from_pose` does."""
+    p, q = message.pose.position, message.pose.orientation
+    return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
+
+
+def to_device_status(message: DiagnosticStatus) -> DeviceStatus:
+    """Return what the protocol needs of device/status."""
+    values = values_of(message)
+    return DeviceStatus(
+        state=values.get("state", ""),
+        homed=values.get("homed", "").lower() == "true",
+        hold_owner=values.get("hold_owner", ""),
+        reason=values.get("fault", "") or values.get("reason", "") or message.message,
+        insertion=_number(values.get("insertion_m", "")),
+        rotation=_number(values.get("rotation_rad", "")),
+    )
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def to_trajectory(step: SendStep) -> JointTrajectory:
+    """Return a step as a trajectory of one point."""
+    point = JointTrajectoryPoint(positions=[step.insertion, step.rotation])
+    nanoseconds = round(step.duration * 1e9)
+    point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
+    message = JointTrajectory(joint_names=[INSERTION_JOINT, ROTATION_JOINT], points=[point])
+    message.header.stamp = to_stamp(step.stamp_ns)
+    return message
+
+
+def to_header(stamp_ns: int) -> Header:
+    """Return a header in the frame of the target plane."""
+    return Header(stamp=to_stamp(stamp_ns), frame_id=TARGET_PLANE)
+
+
+def to_pose(estimate: Estimate, stamp_ns: int) -> PoseWithCovarianceStamped:
+    """Return the estimated pose, its covariance in the message's fixed-axis convention."""
+    message = PoseWithCovarianceStamped(header=to_header(stamp_ns))
+    pose = message.pose.pose
+    pose.position.x, pose.position.y, pose.position.z = (float(c) for c in estimate.position)
+    quaternion = Rotation.from_matrix(estimate.rotation).as_quat()
+    orientation = pose.orientation
+    orientation.x, orientation.y, orientation.z, orientation.w = (float(c) for c in quaternion)
+    turn = np.eye(6)
+    turn[3:, 3:] = angle_axes(estimate.coordinates[3:])
+    message.pose.covariance = (turn @ estimate.covariance @ turn.T).ravel()
+    return message
+
+
+def to_vector(values: Array, stamp_ns: int) -> Vector3Stamped:
+    """Return three numbers stamped in the frame of the target plane."""
+    x, y, z = (float(value) for value in values)
+    return Vector3Stamped(header=to_header(stamp_ns), vector=Vector3(x=x, y=y, z=z))
+
+
+def to_control_input(update: ControlUpdate, stamp_ns: int) -> Vector3Stamped:
+    """Return (v, u, rotation of the base since the first tip)."""
+    command = update.command
+    values = np.array([command.virtual_input, command.rotation_rate, update.turned])
+    return to_vector(values, stamp_ns)
+
+
+def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
+    """Return needle/controller_status as a line of health."""
+    reachable, reachable_depth = "", ""
+    if steering.reach is not None:
+        reachable = str(bool(steering.reach.reachable)).lower()
+        reachable_depth = repr(float(steering.reach.depth))
+    values = {
+        "state": steering.state.value,
+        "starts": str(steering.starts),
+        "step": str(steering.step),
+        "insertion_m": repr(steering.insertion),
+        "target_offset_m": repr(steering.control.plane.offset),
+        "reachable": reachable,
+        "reachable_depth_m": reachable_depth,
+        "reason": steering.silence or steering.reason,
+        "awaiting": steering.awaiting.value,
+        "tip_after_ns": str(steering.tip_after_ns),
+        "tips_rejected": str(steering.tips_rejected),
+        "tips_rejected_for": ", ".join(
+            f"{fault.value} {count}" for fault, count in steering.intake.refused.items()
+        ),
+        "watchdog_trips": str(steering.watchdog_trips),
+        "preset": preset,
+        "depth_m": repr(steering.settings.depth),
+    }
+    level = _LEVELS.get(steering.state, Level.OK)
+    if steering.rejection or steering.silence:
+        level = max(level, Level.WARN)
+    return Diagnostic(level, values["reason"] or steering.state.value, values)

@@ -1,0 +1,377 @@
+"""The bank of filters: consistency, torsion recovered, late, missing and false tips, shapes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
+from needle_controller.bank.hypotheses import RollHypothesis, TorsionHypothesis
+from needle_controller.bank.hypothesis_bank import advance_bank, correct_bank
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.bank.hypothesis_mixture import (
+    T_LAG,
+    T_PLAY,
+    T_WEIGHT,
+    MixtureEstimate,
+    mixture,
+)
+from needle_controller.laws.roll_turns import roll_turns
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.presets.best import make_best
+
+CURVATURE = 1.0 / 0.122
+STEP = 0.001
+RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0),)
+ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
+
+
+def path(
+    turns: Array,
+    pitch: float = 0.0,
+    roll: float = 0.0,
+    curvature: float = CURVATURE,
+    play: float = 0.0,
+    lag: float = 0.0,
+    start: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> Array:
+    """Poses (len(turns) + 1, 4, 4) of an exact needle, tip turned through play and lag."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_angles([0.0, pitch, roll])
+    pose[:3, 3] = start
+    poses, base, behind, tip = [pose], 0.0, 0.0, 0.0
+    for turn in turns:
+        before = tip
+        parts = 200 if play or lag else 1
+        for _ in range(parts):
+            base += turn / parts
+            behind = min(max(behind, base - play), base + play)
+            tip = tip + (behind - tip) * (1 - np.exp(-STEP / parts / lag)) if lag else behind
+        x, z = curvature * STEP, tip - before
+        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, STEP], [0, 0, 0, 0.0]])
+        pose = pose @ expm(twist)
+        poses.append(pose)
+    return np.array(poses)
+
+
+def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-size, size, count // 4 + 1), 4)[:count]
+
+
+def drive(
+    estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
+) -> MixtureEstimate:
+    estimator.reset(tips[0], np.zeros(2))
+    for turn, tip in zip(turns, tips[1:], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip, covariance)
+    return estimator.estimate()
+
+
+def noisy(poses: Array, seed: int = 6, bound: float = 0.001) -> Array:
+    tips = poses[:, :3, 3]
+    return tips + np.random.default_rng(seed).uniform(-bound, bound, tips.shape)
+
+
+def rotation_error(estimate: MixtureEstimate, pose: Array) -> float:
+    return float(np.rad2deg(Rotation.from_matrix(estimate.rotation @ pose[:3, :3].T).magnitude()))
+
+
+def test_finds_the_pose_from_positions() -> None:
+    turns = turns_for(100)
+    poses = path(turns, np.deg2rad(8.0), np.deg2rad(25.0), start=(-0.003, 0.0, 0.0))
+    estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses))
+    assert np.linalg.norm(estimate.position - poses[-1, :3, 3]) < 0.0006
+    assert rotation_error(estimate, poses[-1]) < 12.0
+    assert np.abs(estimate.coordinates[4] - np.arcsin(poses[-1, 0, 2])) < np.deg2rad(2.0)
+
+
+@pytest.mark.parametrize("roll", [-150.0, -75.0, 90.0, 180.0])
+def test_finds_a_roll_nobody_expected(roll: float) -> None:
+    turns = turns_for(80)
+    poses = path(turns, 0.0, np.deg2rad(roll))
+    estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses))
+    assert rotation_error(estimate, poses[-1]) < 25.0
+
+
+def test_estimates_the_curvature() -> None:
+    turns = turns_for(120)
+    poses = path(turns, curvature=1.2 * CURVATURE)
+    estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses))
+    assert estimate.curvature == pytest.approx(1.2 * CURVATURE, rel=0.06)
+
+
+@pytest.mark.parametrize(
+    ("play_deg", "lag", "column", "other", "tolerance"),
+    [(30.0, 0.0, T_PLAY, T_LAG, np.deg2rad(8.0)), (0.0, 0.006, T_LAG, T_PLAY, 0.002)],
+)
+def test_recovers_the_torsion(
+    play_deg: float, lag: float, column: int, other: int, tolerance: float
+) -> None:
+    turns = turns_for(160, size=0.5)
+    poses = path(turns, play=np.deg2rad(play_deg), lag=lag)
+    estimate = drive(HypothesisFilter(FilterSettings()), turns, noisy(poses, bound=0.0003))
+    table = estimate.hypotheses.table
+    best = table[np.argmax(table[:, T_WEIGHT])]
+    assert best[column] == pytest.approx(np.deg2rad(play_deg) + lag, abs=tolerance)
+    assert best[other] == 0.0
+
+
+def test_covariance_is_honest_for_gaussian_noise() -> None:
+    """Normalised estimation error squared of position and orientation near its 6 dimensions."""
+    roll_std = np.deg2rad(10.0)
+    settings = FilterSettings(
+        torsion_hypotheses=RIGID, roll_hypotheses=(RollHypothesis(0.0, roll_std, 1.0),)
+    )
+    rng = np.random.default_rng(7)
+    std, count = 0.0005, 40
+    squares = []
+    for _ in range(60):
+        yaw, pitch = rng.normal(0.0, settings.initial_angle_std, 2)
+        roll = rng.normal(0.0, roll_std)
+        turns = turns_for(count, seed=int(rng.integers(1 << 30)))
+        # The estimator allows for curvature that varies; so does this needle's.
+        poses = path(turns, pitch, roll, CURVATURE * (1.0 + rng.normal(0.0, 0.15)))
+        turned = np.eye(4)
+        turned[:3, :3] = Rotation.from_rotvec([yaw, 0.0, 0.0]).as_matrix()
+        poses = turned @ poses
+        tips = poses[:, :3, 3] + rng.normal(0.0, std, (count + 1, 3))
+        estimate = drive(HypothesisFilter(settings), turns, tips, np.eye(3) * std**2)
+        true = poses[-1]
+        angles = np.array([np.arctan2(-true[1, 2], true[2, 2]), np.arcsin(true[0, 2])])
+        roll = np.arctan2(-true[0, 1], true[0, 0])
+        error = estimate.coordinates - [*true[:3, 3], *angles, roll]
+        error[5] = (error[5] + np.pi) % (2.0 * np.pi) - np.pi
+        squares.append(error @ np.linalg.solve(estimate.covariance, error))
+    assert 4.5 < np.mean(squares) < 7.5
+
+
+def test_a_late_tip_is_used_at_its_exposure() -> None:
+    """One step late all along is the on-time filter, seen one step ahead without its last tip."""
+    turns = turns_for(40)
+    tips = noisy(path(turns))
+    late, on_time = (HypothesisFilter(FilterSettings()) for _ in range(2))
+    late.reset(tips[0], np.zeros(2))
+    on_time.reset(tips[0], np.zeros(2))
+    for k, turn in enumerate(turns):
+        late.advance(STEP, turn)
+        if k > 0:
+            late.correct(tips[k], age=STEP)
+        on_time.advance(STEP, turn)
+        if k + 1 < len(turns):
+            on_time.correct(tips[k + 1])
+    for name in ("coordinates", "linearized", "curvature", "covariance"):
+        np.testing.assert_allclose(
+            getattr(late.estimate(), name),
+            getattr(on_time.estimate(), name),
+            atol=1e-9,
+            err_msg=name,
+        )
+
+
+def test_a_late_tip_between_two_stops() -> None:
+    """An exposure within an advance: as if the advance had been divided there."""
+    turns = turns_for(20)
+    tips = noisy(path(turns))
+    one, two = (HypothesisFilter(FilterSettings()) for _ in range(2))
+    for estimator in (one, two):
+        drive(estimator, turns, tips)
+    one.advance(STEP, 0.2)
+    one.correct(tips[-1] + [0.0, 0.0, 0.0006], age=0.0004)
+    two.advance(0.0006, 0.12)
+    two.correct(tips[-1] + [0.0, 0.0, 0.0006])
+    two.advance(0.0004, 0.08)
+    np.testing.assert_allclose(one.estimate().coordinates, two.estimate().coordinates, atol=1e-12)
+
+
+def test_a_tip_older_than_the_last_is_dropped_and_reported() -> None:
+    turns = turns_for(20)
+    estimator = HypothesisFilter(FilterSettings())
+    before = drive(estimator, turns, noisy(path(turns)))
+    estimator.correct(np.array([0.0, 0.0, 0.015]), age=0.005)
+    after = estimator.estimate()
+    np.testing.assert_array_equal(after.coordinates, before.coordinates)
+    assert any("older" in warning for warning in after.warnings)
+    estimator.advance(STEP, 0.0)
+    estimator.correct(np.full(3, np.nan))
+    assert not any("older" in warning for warning in estimator.estimate().warnings)
+
+
+def test_missing_tips_change_nothing() -> None:
+    turns = turns_for(30)
+    tips = noisy(path(turns))
+    with_missing, without = (HypothesisFilter(FilterSettings()) for _ in range(2))
+    for estimator in (with_missing, without):
+        drive(estimator, turns[:20], tips[:21])
+    for turn in turns[20:]:
+        with_missing.advance(STEP, turn)
+        with_missing.correct(np.array([np.nan, 0.0, 0.0]))
+        without.advance(STEP, turn)
+    np.testing.assert_allclose(
+        with_missing.estimate().coordinates, without.estimate().coordinates, atol=1e-12
+    )
+    covariance = np.diag(with_missing.estimate().covariance)
+    np.testing.assert_allclose(covariance, np.diag(without.estimate().covariance), rtol=1e-9)
+    with_missing.correct(np.zeros(3), np.full((3, 3), np.inf))
+    np.testing.assert_allclose(np.diag(with_missing.estimate().covariance), covariance)
+
+
+def test_outliers_are_refused_and_a_new_place_is_believed_in_the_end() -> None:
+    turns = turns_for(40)
+    tips = noisy(path(turns))
+    estimator = HypothesisFilter(FilterSettings())
+    before = drive(estimator, turns, tips)
+    far = tips[-1] + [0.008, 0.0, 0.0]
+    estimator.correct(far)
+    after = estimator.estimate()
+    np.testing.assert_array_equal(after.coordinates, before.coordinates)
+    assert any("outlier" in warning for warning in after.warnings)
+    for _ in range(estimator.settings.tips_until_reacceptance):
+        estimator.correct(far)
+    moved = estimator.estimate()
+    assert moved.position[0] > before.position[0] + 0.003
+    assert not any("outlier" in warning for warning in moved.warnings)
+
+
+@pytest.mark.parametrize("with_covariance", [False, True])
+def test_many_needles_are_each_one_alone(with_covariance: bool) -> None:
+    rng = np.random.default_rng(8)
+    covariance = np.eye(3) * 1e-7 if with_covariance else None
+    turns = np.stack([turns_for(25, seed) for seed in range(6)], axis=1)
+    tips = np.stack([noisy(path(turns[:, n], 0.05 * n), n) for n in range(6)], axis=1)
+    tips[rng.random(tips.shape[:2]) < 0.2] = np.nan
+    tips[0] = 0.0
+    many = HypothesisFilter(FilterSettings())
+    together = drive(many, turns.reshape(-1, 2, 3), tips.reshape(-1, 2, 3, 3), covariance)
+    assert together.coordinates.shape == (2, 3, 6)
+    assert together.covariance.shape == (2, 3, 6, 6)
+    _, law = make_best()
+    rates = law(together).rotation_rate
+    for n in range(6):
+        alone = drive(HypothesisFilter(FilterSettings()), turns[:, n], tips[:, n], covariance)
+        index = (n // 3, n % 3)
+        np.testing.assert_array_equal(together.coordinates[index], alone.coordinates)
+        np.testing.assert_allclose(together.covariance[index], alone.covariance, rtol=1e-9)
+        assert rates[index] == law(alone).rotation_rate
+
+
+def test_another_plane_is_another_description_of_the_same_needle() -> None:
+    turn = rotation_from_angles([0.2, -0.1, 0.4])
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = turn, [0.002, 0.001, -0.003]
+    turns = turns_for(30)
+    tips = noisy(path(turns))
+    # Gaussian noise, which has no box whose sides would turn with the plane.
+    old, new = HypothesisFilter(FilterSettings()), HypothesisFilter(FilterSettings(), turn)
+    spread = np.diag([2e-7, 3e-7, 4e-7])
+    drive(old, turns, tips, spread)
+    old.change_frame(transform)
+    moved = drive(new, turns, tips @ turn.T + transform[:3, 3], turn @ spread @ turn.T)
+    np.testing.assert_allclose(old.estimate().coordinates, moved.coordinates, atol=1e-7)
+    scale = np.sqrt(np.diag(moved.covariance))
+    np.testing.assert_allclose(
+        old.estimate().covariance / np.outer(scale, scale),
+        moved.covariance / np.outer(scale, scale),
+        atol=1e-4,
+    )
+    np.testing.assert_allclose(old.initial_rotation, new.initial_rotation)
+
+
+def test_starts_as_the_base_is_turned() -> None:
+    estimator = HypothesisFilter(
+        FilterSettings(torsion_hypotheses=RIGID, roll_hypotheses=ROLL_AS_SET),
+        rotation_from_angles([0.1, 0.2, 0.0]),
+    )
+    estimator.reset(np.zeros(3), np.array([0.0, 0.7]))
+    np.testing.assert_allclose(estimator.estimate().coordinates[3:], [0.1, 0.2, 0.7], atol=1e-9)
+
+
+def test_a_start_without_a_tip_takes_the_next_one() -> None:
+    estimator = HypothesisFilter(FilterSettings())
+    estimator.reset(np.full(3, np.nan), np.zeros(2))
+    estimator.advance(STEP, 0.0)
+    estimator.correct(np.array([-0.003, 0.001, 0.001]))
+    np.testing.assert_allclose(estimator.estimate().position, [-0.003, 0.001, 0.001], atol=1e-4)
+
+
+def test_says_that_the_roll_is_not_known_yet() -> None:
+    estimator = HypothesisFilter(FilterSettings(roll_hypotheses=ROLL_HYPOTHESES))
+    estimator.reset(np.zeros(3), np.zeros(2))
+    assert any("roll" in warning for warning in estimator.estimate().warnings)
+
+
+def test_an_old_estimates_covariance_is_not_another_ones() -> None:
+    estimator = HypothesisFilter(FilterSettings())
+    estimate = estimator.estimate()
+    estimator.advance(STEP, 0.0)
+    with pytest.raises(RuntimeError, match="moved on"):
+        _ = estimate.covariance
+
+
+@pytest.mark.parametrize(("length", "turn"), [(-1e-6, 0.0), (np.nan, 0.0), (0.001, np.inf)])
+def test_refuses_to_advance_backwards_or_by_nothing_known(length: float, turn: float) -> None:
+    with pytest.raises(ValueError, match="wants finite"):
+        HypothesisFilter(FilterSettings()).advance(length, turn)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"curvature": 0.0},
+        {"curvature": -8.0},
+        {"curvature": np.nan},
+        {"tip_noise_bound": 0.0},
+        {"curvature_range": (1.2, 0.8)},
+        {"lag_range": (0.0, 0.1)},
+        {"roll_hypotheses": ()},
+    ],
+)
+def test_settings_out_of_bounds_are_refused(change: dict[str, Any]) -> None:
+    with pytest.raises(UserError, match=next(iter(change))):
+        FilterSettings(**change)
+
+
+def test_hypotheses_out_of_bounds_are_refused() -> None:
+    with pytest.raises(OutOfBoundsError, match="play"):
+        TorsionHypothesis(-0.1, 0.0, 0.1, 1.0)
+    with pytest.raises(OutOfBoundsError, match="std"):
+        RollHypothesis(0.0, 0.0, 1.0)
+
+
+def test_starts_over_when_nothing_explains_the_tips() -> None:
+    """All hypotheses but a wrong one are taken away; the roll is found again, and it says so."""
+    turns = turns_for(100)
+    poses = path(turns, roll=np.deg2rad(170.0))
+    tips = noisy(poses)
+    wrong = FilterSettings(torsion_hypotheses=RIGID, roll_hypotheses=ROLL_AS_SET)
+    estimator = HypothesisFilter(wrong)
+    drive(estimator, turns[:15], tips[:16])
+    estimator.settings = FilterSettings()
+    seen: set[str] = set()
+    for turn, tip in zip(turns[15:], tips[16:], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip)
+        seen.update(estimator.estimate().warnings)
+    assert rotation_error(estimator.estimate(), poses[-1]) < 25.0
+    assert any("anew" in warning for warning in seen)
+
+
+def test_nothing_is_compiled_twice() -> None:
+    """One needle and many, with and without covariance, run the same machine code."""
+    for shape in ((), (3,)):
+        for covariance in (None, np.eye(3) * 1e-6):
+            estimator, law = make_best()
+            estimator.reset(np.zeros((*shape, 3)), np.zeros(2))
+            estimator.advance(STEP, 0.1)
+            estimator.correct(np.zeros((*shape, 3)), covariance)
+            law(estimator.estimate(), bend_sign=1.0)
+    functions: list[Any] = [advance_bank, correct_bank, mixture, roll_turns]
+    assert [len(function.signatures) for function in functions] == [1, 1, 1, 1]

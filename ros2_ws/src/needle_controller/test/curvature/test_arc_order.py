@@ -1,0 +1,116 @@
+"""Tips that leave their arc in order are told from tips that miss it at random."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from numpy.random import Generator, default_rng
+from scipy.spatial.transform import Rotation
+
+from needle_common.errors import UserError
+from needle_controller.curvature.arc_order import check_order, order
+from needle_controller.curvature.curvature_checks import fit_checked
+from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+from needle_controller.model.arrays import Array
+from needle_sim.needle.plant import NeedlePlant
+
+RADIUS = 0.122
+STEP = 0.001
+REPEATING = 2e-5
+TRACKER = 3e-5  # standard deviation of stereo_tracker's tips [m]
+
+
+def insertions(count: int, arc: float, turn: float, rng: Generator) -> tuple[Array, Array]:
+    """Return exact tips (count, K, 3) of needles that are turned once, half-way."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    tilted = Rotation.from_rotvec(rng.normal(0.0, math.radians(5.0), (count, 3)) * [1.0, 1.0, 0.0])
+    rolled = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, (count, 1)))
+    poses[:, :3, :3] = (tilted * rolled).as_matrix()
+    plant = NeedlePlant(poses, curvature=1.0 / RADIUS)
+    insertion = np.arange(0.0, arc + 1e-9, STEP)
+    tips = [plant.T_rig_tip[:, :3, 3]]
+    for k in range(1, len(insertion)):
+        plant.advance(STEP, turn if k == len(insertion) // 2 else 0.0)
+        tips.append(plant.T_rig_tip[:, :3, 3])
+    return np.stack(tips, axis=1), insertion
+
+
+def noise(shape: tuple[int, ...], size: float | None, rng: Generator) -> Array:
+    """Return normal noise; None: uniform noise of +-1 mm."""
+    if size is None:
+        return np.asarray(rng.uniform(-1e-3, 1e-3, shape))
+    return np.asarray(rng.normal(0.0, size, shape))
+
+
+def refused(tips: Array, insertion: Array | None) -> int:
+    settings = CurvatureFitSettings(repeating_error=REPEATING)
+    count = 0
+    for each in tips:
+        try:
+            check_order(fit_checked(each, insertion, settings).fit.misses, REPEATING)
+        except UserError:
+            count += 1
+    return count
+
+
+@pytest.mark.parametrize(
+    ("size", "known"), [(None, True), (None, False), (TRACKER, True), (2e-4, True)]
+)
+def test_of_200_pure_insertions_none_is_refused(size: float | None, known: bool) -> None:
+    rng = default_rng(5)
+    tips, insertion = insertions(200, 0.06, 0.0, rng)
+    tips = tips + noise(tips.shape, size, rng)
+    assert refused(tips, insertion if known else None) == 0
+
+
+def test_outliers_are_no_order() -> None:
+    rng = default_rng(6)
+    tips, insertion = insertions(100, 0.06, 0.0, rng)
+    tips = tips + noise(tips.shape, TRACKER, rng)
+    # Two in a row, the same way.
+    tips[:, 20:22] += [5e-3, 0.0, 0.0]
+    assert refused(tips, insertion) == 0
+
+
+def test_errors_that_repeat_are_allowed_for() -> None:
+    """All tips bowed along the arc, three times, as by a calibration's error."""
+    rng = default_rng(7)
+    tips, insertion = insertions(1, 0.12, 0.0, rng)
+    bowed = tips[0] + noise(tips[0].shape, 2e-6, rng)
+    bowed[:, 1] += REPEATING * np.sin(6.0 * np.pi * insertion / 0.12)
+    assert refused(bowed[None], insertion) == 0
+    off = fit_checked(bowed, insertion, CurvatureFitSettings()).fit.misses
+    shared, significance = order(off)
+    assert significance > 10.0
+    assert 0.3 * REPEATING < shared < REPEATING
+
+
+@pytest.mark.parametrize(
+    ("arc", "size", "degrees"),
+    [
+        (0.06, TRACKER, 25.0),
+        (0.06, TRACKER, 90.0),
+        (0.06, TRACKER, 180.0),
+        (0.12, TRACKER, 20.0),
+        (0.12, TRACKER, 90.0),
+        (0.12, None, 45.0),
+        (0.12, None, 90.0),
+    ],
+)
+def test_steered_insertions_are_refused(arc: float, size: float | None, degrees: float) -> None:
+    rng = default_rng(8)
+    tips, insertion = insertions(20, arc, math.radians(degrees), rng)
+    tips = tips + noise(tips.shape, size, rng)
+    assert refused(tips, insertion) == 20
+    assert refused(tips[:5], None) == 5
+
+
+def test_what_is_wrong_is_said_with_a_way_out() -> None:
+    misses = np.zeros((60, 3))
+    misses[:, 0] = 1e-3 * np.sin(np.linspace(0.0, 2.0 * np.pi, 60))
+    with pytest.raises(UserError, match=r"beside it, wants <= 0\.05 mm.*--until-mm.*rotation_rad"):
+        check_order(misses, REPEATING)
+    check_order(misses, 1e-3)
+    assert order(np.zeros((8, 3))) == (0.0, 0.0)

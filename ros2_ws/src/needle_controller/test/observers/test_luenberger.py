@@ -1,0 +1,313 @@
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.random import default_rng
+
+from needle_controller.laws.law import LinearizingLaw, OpenLoopLaw
+from needle_controller.model.arrays import Array
+from needle_controller.model.feedback_linearization import rotation_rate
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.observers.luenberger import LuenbergerObserver
+from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.presets.presets import make_law, observer_settings
+from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_sim.needle.plant import NeedlePlant
+
+PARAMETERS = PlaneControllerParameters(measurement_std=ControlSettings.measurement_std)
+CURVATURE = PARAMETERS.curvature
+STEP = 0.001
+
+
+def observer(**changes: Any) -> LuenbergerObserver:
+    settings = dataclasses.replace(PARAMETERS, **changes).control()
+    return LuenbergerObserver(observer_settings(settings, settings.gains()))
+
+
+def law(**changes: Any) -> LinearizingLaw:
+    settings = dataclasses.replace(PARAMETERS, **changes).control()
+    made = make_law(settings, settings.gains())
+    assert isinstance(made, LinearizingLaw)
+    return made
+
+
+def poses(reduced: Array) -> Array:
+    reduced = np.asarray(reduced, dtype=float)
+    pose = np.zeros((*reduced.shape[:-1], 4, 4))
+    angles = np.concatenate([np.zeros_like(reduced[..., :1]), reduced[..., 1:]], axis=-1)
+    pose[..., :3, :3] = rotation_from_angles(angles)
+    pose[..., 0, 3] = reduced[..., 0]
+    pose[..., 3, 3] = 1.0
+    return pose
+
+
+def true_reduced(plant: NeedlePlant) -> Array:
+    pose = plant.T_rig_tip
+    return np.stack(
+        [
+            pose[..., 0, 3],
+            np.arcsin(pose[..., 0, 2]),
+            np.arctan2(-pose[..., 0, 1], pose[..., 0, 0]),
+        ],
+        axis=-1,
+    )
+
+
+def assert_within(actual: Array, expected: Array | float, bounds: list[float]) -> None:
+    error = np.abs(np.asarray(actual) - expected)
+    assert np.all(error <= bounds), f"{error} exceeds {bounds}"
+
+
+def test_starts_at_the_measurement_with_no_pitch_and_no_roll() -> None:
+    one = observer()
+    one.reset([-0.003, 0.0004, 0.0001], [0.0, 0.0])
+    np.testing.assert_allclose(one.estimate().linearized, [-0.003, 0.0, 0.0], atol=1e-15)
+    np.testing.assert_allclose(one.estimate().position, [-0.003, 0.0004, 0.0001])
+
+
+def test_starts_at_the_orientation_the_base_gives() -> None:
+    one = observer()
+    one.reset([0.0, 0.0, 0.0], [0.0, 0.3])
+    np.testing.assert_allclose(one.estimate().reduced, [0.0, 0.0, 0.3], atol=1e-12)
+
+
+def test_prediction_follows_the_plant_from_a_known_state() -> None:
+    """No correction: the prediction alone, against SE(3), errs only by what v does in a step."""
+    plant, one = NeedlePlant(poses(np.zeros(3)), curvature=CURVATURE), observer()
+    one.reset(np.zeros(3), [0.0, 0.0])
+    rng = default_rng(7)
+    for _ in range(60):
+        d_insertion, rate = rng.uniform(0.2e-3, 1e-3), rng.uniform(-60, 60)
+        plant.advance(d_insertion, rate * d_insertion)
+        one.advance(d_insertion, rate * d_insertion)
+    assert_within(one.estimate().reduced, true_reduced(plant), [2e-6, 1e-4, 2e-3])
+    heading = plant.T_rig_tip[:3, 2]
+    yaw = one.estimate().coordinates[3]
+    assert yaw == pytest.approx(np.arctan2(-heading[1], heading[2]), abs=2e-3)
+
+
+def test_converges_without_noise_to_the_whole_reduced_state() -> None:
+    start = np.array([-0.003, 0.05, 0.3])
+    plant, one, steer = NeedlePlant(poses(start), curvature=CURVATURE), observer(), law()
+    one.reset(plant.T_rig_tip[:3, 3], [0.0, 0.0])
+    errors = []
+    for _ in range(500):
+        rate = float(steer(one.estimate()).rotation_rate)
+        plant.advance(STEP, rate * STEP)
+        one.advance(STEP, rate * STEP)
+        one.correct(plant.T_rig_tip[:3, 3])
+        errors.append(np.abs(one.estimate().reduced - true_reduced(plant)))
+    assert errors[0][2] > 0.2
+    assert_within(errors[-1], 0.0, [1e-6, 1e-4, 1e-3])
+
+
+def test_steps_of_any_length_estimate_alike() -> None:
+    """Half the steps of half the length: the same continuous observer, sampled twice as often."""
+    ends = []
+    for divide in (1, 2, 4):
+        plant = NeedlePlant(poses(np.array([-0.003, 0.05, 0.3])), curvature=CURVATURE)
+        one = observer()
+        one.reset(plant.T_rig_tip[:3, 3], [0.0, 0.0])
+        for i in range(60 * divide):
+            d_rotation = 20.0 * np.sin(i / divide / 5.0) * STEP / divide
+            plant.advance(STEP / divide, d_rotation)
+            one.advance(STEP / divide, d_rotation)
+            one.correct(plant.T_rig_tip[:3, 3])
+        ends.append(one.estimate().reduced - true_reduced(plant))
+    assert_within(ends[0], ends[2], [5e-6, 1e-3, 1e-2])
+    assert_within(ends[1], ends[2], [2.5e-6, 5e-4, 5e-3])
+
+
+@pytest.mark.parametrize("x", [-0.003, 0.003])
+def test_closed_loop_brings_the_needle_into_the_plane(x: float) -> None:
+    plant = NeedlePlant(poses(np.array([x, 0.035, 0.26])), curvature=CURVATURE)
+    one, steer = observer(), law()
+    one.reset(plant.T_rig_tip[:3, 3], [0.0, 0.0])
+    for _ in range(160):
+        rate = float(steer(one.estimate()).rotation_rate)
+        plant.advance(STEP, rate * STEP)
+        one.advance(STEP, rate * STEP)
+        one.correct(plant.T_rig_tip[:3, 3])
+    assert_within(true_reduced(plant)[:2], 0.0, [1e-4, 3e-3])
+
+
+def test_closed_loop_from_a_known_state_settles_within_the_needle() -> None:
+    """The law alone, true state known: the sign of every term matters here."""
+    plant, one, steer = (
+        NeedlePlant(poses(np.array([0.003, 0.0, 0.0])), curvature=CURVATURE),
+        observer(),
+        law(),
+    )
+    one.reset([0.003, 0.0, 0.0], [0.0, 0.0])
+    for _ in range(80):
+        rate = float(steer(one.estimate()).rotation_rate)
+        plant.advance(STEP, rate * STEP)
+        one.advance(STEP, rate * STEP)
+        one.correct(plant.T_rig_tip[:3, 3])
+    assert abs(true_reduced(plant)[0]) < 5e-4
+
+
+def test_law_is_7_for_short_steps() -> None:
+    one = observer()
+    one.initial_rotation = rotation_from_angles([0.0, 0.5, 0.0])
+    one.reset([1e-6, 0.0, 0.0], [0.0, 0.1])
+    estimate = one.estimate()
+    # Enough pitch for the roll's own drift to matter: it is 4.5 rad/m here.
+    assert abs(CURVATURE * np.tan(estimate.reduced[1])) > 1.0
+    short = dataclasses.replace(
+        law(), step_length=1e-9, demand_margin=0.0, max_rotation_per_length=1e9
+    )
+    command = short(estimate)
+    expected = rotation_rate(estimate.reduced, command.virtual_input, CURVATURE)
+    assert float(command.rotation_rate) == pytest.approx(float(expected), rel=1e-5)
+    assert float(command.virtual_input) == pytest.approx(-estimate.linearized @ short.feedback)
+
+
+def test_law_caps_the_rotation_and_open_loop_never_turns() -> None:
+    one = observer()
+    one.reset(np.array([[0.02, 0, 0], [-0.02, 0, 0]]), np.zeros(2))
+    capped = dataclasses.replace(law(), max_rotation_per_length=10.0)(one.estimate())
+    np.testing.assert_array_equal(capped.rotation_rate, [-10.0, 10.0])
+    np.testing.assert_array_equal(OpenLoopLaw()(one.estimate()).rotation_rate, [0.0, 0.0])
+
+
+def test_pure_rotation_turns_the_roll_alone() -> None:
+    one = observer()
+    one.reset([0.001, 0.0, 0.0], [0.0, 0.2])
+    one.advance(0.0, 0.3)
+    np.testing.assert_allclose(one.estimate().reduced, [0.001, 0.0, 0.5], atol=1e-12)
+
+
+def test_broadcasting_equals_looping() -> None:
+    rng = default_rng(8)
+    tips = rng.normal(0.0, 2e-3, (20, 5, 3))
+    insertions = rng.uniform(0.5e-3, 1e-3, 20)
+    turns = rng.normal(0.0, 0.1, (20, 5))
+    tips[3, 2] = np.nan
+    many = observer()
+    many.reset(tips[0], np.zeros(2))
+    for tip, d_insertion, turn in zip(tips[1:], insertions[1:], turns[1:], strict=True):
+        many.advance(d_insertion, turn)
+        many.correct(tip)
+    whole = many.estimate()
+    covariance = whole.covariance
+    command = law()(whole)
+    for i in range(5):
+        one = observer()
+        one.reset(tips[0, i], np.zeros(2))
+        for tip, d_insertion, turn in zip(tips[1:, i], insertions[1:], turns[1:, i], strict=True):
+            one.advance(d_insertion, turn)
+            one.correct(tip)
+        alone = one.estimate()
+        np.testing.assert_allclose(whole.coordinates[i], alone.coordinates, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(covariance[i], alone.covariance, rtol=1e-8, atol=1e-20)
+        single = law()(alone)
+        np.testing.assert_allclose(command.rotation_rate[i], single.rotation_rate, rtol=1e-8)
+
+
+def test_a_missing_tip_changes_nothing_but_time() -> None:
+    one, other = observer(), observer()
+    for each in (one, other):
+        each.reset([0.001, 0.0, 0.0], [0.0, 0.1])
+        each.advance(STEP, 0.02)
+    one.correct([np.nan, 0.0, 0.0])
+    np.testing.assert_array_equal(one.estimate().coordinates, other.estimate().coordinates)
+    np.testing.assert_array_equal(one.estimate().covariance, other.estimate().covariance)
+    for each in (one, other):
+        each.advance(STEP, 0.02)
+        each.correct([0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(one.estimate().coordinates, other.estimate().coordinates)
+
+
+def test_a_late_tip_is_compared_with_where_the_tip_was() -> None:
+    one = observer()
+    one.reset([0.0, 0.0, 0.0], [0.0, 0.5])
+    for _ in range(20):
+        one.advance(STEP, 0.0)
+    before = one.estimate()
+    late = 5 * STEP
+    s = before.linearized
+    was = s[0] - late * s[1] + late**2 / 2 * s[2]
+    one.correct([was, 0.0, 0.015], age=late)
+    np.testing.assert_allclose(one.estimate().linearized, s, atol=1e-12)
+
+
+def test_covariance_is_honest() -> None:
+    """Over many noisy runs the spread of the errors is within what the covariance says."""
+    rng = default_rng(9)
+    count = 2000
+    start = np.stack(
+        [
+            np.zeros(count),
+            rng.normal(0.0, PARAMETERS.initial_pitch_std / 2, count),
+            rng.normal(0.0, PARAMETERS.initial_roll_std / 2, count),
+        ],
+        axis=-1,
+    )
+    plant, many = NeedlePlant(poses(start), curvature=CURVATURE), observer()
+
+    def measured() -> Array:
+        noise = rng.uniform(-1e-3, 1e-3, (count, 3))
+        return np.asarray(plant.T_rig_tip[:, :3, 3] + noise)
+
+    many.reset(measured(), np.zeros(2))
+    for i in range(30):
+        plant.advance(STEP, 0.0)
+        many.advance(STEP, 0.0)
+        many.correct(measured())
+        if i % 10 == 9:
+            error = many.estimate().reduced - true_reduced(plant)
+            covariance = many.estimate().covariance
+            sigma = np.sqrt(covariance[:, [0, 4, 5], [0, 4, 5]])
+            assert np.all(np.sqrt(np.mean((error / sigma) ** 2, axis=0)) < 1.3)
+    eigenvalues = np.linalg.eigvalsh(covariance)
+    assert np.all(eigenvalues > 0.0)
+    # y and z are as measured; the yaw is not observed.
+    np.testing.assert_allclose(covariance[:, 1, 1], PARAMETERS.measurement_std**2)
+    assert np.all(covariance[:, 3, 3] >= PARAMETERS.initial_yaw_std**2)
+
+
+def test_saturation_is_said() -> None:
+    one = observer()
+    one.reset([0.0, 0.0, 0.0], [0.0, 1.5])
+    assert any("saturated" in warning for warning in one.estimate().warnings)
+    one.reset([0.0, 0.0, 0.0], [0.0, 0.0])
+    assert one.estimate().warnings == ()
+
+
+def test_new_settings_keep_the_pose() -> None:
+    one = observer()
+    one.reset([0.001, 0.0, 0.0], [0.0, 0.4])
+    before = one.estimate().coordinates
+    settings = dataclasses.replace(PARAMETERS, curvature=6.0).control()
+    one.settings = observer_settings(settings, settings.gains())
+    np.testing.assert_allclose(one.estimate().coordinates, before, atol=1e-12)
+    assert one.estimate().curvature == 6.0
+
+
+def test_a_new_frame_keeps_the_needle() -> None:
+    one = observer()
+    one.reset([0.001, 0.002, 0.003], [0.0, 0.4])
+    for _ in range(10):
+        one.advance(STEP, 0.02)
+    before = one.estimate()
+    transform = np.eye(4)
+    transform[:3, :3] = rotation_from_angles([0.3, -0.2, 0.4])
+    transform[:3, 3] = [0.001, -0.002, 0.003]
+    one.change_frame(transform)
+    after = one.estimate()
+    np.testing.assert_allclose(after.rotation, transform[:3, :3] @ before.rotation, atol=1e-9)
+    expected = transform[:3, :3] @ before.position + transform[:3, 3]
+    # y and z of the estimate are the measured tip's, x the observer's.
+    assert after.position[0] == pytest.approx(expected[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("length", [-1e-6, np.nan, np.inf])
+def test_only_forward_insertion_is_modelled(length: float) -> None:
+    one = observer()
+    one.reset([0.0, 0.0, 0.0], [0.0, 0.0])
+    with pytest.raises(ValueError, match="d_insertion"):
+        one.advance(length, 0.0)

@@ -1,0 +1,102 @@
+"""The other side of the step protocol, and what it is asked."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.plane_control import PlaneControl
+from needle_controller.protocol.steering import Steering
+from needle_controller.protocol.steering_types import (
+    Action,
+    Awaiting,
+    DeviceStatus,
+    Log,
+    SendStep,
+    State,
+)
+from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.ros.parameters import PlaneControllerParameters
+
+TICK = 20_000_000
+HELD = DeviceStatus("HOLDING", True, "operator")
+MOVING = DeviceStatus("MOVING", True, "operator")
+FREE = DeviceStatus("HOLDING", True, "")
+
+
+class Rig:
+    """The other side of the protocol: joints, tips and answers, on its own clock."""
+
+    def __init__(
+        self,
+        *,
+        depth: float = 0.12,
+        started: bool = True,
+        held: bool = True,
+        tip_covariance: str = "configured",
+        preset: str = "best",
+        insertion: float = 0.0,
+        rotation: float = 0.0,
+    ) -> None:
+        parameters = PlaneControllerParameters(
+            preset=preset, depth=depth, target_offset=0.003, tip_covariance=tip_covariance
+        )
+        control = PlaneControl(parameters.control(), offset_plane(0.003))
+        self.steering = Steering(parameters.steering(), control)
+        self.now = TICK
+        self.insertion = insertion
+        self.rotation = rotation
+        self.steering.on_device(HELD if held else FREE)
+        self.joints()
+        if started:
+            reply, _ = self.steering.on_start()
+            assert reply.success, reply.message
+
+    def joints(self) -> list[Action]:
+        return self.steering.on_joints(JointSample(self.now, self.insertion, self.rotation))
+
+    def settle(self, count: int = 6) -> list[Action]:
+        """Let joint_states say several times where the needle is."""
+        actions: list[Action] = []
+        for _ in range(count):
+            self.now += TICK
+            actions += self.joints()
+        return actions
+
+    def measured(self, x: float = 0.0) -> TipMeasurement:
+        return TipMeasurement(self.now, "rig", np.array([x, 0.0, self.insertion]))
+
+    def expose(self, tip: TipMeasurement | None = None) -> list[Action]:
+        """One tick: joints, then the tip."""
+        self.now += TICK
+        actions = self.joints()
+        return actions + self.steering.on_tip(tip or self.measured())
+
+    def run(self, step: SendStep, part: float = 1.0, text: str = "succeeded") -> list[Action]:
+        """Carry out a part of a step and answer."""
+        start = self.insertion, self.rotation
+        for share in (0.5 * part, part):
+            self.now += TICK
+            self.insertion = start[0] + share * (step.insertion - start[0])
+            self.rotation = start[1] + share * (step.rotation - start[1])
+            self.joints()
+        return self.steering.on_result(step.stamp_ns, text)
+
+
+def sent(actions: list[Action]) -> SendStep:
+    steps = [action for action in actions if isinstance(action, SendStep)]
+    assert len(steps) == 1, actions
+    return steps[0]
+
+
+def none_sent(actions: list[Action]) -> bool:
+    return not any(isinstance(action, SendStep) for action in actions)
+
+
+def logged(actions: list[Action]) -> str:
+    return "; ".join(action.text for action in actions if isinstance(action, Log))
+
+
+def where(rig: Rig) -> tuple[State, Awaiting]:
+    return rig.steering.state, rig.steering.awaiting

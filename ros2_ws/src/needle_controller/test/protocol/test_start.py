@@ -1,0 +1,93 @@
+"""What it takes to start steering."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from needle_controller.protocol.steering import Steering
+from needle_controller.protocol.steering_types import Awaiting, DeviceStatus, State
+
+from .rig import HELD, MOVING, Rig, sent, where
+
+
+@pytest.mark.parametrize(
+    ("device", "said"),
+    [
+        (None, "device/status"),
+        (DeviceStatus("HOLDING", False, ""), "not homed"),
+        (DeviceStatus("DISABLED", True, ""), "not enabled"),
+        (DeviceStatus("ESTOPPED", True, ""), "not enabled"),
+    ],
+)
+def test_start_says_why_not(device: DeviceStatus | None, said: str) -> None:
+    rig = Rig(started=False)
+    rig.steering._device = device
+    reply, _ = rig.steering.on_start()
+    assert not reply.success
+    assert said in reply.message
+    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+
+
+def test_start_needs_joints() -> None:
+    steering = Rig(started=False).steering
+    fresh = Steering(steering.settings, steering.control)
+    fresh.on_device(HELD)
+    reply, _ = fresh.on_start()
+    assert (reply.success, reply.message) == (False, "no joint_states have come")
+
+
+def test_start_refuses_a_needle_it_did_not_follow() -> None:
+    rig = Rig(started=False, insertion=0.05)
+    reply, _ = rig.steering.on_start()
+    assert not reply.success
+    assert "0.05 m in" in reply.message
+
+
+def test_start_refuses_a_roll_its_coordinates_cannot_say() -> None:
+    rig = Rig(started=False, preset="paper", rotation=2.0)
+    reply, _ = rig.steering.on_start()
+    assert not reply.success
+    assert "roll" in reply.message
+
+
+@pytest.mark.parametrize("turned", [2.0, np.pi, -8.0])
+def test_best_starts_with_its_base_turned_however_the_last_run_left_it(turned: float) -> None:
+    rig = Rig(started=False, rotation=turned)
+    assert rig.steering.on_start()[0].success
+    assert sent(rig.expose()).rotation == pytest.approx(turned, abs=0.53)
+
+
+def test_start_twice_and_stop_twice() -> None:
+    rig = Rig()
+    assert not rig.steering.on_start()[0].success
+    assert rig.steering.on_stop()[0].success
+    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert rig.steering.on_stop()[0].success
+
+
+def test_tips_move_nothing_while_idle() -> None:
+    rig = Rig(started=False)
+    assert rig.expose() == []
+
+
+@pytest.mark.parametrize(
+    ("device", "said"),
+    [
+        (MOVING, "waiting for the device, which moves"),
+        (DeviceStatus("MOVING", False, ""), "waiting for the device, which moves"),
+        (DeviceStatus("HOLDING", True, "", "", 0.0, 0.0), "waiting for joint_states"),
+    ],
+)
+def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) -> None:
+    """The joints lag behind the device: homing has ended there, and not here."""
+    rig = Rig(started=False, insertion=0.0015)
+    rig.steering.on_device(device)
+    reply, _ = rig.steering.on_start()
+    assert not reply.success
+    assert reply.message.startswith(said)
+    rig.insertion = 0.0
+    rig.settle()
+    rig.steering.on_device(DeviceStatus("HOLDING", True, "operator", "", 0.0, 0.0))
+    assert rig.steering.on_start()[0].success
+    sent(rig.expose())

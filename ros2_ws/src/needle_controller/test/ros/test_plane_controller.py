@@ -1,0 +1,451 @@
+"""The node in process: steps, bad input and what it says about them."""
+
+from __future__ import annotations
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3Stamped,
+)
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
+
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.ros.conversions import (
+    JOINT_STATES,
+    LATCHED,
+    RELIABLE,
+    to_diagnostic_status,
+    to_nanoseconds,
+    to_stamp,
+    values_of,
+)
+from needle_common.ros.own_context import own_context
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.ros.conversions import to_tip_covariance
+from needle_controller.ros.plane_controller import PlaneControllerNode, main
+
+LIMIT = 20.0
+TICK = 20_000_000
+
+
+@pytest.fixture
+def context() -> Iterator[Context]:
+    with own_context() as context:
+        yield context
+
+
+class Bench:
+    """The node under test, a scripted device and a scripted tracker, on one executor."""
+
+    def __init__(self, context: Context, **parameters: Any) -> None:
+        # most tests send tips alone
+        given = {"tip_covariance": "configured", **parameters}
+        self.node = PlaneControllerNode(
+            context=context,
+            parameter_overrides=[Parameter(name, value=v) for name, v in given.items()],
+        )
+        self.outside = outside = Node("outside", context=context)
+        self._executor = SingleThreadedExecutor(context=context)
+        for node in (self.node, outside):
+            self._executor.add_node(node)
+        self.received: defaultdict[str, list[Any]] = defaultdict(list)
+        for kind, topic, qos in (
+            (JointTrajectory, "device/joint_trajectory", RELIABLE),
+            (PoseWithCovarianceStamped, "needle/estimate", RELIABLE),
+            (Vector3Stamped, "needle/reduced_state", RELIABLE),
+            (Vector3Stamped, "needle/linearized_state", RELIABLE),
+            (Vector3Stamped, "needle/control_input", RELIABLE),
+            (DiagnosticStatus, "needle/controller_status", LATCHED),
+            (DiagnosticArray, "/diagnostics", RELIABLE),
+        ):
+            outside.create_subscription(kind, topic, self.received[topic].append, qos)
+        self._joints = outside.create_publisher(JointState, "joint_states", JOINT_STATES)
+        self._tips = outside.create_publisher(PointStamped, "needle/tip", RELIABLE)
+        self._results = outside.create_publisher(Header, "device/result", RELIABLE)
+        self._device = outside.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+        self._planes = outside.create_publisher(PoseStamped, "target_plane", LATCHED)
+        self.now = TICK
+        self.insertion = self.rotation = 0.0
+        publishers = (self._joints, self._tips, self._results, self._device, self._planes)
+        self.until(lambda: all(p.get_subscription_count() for p in publishers))
+        commands = self.node._commands
+        self.until(lambda: commands.get_subscription_count() > 0)
+        self.until(lambda: bool(self.received["needle/controller_status"]))
+
+    def close(self) -> None:
+        for node in (self.node, self.outside):
+            self._executor.remove_node(node)
+            node.destroy_node()
+        self._executor.shutdown()
+
+    def until(self, condition: Callable[[], bool]) -> None:
+        end = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < end, f"waited in vain; {self.status}"
+            self._executor.spin_once(timeout_sec=0.05)
+
+    @property
+    def status(self) -> dict[str, str]:
+        messages = self.received["needle/controller_status"]
+        return values_of(messages[-1]) if messages else {}
+
+    @property
+    def commands(self) -> list[JointTrajectory]:
+        return self.received["device/joint_trajectory"]
+
+    def health(self, part: str) -> tuple[int, str]:
+        for array in reversed(self.received["/diagnostics"]):
+            for status in array.status:
+                if status.name == f"plane_controller: {part}":
+                    return status.level[0], status.message
+        return -1, ""
+
+    def device(self, state: str = "HOLDING", owner: str = "operator") -> None:
+        values = {"state": state, "homed": "true", "hold_owner": owner}
+        health = Diagnostic(Level.OK, state, values)
+        self._device.publish(to_diagnostic_status("device: device", "device", health))
+
+    def joints(self) -> None:
+        message = JointState(
+            name=["rotation_joint", "insertion_joint"], position=[self.rotation, self.insertion]
+        )
+        message.header.stamp = to_stamp(self.now)
+        self._joints.publish(message)
+
+    def call(self, service: str) -> Trigger.Response:
+        client = self.outside.create_client(Trigger, f"plane_controller/{service}")
+        self.until(client.service_is_ready)
+        future = client.call_async(Trigger.Request())
+        self.until(future.done)
+        return future.result()
+
+    def start(self) -> None:
+        self.device()
+        self.joints()
+        steering = self.node._steering
+        self.until(
+            lambda: steering.intake.joints.latest is not None and steering._device is not None
+        )
+        response = self.call("start")
+        assert response.success, response.message
+        self.until(lambda: self.status["awaiting"] == "tip")
+
+    def tip(self, position: list[float], frame: str = "rig", stamp: int | None = None) -> int:
+        """Publish a tip one tick later, joints first; its stamp."""
+        self.now += TICK
+        self.joints()
+        message = PointStamped()
+        stamp = self.now if stamp is None else stamp
+        message.header.stamp, message.header.frame_id = to_stamp(stamp), frame
+        message.point.x, message.point.y, message.point.z = position
+        self._tips.publish(message)
+        return stamp
+
+    def step(self) -> JointTrajectory:
+        """One good tip and the command it leads to."""
+        wanted = len(self.commands) + 1
+        stamp = self.tip([0.0, 0.0, self.insertion])
+        self.until(lambda: len(self.commands) >= wanted)
+        command = self.commands[-1]
+        assert to_nanoseconds(command.header.stamp) == stamp
+        return command
+
+    def run(self, command: JointTrajectory) -> None:
+        """Carry it out, and answer."""
+        self.insertion, self.rotation = command.points[0].positions
+        self.now += TICK
+        self.joints()
+        answer = Header(stamp=command.header.stamp, frame_id="succeeded")
+        self._results.publish(answer)
+        self.until(lambda: self.status["tip_after_ns"] == str(self.now))
+
+
+@pytest.fixture
+def bench(context: Context) -> Iterator[Bench]:
+    bench = Bench(context, target_offset=0.003)
+    yield bench
+    bench.close()
+
+
+def test_steers_step_by_step(bench: Bench) -> None:
+    assert bench.status["state"] == "IDLE"
+    bench.start()
+    assert bench.status["state"] == "STEERING"
+    for number in (1, 2, 3):
+        command = bench.step()
+        assert list(command.joint_names) == ["insertion_joint", "rotation_joint"]
+        (point,) = command.points
+        assert point.positions[0] == pytest.approx(number * 0.001)
+        assert (point.time_from_start.sec, point.time_from_start.nanosec) == (0, 500_000_000)
+        bench.run(command)
+        assert bench.status["step"] == str(number)
+        assert int(bench.status["tip_after_ns"]) == bench.now
+    topics = (
+        "needle/estimate",
+        "needle/reduced_state",
+        "needle/linearized_state",
+        "needle/control_input",
+    )
+    bench.until(lambda: all(len(bench.received[topic]) == 3 for topic in topics))
+    for topic in topics:
+        assert bench.received[topic][-1].header.stamp == bench.commands[-1].header.stamp
+        assert bench.received[topic][-1].header.frame_id == "target_plane"
+    reduced = bench.received["needle/reduced_state"][-1].vector
+    pose = bench.received["needle/estimate"][-1].pose
+    assert pose.pose.position.x == reduced.x == pytest.approx(-0.003, abs=2e-4)
+    q = pose.pose.orientation
+    heading_x = 2.0 * (q.x * q.z + q.w * q.y)
+    assert heading_x == pytest.approx(np.sin(reduced.y), abs=1e-12)
+    covariance = np.reshape(pose.covariance, (6, 6))
+    assert np.all(np.linalg.eigvalsh(covariance) > 0.0)
+    u = bench.received["needle/control_input"][0].vector.y
+    assert bench.commands[0].points[0].positions[1] == pytest.approx(u * 0.001)
+    assert bench.status["target_offset_m"] == "0.003"
+    response = bench.call("stop")
+    assert response.success
+    bench.until(lambda: bench.status["state"] == "IDLE")
+
+
+@pytest.mark.parametrize(
+    ("position", "frame", "said"),
+    [
+        ([float("nan"), 0.0, 0.001], "rig", "not finite"),
+        ([0.0, 0.0, 0.001], "left_camera_optical", "left_camera_optical"),
+        ([0.12, 0.2, 1.0], "rig", "from the entry point"),
+    ],
+)
+def test_a_bad_tip_is_named_and_moves_nothing(
+    bench: Bench, position: list[float], frame: str, said: str
+) -> None:
+    bench.start()
+    bench.run(bench.step())
+    sent = len(bench.commands)
+    stamp = bench.tip(position, frame)
+    bench.until(lambda: bench.status["tips_rejected"] == "1")
+    assert said in bench.status["reason"]
+    assert bench.status["awaiting"] == "tip"
+    assert int(bench.status["tip_after_ns"]) == stamp
+    bench.until(lambda: bench.health("steering")[0] == Level.WARN)
+    assert said in bench.health("steering")[1]
+    assert len(bench.commands) == sent
+    bench.step()
+    assert len(bench.commands) == sent + 1
+    bench.until(lambda: bench.health("steering")[0] == Level.OK)
+
+
+def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None:
+    bench = Bench(context, target_offset=0.003, tip_covariance="from_tip_pose")
+    poses = bench.outside.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
+    bench.until(lambda: poses.get_subscription_count() > 0)
+    bench.start()
+    stamps = [bench.tip([0.0, 0.0, 0.0])]
+    intake = bench.node._steering.intake
+    bench.until(lambda: bool(intake._waiting) and intake.joints.at(stamps[0]) is not None)
+    assert not bench.commands
+    # That of another tip says that this one's will not come.
+    pose = PoseWithCovarianceStamped()
+    pose.header.frame_id = "rig"
+    pose.pose.covariance[0] = pose.pose.covariance[7] = pose.pose.covariance[14] = 1e-8
+    pose.header.stamp = to_stamp(stamps[0] + 1)
+    poses.publish(pose)
+    bench.until(lambda: bench.status["tips_rejected_for"] == "no_covariance 1")
+    assert "needle/tip_pose" in bench.status["reason"]
+    stamps.append(bench.tip([0.0, 0.0, 0.0]))
+    pose.header.stamp = to_stamp(stamps[1])
+    poses.publish(pose)
+    bench.until(lambda: len(bench.commands) == 1)
+    assert to_nanoseconds(bench.commands[0].header.stamp) == stamps[1]
+    bench.close()
+
+
+def test_a_tip_pose_says_direction_and_covariance() -> None:
+    message = PoseWithCovarianceStamped()
+    turned = Rotation.from_rotvec([0.3, -0.2, 0.9])
+    q = message.pose.pose.orientation
+    q.x, q.y, q.z, q.w = (float(part) for part in turned.as_quat())
+    message.pose.covariance = np.arange(36.0)
+    known = to_tip_covariance(message)
+    np.testing.assert_allclose(known.direction, turned.as_matrix()[:, 2], atol=1e-12)
+    np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
+    np.testing.assert_array_equal(
+        known.direction_covariance, [[21, 22, 23], [27, 28, 29], [33, 34, 35]]
+    )
+
+
+def test_every_reason_to_refuse_a_tip_is_logged(
+    bench: Bench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Within one period of the log: a kind of its own for each reason, repetitions kept back."""
+    bench.start()
+    for position, frame in (
+        ([float("nan")] * 3, "rig"), ([0.0] * 3, "map"), ([1.0] * 3, "rig"), ([1.0] * 3, "rig")
+    ):  # fmt: skip
+        bench.tip(position, frame)
+    bench.until(lambda: bench.status["tips_rejected"] == "4")
+    assert bench.status["tips_rejected_for"] == "not_finite 1, frame 1, too_far 2"
+    said = capfd.readouterr().err
+    for reason in ("not finite", "frame 'map'", "from the entry point"):
+        assert said.count(reason) == 1
+
+
+def test_start_says_why_not(bench: Bench) -> None:
+    response = bench.call("start")
+    assert (response.success, response.message) == (False, "no device/status has come")
+
+
+def test_a_start_waits_for_a_device_that_listens(bench: Bench) -> None:
+    bench.device()
+    listening = next(
+        subscription
+        for subscription in bench.outside.subscriptions
+        if subscription.topic_name == "/device/joint_trajectory"
+    )
+    bench.outside.destroy_subscription(listening)
+    said = "waiting for subscriber of /device/joint_trajectory"
+    bench.until(lambda: bench.call("start").message == said)
+    assert bench.status["state"] == "IDLE"
+
+
+def test_a_recorded_start_waits_for_the_tips_sources_too(context: Context) -> None:
+    bench = Bench(
+        context, target_offset=0.003, wait_for_recorder=True, tip_covariance="from_tip_pose"
+    )
+    said = bench.call("start").message
+    assert said.startswith("waiting for publisher of /needle/tip_pose, ")
+    assert "recorder of /needle/estimate" in said
+    bench.outside.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
+    # Each source has to have said that it knows this node, too.
+    bench.until(lambda: bench.call("start").message.startswith("waiting for recorder of"))
+    bench.close()
+
+
+def test_a_plane_given_at_run_time_and_planes_refused(bench: Bench) -> None:
+    message = PoseStamped()
+    message.header.frame_id = "rig"
+    message.pose.position.x = 0.005
+    message.pose.orientation.w = 1.0
+    bench._planes.publish(message)
+    bench.until(lambda: bench.status["target_offset_m"] == "0.005")
+    message.pose.position.x = float("nan")
+    bench._planes.publish(message)
+    bench.until(lambda: bench.health("target_plane")[0] == Level.WARN)
+    assert "not finite" in bench.health("target_plane")[1]
+    assert bench.status["target_offset_m"] == "0.005"
+
+
+def at_offset(bench: Bench, offset: float) -> bool:
+    return bench.status["target_offset_m"] == str(offset)
+
+
+def test_a_plane_from_a_plain_publisher_is_taken_and_each_plane_once(
+    bench: Bench, capfd: pytest.CaptureFixture[str]
+) -> None:
+    plain = bench.outside.create_publisher(PoseStamped, "target_plane", RELIABLE)
+    bench.until(lambda: plain.get_subscription_count() == 1)
+    message = PoseStamped()
+    message.header.frame_id = "rig"
+    message.pose.orientation.w = 1.0
+    # Of the latched publisher both subscriptions hear: a plane that came before must not come back.
+    for offset, publisher in ((0.001, bench._planes), (0.002, plain), (0.004, bench._planes)):
+        message.pose.position.x = offset
+        publisher.publish(message)
+        bench.until(partial(at_offset, bench, offset))
+    message.pose.position.x = 0.005
+    plain.publish(message)
+    bench.until(partial(at_offset, bench, 0.005))
+    said = capfd.readouterr().err
+    assert said.count("target_plane at offset") == 4
+    ours = [line for line in said.splitlines() if "[plane_controller]" in line]
+    assert not any("incompatible" in line for line in ours)
+
+
+def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
+    bench._joints.publish(JointState(name=["insertion_joint"], position=[0.0]))
+    bench.until(lambda: bench.health("joint_states")[0] == Level.WARN)
+    assert "rotation_joint" in bench.health("joint_states")[1]
+    assert bench.node._steering.intake.joints.latest is None
+
+
+def test_parameters_change_as_valid_wholes_only(bench: Bench) -> None:
+    def set_all(**values: Any) -> list[Any]:
+        return list(bench.node.set_parameters([Parameter(n, value=v) for n, v in values.items()]))
+
+    node = bench.node
+    before = node._settings.values
+    for bad in (
+        {"curvature": 0.0},
+        {"curvature": float("nan")},
+        {"state_weights": [1.0, -1.0, 1.0]},
+        {"state_weights": [1.0, 1.0]},
+        {"process_noise": [0.0, 0.0, 0.0]},
+        {"preset": "best_of_all"},
+        {"step_length": 0.01},
+    ):
+        (result,) = set_all(**bad)
+        assert not result.successful, bad
+        assert result.reason
+        assert node._settings.values == before
+    results = set_all(curvature=7.0, preset="open_loop")
+    assert all(result.successful for result in results)
+    bench.until(lambda: bench.status["preset"] == "open_loop")
+    bench.start()
+    assert bench.step().points[0].positions[1] == 0.0
+
+
+def test_covariance_follows_the_messages_convention(bench: Bench) -> None:
+    """Fixed axes of target_plane: a sample of small turns has the published covariance."""
+    bench.start()
+    bench.step()
+    bench.until(lambda: bool(bench.received["needle/estimate"]))
+    estimate = bench.node._steering.control._estimator.estimate()
+    published = np.reshape(bench.received["needle/estimate"][-1].pose.covariance, (6, 6))
+    scale = 1e-4
+    rng = np.random.default_rng(1)
+    draws = rng.multivariate_normal(np.zeros(6), estimate.covariance, 20_000) * scale
+    mean = rotation_from_angles(estimate.coordinates[3:])
+    turned = rotation_from_angles(estimate.coordinates[3:] + draws[:, 3:]) @ mean.T
+    vectors = np.stack([turned[:, 2, 1], turned[:, 0, 2], turned[:, 1, 0]], axis=-1)
+    sampled = np.cov(vectors.T / scale)
+    np.testing.assert_allclose(sampled, published[3:, 3:], atol=0.05 * np.max(published[3:, 3:]))
+
+
+def test_an_unknown_parameter_is_refused(context: Context) -> None:
+    with pytest.raises(UserError, match="did you mean 'curvature'"):
+        Bench(context, curvatur=8.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--ros-args", "-p", "curvatur:=8.0"], "did you mean 'curvature'"),
+        (["--ros-args", "-p", "curvature:=-8.0"], "curvature = -8.0 is outside"),
+        (["--ros-args", "-p", "state_weights:=[1.0, -1.0, 1.0]"], "state_weights"),
+        (["--fast"], "unknown argument '--fast'"),
+    ],
+)
+def test_bad_arguments_are_one_line_and_exit_code_2(
+    arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["plane_controller", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert len(error.strip().splitlines()) == 1

@@ -1,0 +1,1 @@
+"""What the motion supervisor asks of the axes, whatever moves them."""

@@ -1,0 +1,92 @@
+"""The insertion and the rotation axis as the one thing that they are to the needle."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.rules import Rule
+
+
+@dataclasses.dataclass(frozen=True)
+class PairSnapshot:
+    """The newest reply of each axis."""
+
+    insertion: AxisSnapshot
+    rotation: AxisSnapshot
+
+    @property
+    def homed(self) -> bool:
+        """Whether both axes are homed."""
+        return self.insertion.homed and self.rotation.homed
+
+    @property
+    def powered(self) -> bool:
+        """Whether both axes are able to move."""
+        return self.insertion.powered and self.rotation.powered
+
+    @property
+    def ready(self) -> bool:
+        """Whether both axes would begin to move at once."""
+        return self.insertion.ready and self.rotation.ready
+
+    @property
+    def answered(self) -> bool:
+        """Whether both axes have answered to all that they were asked."""
+        return self.insertion.answered and self.rotation.answered
+
+    def age(self, now: float) -> float:
+        """Return the age of the older reply [s]."""
+        return now - min(self.insertion.time, self.rotation.time)
+
+    @property
+    def fault(self) -> str:
+        """The faults of both axes; empty: none."""
+        faults = []
+        if self.insertion.fault:
+            faults.append(f"insertion axis: {self.insertion.fault}")
+        if self.rotation.fault:
+            faults.append(f"rotation axis: {self.rotation.fault}")
+        return "; ".join(faults)
+
+    @property
+    def fault_rule(self) -> Rule:
+        """The rule behind the first fault."""
+        axis = self.insertion if self.insertion.fault else self.rotation
+        return axis.fault_rule
+
+
+class AxisPair:
+    """Gives orders to both axes such that one's failure never keeps the order from the other.
+
+    Parameters
+    ----------
+    insertion, rotation : Axis
+        The two axes.
+    """
+
+    def __init__(self, insertion: Axis, rotation: Axis) -> None:
+        self.insertion = insertion
+        self.rotation = rotation
+
+    def each(self, order: Callable[[Axis], None]) -> None:
+        """Give an order to both axes.
+
+        Raises
+        ------
+        AxisError
+            What either raised, after both were tried.
+        """
+        errors: list[AxisError] = []
+        for axis in (self.insertion, self.rotation):
+            try:
+                order(axis)
+            except AxisError as error:
+                errors.append(error)
+        if errors:
+            raise AxisError("; ".join(map(str, errors)), errors[0].rule)
+
+    def poll(self, now: float) -> PairSnapshot:
+        """Return the newest replies; `now` is the steady time [s]."""
+        return PairSnapshot(self.insertion.poll(now), self.rotation.poll(now))

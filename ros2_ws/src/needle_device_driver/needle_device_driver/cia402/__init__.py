@@ -1,0 +1,1 @@
+"""Axes whose drives speak CiA 402."""

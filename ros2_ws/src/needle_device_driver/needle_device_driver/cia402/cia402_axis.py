@@ -1,0 +1,409 @@
+"""An axis whose drive speaks CiA 402 over CAN."""
+
+from __future__ import annotations
+
+from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.cia402.cia402 import (
+    FAULTS,
+    POWERED,
+    START_HOMING,
+    DriveCommand,
+    Goal,
+    Mode,
+)
+from needle_device_driver.cia402.drive_fault import Fault, drive_fault
+from needle_device_driver.cia402.drive_machine import LONGEST_REST, DriveMachine
+from needle_device_driver.cia402.drive_monitor import DriveMonitor
+from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
+from needle_device_driver.cia402.drive_setup import set_up, write_homing, write_limits
+from needle_device_driver.cia402.drive_upkeep import (
+    arm_watchdog,
+    await_operational,
+    await_start,
+    disarm_watchdog,
+    reset_fault,
+)
+from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
+from needle_device_driver.link import objects as od
+from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.rules import Rule
+
+# In cycles without an answer: a drive that is switched off at the end is given up.
+_SILENT = 15
+
+
+class Cia402Axis(Axis):
+    """Steers one drive: a state machine towards a goal, set-points in cyclic position mode.
+
+    Orders are taken at once and carried out by `transmit` and `update`, once a cycle each, around
+    a SYNC; a stop goes out immediately. The drive runs to the last set-point and ends there: when
+    none comes, nothing moves on.
+
+    Parameters
+    ----------
+    name : str
+        What errors call it.
+    settings : DriveSettings
+        The drive.
+    link : CanLink
+        The bus, shared by all axes.
+    period : float
+        Of the SYNC [s].
+    watchdog : float
+        How long the drive goes without the computer's heartbeat [s].
+
+    Attributes
+    ----------
+    name : str
+        As given.
+    monitor : DriveMonitor
+        What the drive sends.
+    lacking : tuple of str
+        What the drive lacks that it could be set up without.
+    """
+
+    def __init__(
+        self, name: str, settings: DriveSettings, link: CanLink, *, period: float, watchdog: float
+    ) -> None:
+        self.name = name
+        self._settings = settings
+        self.actuated = settings.actuated
+        self._link = link
+        self._period = period
+        self._watchdog = watchdog
+        self.monitor = DriveMonitor(link, settings.node_id)
+        self.lacking: tuple[str, ...] = ()
+        self._machine = DriveMachine(
+            settings.magnitude(settings.tolerance), period, self.monitor.feedback
+        )
+        self._homing: HomingRun | None = None
+        self._configured = False
+        self._opening = 0
+        self._homed = False
+        self._limits_due = False
+        self._origin = 0
+        self._zero = 0
+        self._velocity = 0.0
+
+    def probe(self) -> None:
+        """Ask the drive whether it is there, from whatever state its node was left in.
+
+        Raises
+        ------
+        AxisError
+            If it does not answer.
+        """
+        node = self._settings.node_id
+        try:
+            # A stopped node answers to nothing else.
+            self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
+            ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
+        except (LinkError, DriveError) as error:
+            raise self._error(error) from error
+
+    # ---- orders -------------------------------------------------------------------------------
+
+    def configure(self) -> None:
+        """Open the link and set the drive up; moves nothing."""
+        try:
+            self._link.open()
+            self._set_up(survived=False)
+        except (LinkError, DriveError) as error:
+            raise self._error(error) from error
+        self._configured = True
+
+    def power(self, on: bool) -> None:
+        """Begin to switch the drive on, where it stands, or off."""
+        if not self.actuated:
+            return
+        if on:
+            self._refuse_fault()
+            if self._limits_due:
+                raise AxisError(f"{self.name} axis has no software limits yet")
+        else:
+            self._homing = None
+            self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+        self._machine.want(Goal.ON if on else Goal.OFF)
+
+    def home(self, speed: float) -> None:
+        """Begin to home; an axis that a hand moves takes where it is as 0."""
+        self._refuse_fault()
+        if not self.actuated:
+            self._zero = self._machine.at.position
+            self._count_from_home()
+            return
+        self._homed = self._limits_due = False
+        try:
+            write_limits(self._access, self._settings, homed=False)
+            write_homing(self._access, self._settings, speed)
+        except (LinkError, DriveError) as error:
+            raise self._error(error) from error
+        self._machine.mode = Mode.HOMING
+        self._homing = HomingRun(
+            here=self._settings.homing_method in HERE, tolerance_counts=self._rest_counts
+        )
+
+    def start_move(self, target: float, speed: float) -> None:
+        """Set the set-point of the next cycle; `speed` follows from the cycle's length."""
+        self._refuse_fault()
+        if not self._machine.ready:
+            raise AxisError(f"{self.name} axis is not ready to move")
+        settings = self._settings
+        counts = settings.counts(target)
+        lower, upper = settings.limits_counts
+        if self._homed and not lower <= counts <= upper:
+            raise AxisError(
+                f"{self.name} axis: target {target:.6g} is outside the drive's limits "
+                f"[{settings.lower:.6g}, {settings.upper:.6g}]",
+                Rule.SOFTWARE_LIMITS,
+            )
+        step = abs(counts - self._machine.target)
+        bound = settings.magnitude(settings.speed * self._period * 1.01) + 1
+        if step > bound:
+            raise AxisError(
+                f"{self.name} axis: set-point {step / settings.counts_per_unit:.6g} ahead in a "
+                f"cycle at {speed:.6g}/s, at most {bound / settings.counts_per_unit:.6g}",
+                Rule.LOOK_AHEAD,
+            )
+        self._machine.target = counts
+
+    def stop(self) -> None:
+        """Order a quick stop now, without waiting for the next cycle."""
+        if not self.actuated or not self._configured:
+            return
+        self._homing = None
+        self._machine.stop()
+        try:
+            self._send_order()
+        except LinkError as error:
+            raise self._error(error) from error
+
+    def reset(self) -> None:
+        """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
+        self._machine.want(Goal.OFF)
+        self._homing = None
+        try:
+            self._link.open()
+            self._link.other_master = ""
+            survived = (
+                await_operational(self._link, self.monitor, self._period)
+                and not self.monitor.rebooted
+            )
+            if not survived or self._opening != self._link.openings:
+                self._set_up(survived=survived)
+            self.monitor.emergency = None
+            reset_fault(self._link, self._settings)
+            self._refresh()
+        except (LinkError, DriveError) as error:
+            raise self._error(error) from error
+
+    def poll(self, now: float) -> AxisSnapshot:
+        """Return the newest reply."""
+        machine = self._machine
+        fault = self._fault
+        position, told = (
+            self._settings.position(counts - self._zero)
+            for counts in (machine.at.position, machine.target)
+        )
+        return AxisSnapshot(
+            time=self.monitor.fresh_time,
+            position=position,
+            set_point=told if self.actuated else position,
+            velocity=self._velocity,
+            powered=not self.actuated or machine.powered,
+            homed=self._homed and not self.monitor.rebooted,
+            moving=self._homing is not None,
+            at_home_switch=bool(machine.at.inputs & self._outer_switches),
+            at_inner_switch=bool(machine.at.inputs & self._inner_switch),
+            fault="" if fault is None else fault[1],
+            fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
+            ready=not self.actuated or machine.ready,
+            answered=self.monitor.answered(),
+            origin=self._origin,
+        )
+
+    def close(self) -> None:
+        """Stop, switch off and release the drive's watchdog; the link is its owner's to close.
+
+        Raises
+        ------
+        AxisError
+            If the drive does not say that it is off: its watchdog stays, and will switch it off.
+        """
+        if not self._configured:
+            return
+        self._homing = None
+        try:
+            self._machine.want(Goal.OFF)
+            if not self._switch_off_now():
+                raise DriveError("does not say that it is off; its watchdog will switch it off")
+            disarm_watchdog(self._link, self._settings)
+        except (LinkError, DriveError) as error:
+            raise self._error(error) from error
+        finally:
+            self._configured = False
+
+    # ---- the cycle ----------------------------------------------------------------------------
+
+    @property
+    def needs_cycles(self) -> bool:
+        """Whether the drive is on its way to where it was ordered, apart from set-points."""
+        if not self.actuated or self._fault is not None:
+            return False
+        return self._machine.switching or self._homing is not None
+
+    def transmit(self) -> None:
+        """Send this cycle's command and set-point.
+
+        Raises
+        ------
+        LinkError
+            If the link is lost.
+        """
+        if not self.actuated or not self._configured:
+            return
+        self._send_order()
+        self._link.send(
+            od.SET_POINT.function_code + self._settings.node_id,
+            od.SET_POINT.pack(self._machine.target),
+        )
+
+    def update(self) -> None:
+        """Take what the drive answered to the SYNC; nothing new where nothing came."""
+        before, at = self._machine.at, self.monitor.feedback
+        if at.number == before.number or not self._configured:
+            return
+        self._velocity = self._settings.position(at.position - before.position) / self._period
+        if not self.actuated:
+            self._machine.at = at
+            return
+        self._machine.update(at)
+        if self._homing is not None:
+            self._homing.update(at)
+            if self._homing.step is HomingStep.DONE:
+                # The drive's own limits count from home: now that it has one, and once it is off.
+                self._limits_due = True
+                self._count_from_home()
+        elif self._limits_due and self._machine.state not in POWERED:
+            self._write_limits()
+
+    def _send_order(self) -> None:
+        command, mode = self._machine.next_order()
+        word = int(command)
+        running = self._homing is not None and self._homing.step is HomingStep.RUNNING
+        if running and command is DriveCommand.ENABLE_OPERATION:
+            word |= START_HOMING
+        self._link.send(
+            od.COMMAND.function_code + self._settings.node_id, od.COMMAND.pack(word, mode)
+        )
+
+    def _write_limits(self) -> None:
+        try:
+            write_limits(self._access, self._settings, homed=True)
+        except LinkError:
+            # The link's loss has its own name.
+            return
+        except DriveError as error:
+            self._machine.trouble = str(error)
+            return
+        self._limits_due = False
+
+    def _count_from_home(self) -> None:
+        self._homing = None
+        self._homed = True
+        self._origin += 1
+
+    # ---- what is the matter -------------------------------------------------------------------
+
+    @property
+    def _access(self) -> ObjectAccess:
+        return ObjectAccess(self._link, self._settings.node_id)
+
+    @property
+    def _rest_counts(self) -> int:
+        return self._settings.magnitude(self._settings.tolerance)
+
+    @property
+    def _outer_switches(self) -> int:
+        # Outward is the drive's positive direction where it counts in reverse.
+        limit = od.POSITIVE_LIMIT_SWITCH if self._settings.reverse else od.NEGATIVE_LIMIT_SWITCH
+        return limit | od.HOME_SWITCH
+
+    @property
+    def _inner_switch(self) -> int:
+        reverse = self._settings.reverse
+        return od.NEGATIVE_LIMIT_SWITCH if reverse else od.POSITIVE_LIMIT_SWITCH
+
+    @property
+    def _fault(self) -> Fault | None:
+        if not self._configured:
+            return None
+        if self._link.lost:
+            return Rule.LINK_LOSS, self._link.lost
+        if self._link.other_master:
+            return Rule.ONE_MASTER, self._link.other_master
+        return drive_fault(self.monitor, self._machine, self._homing, actuated=self.actuated)
+
+    def _refuse_fault(self) -> None:
+        if not self._configured:
+            raise AxisError(f"{self.name} axis is not configured")
+        fault = self._fault
+        if fault is not None:
+            raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
+
+    def _error(self, error: LinkError | DriveError) -> AxisError:
+        rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
+        return AxisError(f"{self.name} axis: {error}", rule)
+
+    # ---- set-up, reset, shut-down -------------------------------------------------------------
+
+    def _set_up(self, *, survived: bool) -> None:
+        if not survived:
+            self._homed = False
+            self._origin += 1
+        self.monitor.begin_set_up()
+        self.lacking = set_up(self._link, self._settings, period=self._period, homed=self._homed)
+        self._limits_due = False
+        await_start(self._link, self.monitor, self._settings, self._period)
+        arm_watchdog(self._link, self._settings, self._watchdog)
+        self.monitor.end_set_up()
+        self._opening = self._link.openings
+        self._refresh()
+
+    def _refresh(self) -> None:
+        """Ask for what the next SYNC would bring, and forget what was before."""
+        access = self._access
+        self.monitor.take(
+            access.read(od.STATUSWORD),
+            access.read(od.MODE_DISPLAY),
+            self._machine.at.inputs,
+            access.read(od.POSITION_ACTUAL),
+        )
+        self._machine.begin_anew(self.monitor.feedback)
+        self._velocity = 0.0
+        if self._machine.state in FAULTS and access.has(od.ERROR_CODE):
+            # A fault from before has sent its message to nobody.
+            self.monitor.emergency = access.read(od.ERROR_CODE) or None
+
+    def _switch_off_now(self) -> bool:
+        """Run cycles of its own until the drive is off: nobody else will. Return whether it is."""
+        if not self.actuated:
+            return True
+        silent = 0
+        for _ in range(LONGEST_REST + _SILENT):
+            self._link.beat()
+            self._send_order()
+            self.monitor.expect_answer()
+            self._link.send(od.SYNC)
+            with self._link.arrival:
+                answered = self._link.arrival.wait_for(self.monitor.answered, self._period)
+                # Not as fast as the bus goes: a drive has this cycle's length.
+                self._link.arrival.wait_for(lambda: bool(self._link.lost), self._period / 2.0)
+            self.update()
+            silent = 0 if answered else silent + 1
+            if silent > _SILENT:
+                return False
+            if answered and self._machine.state not in POWERED:
+                return True
+        return False

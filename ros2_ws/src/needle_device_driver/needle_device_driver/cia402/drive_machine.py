@@ -1,0 +1,180 @@
+"""Leads a drive through its CiA 402 states to a goal, cycle by cycle."""
+
+from __future__ import annotations
+
+from needle_device_driver.cia402.cia402 import (
+    FAULTS,
+    POWERED,
+    REMOTE,
+    DriveCommand,
+    DriveState,
+    Goal,
+    Mode,
+    TransitionWatch,
+    drive_state,
+    next_command,
+)
+from needle_device_driver.cia402.drive_monitor import Feedback
+
+# In cycles: how long an axis must stand still to be at rest; when it is switched off although it
+# does not; when a change of state has failed; when a quick stop is left by way of switching off.
+_REST = 3
+LONGEST_REST = 50
+_LONGEST_SWITCHING = 100
+_LONGEST_REENABLE = 10
+
+
+class DriveMachine:
+    """What the drive is wanted to be, what it says it is, and the command in between.
+
+    Parameters
+    ----------
+    rest_counts : int
+        An axis that moves no further in a cycle stands still.
+    period : float
+        Of a cycle [s].
+    at : Feedback
+        What the drive said last.
+    """
+
+    def __init__(self, rest_counts: int, period: float, at: Feedback) -> None:
+        self._rest_counts = rest_counts
+        self._period = period
+        self._watch = TransitionWatch()
+        self._goal = Goal.OFF
+        self._cycles = 0
+        self._recovering = False
+        self._stopping = False
+        self._still = 0
+        self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+        self.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
+        self.at = at
+        self.target = at.position
+        self.trouble = ""
+
+    @property
+    def goal(self) -> Goal:
+        """What is wanted."""
+        return self._goal
+
+    @property
+    def state(self) -> DriveState | None:
+        """What the drive said last; None: nothing that CiA 402 has."""
+        return drive_state(self.at.statusword)
+
+    @property
+    def ready(self) -> bool:
+        """Whether a set-point would be followed."""
+        return (
+            self._goal is Goal.ON
+            and not self._stopping
+            and self.state is DriveState.OPERATION_ENABLED
+            and self.at.mode == self.mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
+        )
+
+    @property
+    def powered(self) -> bool:
+        """Whether the drive is on by the present order, stopped or not."""
+        # One that is still on from before, on its way off or to another mode, is not.
+        on = self.state in POWERED and self.at.mode == self.mode
+        return self._goal is not Goal.OFF and (on or self._recovering)
+
+    @property
+    def switching(self) -> bool:
+        """Whether the drive is on its way to the goal."""
+        if self._goal is Goal.ON:
+            return not self.ready
+        if self._goal is Goal.STOPPED:
+            return self.state is DriveState.OPERATION_ENABLED
+        return self.state in POWERED
+
+    def want(self, goal: Goal) -> None:
+        """Set the goal."""
+        if goal is not self._goal:
+            self._goal = goal
+            self._cycles = 0
+            self._recovering = False
+
+    def stop(self) -> None:
+        """Want a stop; until the drive has said that it took it, nothing else is ordered."""
+        if self._goal is not Goal.OFF:
+            self.want(Goal.STOPPED)
+        self._stopping = True
+
+    def begin_anew(self, at: Feedback) -> None:
+        """Forget what was, after a set-up or reset: the drive shall be off."""
+        self._watch = TransitionWatch()
+        self.want(Goal.OFF)
+        self._stopping = False
+        self._still = 0
+        self.at = at
+        self.target = at.position
+        self.trouble = ""
+
+    def next_order(self) -> tuple[DriveCommand, Mode]:
+        """Return the command and the mode to send now."""
+        command = self._next_command()
+        self._watch.sent(command)
+        # The mode of a powered drive stays: its set-point may be of another mode's making.
+        if self.state not in POWERED:
+            self._sent_mode = self.mode
+        return command, self._sent_mode
+
+    def update(self, at: Feedback) -> None:
+        """Take what the drive says now; `trouble` has what is wrong with it."""
+        still = abs(at.position - self.at.position) <= self._rest_counts
+        self._still = self._still + 1 if still else 0
+        self.at = at
+        state = self.state
+        if state is None:
+            self._complain(f"says 0x{at.statusword:04X}, no statusword of CiA 402")
+            return
+        self._complain(self._watch.unexplained(state))
+        follows = at.mode == Mode.CYCLIC_SYNCHRONOUS_POSITION
+        if self._stopping or not (follows and state is DriveState.OPERATION_ENABLED):
+            # Whatever switches on or changes mode begins where the axis stands.
+            self.target = at.position
+        self._stopping = self._stopping and state is DriveState.OPERATION_ENABLED
+        self._cycles += 1
+        self._watch_switching(state)
+
+    def _watch_switching(self, state: DriveState) -> None:
+        homing = self.mode is Mode.HOMING and self.at.mode == Mode.HOMING
+        if self.ready or (homing and state is DriveState.OPERATION_ENABLED):
+            self._cycles = 0
+            self._recovering = False
+            return
+        if (
+            self._goal is Goal.ON
+            and state is DriveState.QUICK_STOP_ACTIVE
+            and self._cycles > _LONGEST_REENABLE + _REST
+            and self._still > _REST
+        ):
+            # Transition 16 is optional: where it is lacking, through SWITCH ON DISABLED.
+            self._recovering = True
+        if self.switching and state not in FAULTS and self._cycles > _LONGEST_SWITCHING:
+            self._complain(
+                f"is not {self._goal.value} after {_LONGEST_SWITCHING * self._period:g} s: "
+                f"{state.name}, mode {self.at.mode}"
+                + ("" if self.at.statusword & REMOTE else ", not under the bus's control (bit 9)")
+            )
+
+    def _next_command(self) -> DriveCommand:
+        state = self.state
+        if self._stopping:
+            return DriveCommand.QUICK_STOP
+        if self._goal is not Goal.ON:
+            at_rest = self._still >= _REST or self._cycles > LONGEST_REST
+            return next_command(self._goal, state, at_rest=at_rest)
+        at_rest = self._still >= _REST
+        if state is DriveState.QUICK_STOP_ACTIVE and self._recovering:
+            return DriveCommand.DISABLE_VOLTAGE
+        if self.at.mode != self.mode:
+            if state in POWERED:
+                return next_command(Goal.OFF, state, at_rest=at_rest)
+            if state is DriveState.SWITCHED_ON:
+                return DriveCommand.SWITCH_ON
+        return next_command(Goal.ON, state, at_rest=at_rest)
+
+    def _complain(self, text: str) -> None:
+        self.trouble = self.trouble or text

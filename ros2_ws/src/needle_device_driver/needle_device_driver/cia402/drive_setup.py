@@ -1,0 +1,214 @@
+"""How a drive is set up over SDO: limits, reactions, process data, watchdog."""
+
+from __future__ import annotations
+
+import enum
+
+from needle_device_driver.cia402.cia402 import (
+    POWERED,
+    SUPPORTS_CYCLIC_POSITION,
+    SUPPORTS_HOMING,
+    DriveCommand,
+    drive_state,
+)
+from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
+from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
+from needle_device_driver.link import objects as od
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
+
+# Milliseconds between a drive's heartbeats: well inside the reply age limit.
+PRODUCER_HEARTBEAT_MS = 30
+# In seconds.
+_SWITCH_OFF_WAIT = 1.0
+
+_LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
+_KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
+_NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
+
+
+class _Need(enum.Enum):
+    """How much hangs on an entry that a drive need not have; one that it has is set."""
+
+    # A drive that refuses keeps its own.
+    WISH = enum.auto()
+    # A rule depends on these: what the drive made of them is read back. Rounded is not clipped.
+    ROUNDED = enum.auto()
+    ROUNDED_DOWN = enum.auto()
+    EXACT = enum.auto()
+
+
+def set_up(
+    link: CanLink, settings: DriveSettings, *, period: float, homed: bool
+) -> tuple[str, ...]:
+    """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
+
+    Parameters
+    ----------
+    link : CanLink
+        The bus, open.
+    settings : DriveSettings
+        What the drive shall be.
+    period : float
+        Of the SYNC [s].
+    homed : bool
+        Whether its position counts from home, so that software limits mean something.
+
+    Returns
+    -------
+    tuple of str
+        What the drive lacks that it could be without.
+
+    Raises
+    ------
+    DriveError
+        If the node does not answer, is no CiA 402 drive, or lacks what is needed.
+    LinkError
+        If the link is lost.
+    """
+    node = settings.node_id
+    access = ObjectAccess(link, node)
+    link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
+    profile = access.read(od.DEVICE_TYPE) & 0xFFFF
+    if profile != od.CIA402:
+        raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
+    # Not while this set-up keeps the loop from its heartbeat.
+    access.write(od.CONSUMER_HEARTBEAT, 0)
+    lacking: list[str] = []
+    if settings.actuated:
+        lacking += _set_up_motion(link, access, settings, period)
+        write_limits(access, settings, homed=homed)
+        map_pdo(access, node, od.COMMAND)
+        map_pdo(access, node, od.SET_POINT)
+    lacking += _map_status(access, node)
+    map_pdo(access, node, od.POSITION)
+    silence_unused(access)
+    access.offer(od.CYCLE_PERIOD, round(period * 1e6))
+    access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
+    link.send(od.NMT, bytes([od.NMT_START, node]))
+    return tuple(lacking)
+
+
+def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> None:
+    """Set the drive's software limits: none while un-homed, for they count from home."""
+    if homed:
+        _write_limits(access, *settings.limits_counts)
+        return
+    refusals = []
+    for lower, upper in od.NO_LIMITS:
+        try:
+            _write_limits(access, lower, upper)
+        except DriveRefusalError as error:
+            refusals.append(error)
+        else:
+            return
+    raise refusals[0]
+
+
+def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> None:
+    """Set the speeds of a homing; `speed` in unit/s."""
+    access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed))
+    # Slow on the edge that counts.
+    access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0))
+
+
+def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
+    access.write_checked(od.LOWER_LIMIT, lower, variable=True)
+    access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+
+
+def _set_up_motion(
+    link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
+) -> list[str]:
+    modes = access.read(od.SUPPORTED_MODES)
+    for bit, name in (
+        (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
+        (SUPPORTS_HOMING, "homing"),
+    ):
+        if not modes & bit:
+            raise DriveError(f"node {settings.node_id} has no {name} mode (0x6502 = 0x{modes:08X})")
+    _switch_off(link, access, settings)
+    # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
+    access.write_checked(od.QUICK_STOP_OPTION, 6)
+    # The node keeps its state: whether it exchanges process data tells a reboot.
+    access.offer(od.ERROR_BEHAVIOUR, 1)
+    _write_homing_method(access, settings.homing_method)
+    magnitude = settings.magnitude
+    wanted = [
+        # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
+        (od.SHUTDOWN_OPTION, 1, _Need.WISH),
+        (od.DISABLE_OPTION, 1, _Need.WISH),
+        (od.FAULT_REACTION_OPTION, 2, _Need.EXACT),
+        (od.ABORT_CONNECTION_OPTION, 1, _Need.EXACT),
+        (od.FOLLOWING_WINDOW, magnitude(settings.following_error), _Need.ROUNDED_DOWN),
+        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3), _Need.WISH),
+        (od.HOME_OFFSET, 0, _Need.EXACT),
+        (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
+        (od.PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
+        (od.PROFILE_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.PROFILE_DECELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.HOMING_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
+        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration), _Need.ROUNDED),
+        (od.INTERPOLATION_PERIOD, round(period * 1e3), _Need.EXACT),
+        (od.INTERPOLATION_EXPONENT, -3, _Need.EXACT),
+    ]
+    if settings.max_torque > 0.0:
+        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.ROUNDED))
+    lacking = (_set(access, entry, value, need) for entry, value, need in wanted)
+    return [text for text in lacking if text]
+
+
+def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
+    """Write an entry as far as it is needed; return what the drive lacks."""
+    try:
+        if need is _Need.EXACT:
+            access.write_checked(entry, value)
+        elif need is _Need.ROUNDED:
+            access.write_checked(entry, value, at_least=value // 2 + 1, at_most=2 * value)
+        elif need is _Need.ROUNDED_DOWN:
+            access.write_checked(entry, value, at_least=value // 2 + 1)
+        else:
+            access.write(entry, value)
+    except DriveRefusalError as error:
+        if error.lacking:
+            return _LEFT_OUT.format(entry)
+        if need is not _Need.WISH:
+            raise
+        return _KEPT.format(entry, value)
+    return ""
+
+
+def _switch_off(link: CanLink, access: ObjectAccess, settings: DriveSettings) -> None:
+    """Switch off what another program left on: a powered drive takes no settings."""
+    if drive_state(access.read(od.STATUSWORD)) not in POWERED:
+        return
+    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    until = link.clock() + _SWITCH_OFF_WAIT
+    while drive_state(access.read(od.STATUSWORD)) in POWERED:
+        if link.clock() > until:
+            raise DriveError(f"node {settings.node_id} does not switch off")
+
+
+def _write_homing_method(access: ObjectAccess, method: int) -> None:
+    try:
+        access.write(od.HOMING_METHOD, method)
+    except DriveRefusalError:
+        if method not in HERE:
+            raise
+        # Two numbers for "where it stands": 35 is the older edition's.
+        for other in HERE:
+            if other != method:
+                access.write(od.HOMING_METHOD, other)
+
+
+def _map_status(access: ObjectAccess, node: int) -> list[str]:
+    if access.has(od.DIGITAL_INPUTS):
+        try:
+            map_pdo(access, node, od.STATUS)
+        except DriveRefusalError:
+            # Either they cannot be mapped, or the next attempt tells what else it is.
+            pass
+        else:
+            return []
+    map_pdo(access, node, od.STATUS_WITHOUT_INPUTS)
+    return [_NO_INPUTS]

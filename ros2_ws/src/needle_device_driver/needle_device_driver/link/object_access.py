@@ -1,0 +1,178 @@
+"""A drive's object dictionary, read and written by SDO."""
+
+from __future__ import annotations
+
+import contextlib
+
+import canopen
+
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.objects import Entry
+
+_NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
+_OTHER_LENGTH = (0x0607_0010, 0x0607_0012, 0x0607_0013)
+
+
+class DriveError(Exception):
+    """A drive does not answer, or refuses; the text says what and why."""
+
+
+class DriveRefusalError(DriveError):
+    """A drive refuses to have an entry read or written.
+
+    Parameters
+    ----------
+    text : str
+        What and why.
+    code : int
+        SDO abort code.
+    """
+
+    def __init__(self, text: str, code: int) -> None:
+        super().__init__(text)
+        self.code = code
+
+    @property
+    def lacking(self) -> bool:
+        """Whether the drive does not have the entry at all."""
+        return self.code in _NO_SUCH_OBJECT
+
+
+class ObjectAccess:
+    """Reads and writes entries of one node; each transfer waits for its answer.
+
+    Before each transfer, and while it waits, the computer's heartbeat goes out, so that the
+    watchdog of the other drive does not trip while one is set up.
+
+    Parameters
+    ----------
+    link : CanLink
+        The bus, open.
+    node_id : int
+        Which node.
+    """
+
+    def __init__(self, link: CanLink, node_id: int) -> None:
+        self._link = link
+        self._node_id = node_id
+
+    def read(self, entry: Entry) -> int:
+        """Return an entry's value.
+
+        Raises
+        ------
+        DriveRefusalError
+            If the drive does not have it.
+        DriveError
+            If the drive does not answer.
+        LinkError
+            If the link is lost.
+        """
+        try:
+            data = self._upload(entry)
+            narrower = entry.resized(len(data)) if len(data) < entry.size else None
+            return (narrower or entry).unpack(data)
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, ValueError) as error:
+            raise self._error("read", entry, error) from error
+
+    def write(self, entry: Entry, value: int, *, variable: bool = False) -> None:
+        """Write an entry; raises as `read`.
+
+        A drive in which it is wider or narrower than the standard has it gets it as wide as it has
+        it. A drive that refuses to be given what it has already has not refused, unless the entry
+        is `variable`: it will be given other values later.
+        """
+        try:
+            self._download(entry, entry.pack(value))
+        except canopen.SdoAbortedError as error:
+            if error.code in _OTHER_LENGTH and self._write_resized(entry, value):
+                return
+            if variable or not self._holds(entry, value):
+                raise self._error(f"write {value} to", entry, error) from error
+        except canopen.SdoCommunicationError as error:
+            raise self._error(f"write {value} to", entry, error) from error
+
+    def write_checked(
+        self,
+        entry: Entry,
+        value: int,
+        *,
+        at_least: int | None = None,
+        at_most: int | None = None,
+        variable: bool = False,
+    ) -> None:
+        """Write an entry that a safety rule depends on, and read it back; raises as `read`.
+
+        Parameters
+        ----------
+        entry : Entry
+            Where.
+        value : int
+            What it shall be.
+        at_least, at_most : int, optional
+            What a drive that rounds may make of it; otherwise nothing else.
+        variable : bool
+            As `write` has it.
+
+        Raises
+        ------
+        DriveError
+            Also if the drive has something else then.
+        """
+        self.write(entry, value, variable=variable)
+        got = self.read(entry)
+        lower = value if at_least is None else at_least
+        upper = value if at_most is None else at_most
+        if not lower <= got <= upper:
+            raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
+
+    def offer(self, entry: Entry, value: int) -> None:
+        """Write an entry that is good to have; a drive that refuses goes without."""
+        with contextlib.suppress(DriveRefusalError):
+            self.write(entry, value)
+
+    def has(self, entry: Entry) -> bool:
+        """Return whether the drive has an entry; raises as `read`."""
+        try:
+            self.read(entry)
+        except DriveRefusalError as error:
+            if error.lacking:
+                return False
+            raise
+        return True
+
+    def _upload(self, entry: Entry) -> bytes:
+        self._link.beat()
+        return self._link.sdo(self._node_id).upload(entry.index, entry.subindex)
+
+    def _download(self, entry: Entry, data: bytes) -> None:
+        self._link.beat()
+        self._link.sdo(self._node_id).download(entry.index, entry.subindex, data)
+
+    def _write_resized(self, entry: Entry, value: int) -> bool:
+        try:
+            resized = entry.resized(len(self._upload(entry)))
+            if resized is None:
+                return False
+            self._download(resized, resized.pack(value))
+        except (canopen.SdoAbortedError, canopen.SdoCommunicationError):
+            return False
+        return True
+
+    def _holds(self, entry: Entry, value: int) -> bool:
+        try:
+            return self.read(entry) == value
+        except DriveError:
+            return False
+
+    def _error(self, what: str, entry: Entry, error: Exception) -> DriveError:
+        if isinstance(error, canopen.SdoAbortedError):
+            return DriveRefusalError(
+                f"node {self._node_id} refuses to {what} {entry}: {error}", error.code
+            )
+        if isinstance(error, ValueError):
+            return DriveError(f"node {self._node_id} sends {error}")
+        why = (
+            "; the adapter refuses what it is told: bitrate, wiring?" if self._link.refused else ""
+        )
+        return DriveError(f"node {self._node_id} does not answer ({what} {entry}){why}")

@@ -1,0 +1,214 @@
+"""The parameters of device_driver."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_device_driver.cia402.drive_settings import DriveSettings
+from needle_device_driver.link.can_link import LINKS, LinkSettings
+from needle_device_driver.ros.limit_parameters import limit_parameter, limits_of
+from needle_device_driver.supervisor.limits import SafetyLimits
+
+# Beyond the supervisor's own limits, a drive's limits leave room for its following error.
+_LIMIT_MARGIN = 2.0
+# The longest that drives whose motors turn by themselves may go unheard [s].
+LONGEST_WATCHDOG = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class _RigParameters:
+    link: str = fixed_parameter(
+        "slcan",
+        "-",
+        "slcan: serial adapter or pseudo-terminal; socketcan: Linux CAN interface; socketcand: one "
+        "over TCP; virtual: inside one process.",
+        choices=LINKS,
+    )
+    channel: str = fixed_parameter(
+        "/dev/ttyACM0", "-", "Device file (slcan) or name of the interface."
+    )
+    bitrate: int = fixed_parameter(
+        500_000, "bit/s", "Of the CAN bus; slcan only.", 10_000, 1_000_000
+    )
+    tty_baudrate: int = fixed_parameter(
+        115_200, "bit/s", "Of the serial port; slcan only, USB adapters ignore it.", 9600, 4_000_000
+    )
+    host: str = fixed_parameter("localhost", "-", "Where socketcand runs.")
+    port: int = fixed_parameter(29536, "-", "Where socketcand listens.", 1, 65535)
+    autostart: bool = fixed_parameter(
+        True, "-", "Configure and activate at start; false: a lifecycle manager does."
+    )
+    connect_timeout: float = fixed_parameter(
+        10.0, "s", "Autostart: how long adapter and drives may take to be there.", 0.0, 3600.0
+    )
+    lock_step: bool = fixed_parameter(
+        False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
+    )
+    wait_for_recorder: bool = fixed_parameter(
+        False,
+        "-",
+        "Refuse services until a node named recorder listens to everything, and all partners know "
+        "this node.",
+    )
+    watchdog: float = fixed_parameter(
+        0.1,
+        "s",
+        "A drive stops without the computer's heartbeat for so long; over 0.5 s in lock step only.",
+        0.05,
+        10.0,
+    )
+    reply_age_limit: float = fixed_parameter(
+        SafetyLimits.reply_age_limit,
+        "s",
+        "A drive silent for longer has failed; over 0.5 s in lock step only.",
+        0.05,
+        10.0,
+    )
+    hold_timeout: float = limit_parameter("hold_timeout")
+    tip_age_limit: float = limit_parameter("tip_age_limit")
+    max_depth: float = limit_parameter("max_depth")
+    max_step_length: float = limit_parameter("max_step_length")
+    max_speed: float = limit_parameter("max_speed")
+    max_rotation_step: float = limit_parameter("max_rotation_step")
+    max_rotation_rate: float = limit_parameter("max_rotation_rate")
+    max_turns: float = limit_parameter("max_turns")
+    retraction_speed: float = limit_parameter("retraction_speed")
+    homing_speed: float = limit_parameter("homing_speed")
+    homing_rotation_rate: float = limit_parameter("homing_rotation_rate")
+    settling_time: float = limit_parameter("settling_time")
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be.
+
+        Raises
+        ------
+        UserError
+            A parameter out of bounds, two drives with one node id, or a link that is none.
+        """
+        check_fields(self)
+        if self.drive("insertion").node_id == self.drive("rotation").node_id:
+            raise UserError("insertion_node_id and rotation_node_id are the same")
+        if not self.drive("rotation").actuated:
+            raise UserError("rotation_actuated = False: nobody would turn the needle")
+        for name in ("watchdog", "reply_age_limit"):
+            value = getattr(self, name)
+            # In lock step motors stand still while nobody sends SYNC; real ones do not.
+            if value > LONGEST_WATCHDOG and not self.lock_step:
+                raise OutOfBoundsError(name, value, 0.05, LONGEST_WATCHDOG, "s")
+        _ = self.link_settings, self.limits
+
+    @property
+    def link_settings(self) -> LinkSettings:
+        """The CAN link."""
+        return LinkSettings(
+            kind=self.link,
+            channel=self.channel,
+            bitrate=self.bitrate,
+            tty_baudrate=self.tty_baudrate,
+            host=self.host,
+            port=self.port,
+            # Before a drive would count as silent, its link has a name.
+            write_timeout=self.reply_age_limit / 2.0,
+        )
+
+    @property
+    def limits(self) -> SafetyLimits:
+        """The motion supervisor's limits."""
+        return limits_of(self)
+
+    def drive(self, axis: str) -> DriveSettings:
+        """Return the settings of the `insertion` or `rotation` drive."""
+        limits = self.limits
+        names = {field.name for field in dataclasses.fields(DriveSettings)}
+        own = {name: getattr(self, f"{axis}_{name}", None) for name in names}
+        values = {name: value for name, value in own.items() if value is not None}
+        margin = _LIMIT_MARGIN * values["following_error"]
+        if axis == "insertion":
+            values |= {"speed": limits.max_speed, "lower": -margin}
+            values["upper"] = limits.max_depth + margin
+        else:
+            values |= {"speed": limits.max_rotation_rate}
+            values |= {
+                "lower": -limits.max_rotation - margin,
+                "upper": limits.max_rotation + margin,
+            }
+        return DriveSettings(**values)
+
+
+def _axis(
+    axis: str,
+    unit: str,
+    *,
+    node_id: int,
+    counts_per_unit: float,
+    acceleration: float,
+    quick_stop: float,
+    homing_method: int,
+    following_error: float,
+    tolerance: float,
+) -> list[tuple[str, type, Any]]:
+    ramp = f"{unit}/s^2"
+    fields = {
+        "node_id": fixed_parameter(node_id, "-", "CANopen node id of the drive.", 1, 126),
+        "counts_per_unit": fixed_parameter(
+            counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
+        ),
+        "reverse": fixed_parameter(False, "-", "Whether the drive counts the other way."),
+        "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
+        "quick_stop_deceleration": fixed_parameter(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),
+        "homing_method": fixed_parameter(
+            homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 where it stands.", 1, 37
+        ),
+        "following_error": fixed_parameter(
+            following_error, unit, "Largest distance from the set-point.", 1e-6, 10.0
+        ),
+        "following_error_time": fixed_parameter(
+            0.05, "s", "How long the drive itself lets that be exceeded.", 0.001, 10.0
+        ),
+        "max_torque": fixed_parameter(
+            0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0
+        ),
+        "tolerance": fixed_parameter(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
+        "actuated": fixed_parameter(
+            True, "-", "False: a hand moves the axis, its drive only says where it is."
+        ),
+    }
+    return [(f"{axis}_{name}", type(f.default), f) for name, f in fields.items()]
+
+
+DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
+    "DeviceDriverParameters",
+    [
+        # A lead screw of 1 mm, 20000 counts a turn.
+        *_axis(
+            "insertion",
+            "m",
+            node_id=1,
+            counts_per_unit=20_000_000.0,
+            acceleration=0.05,
+            quick_stop=0.5,
+            homing_method=17,
+            following_error=SafetyLimits.insertion_following_error,
+            tolerance=5e-6,
+        ),
+        # An encoder of 16384 lines, four counts a line, on the needle's own shaft.
+        *_axis(
+            "rotation",
+            "rad",
+            node_id=2,
+            counts_per_unit=65536.0 / (2.0 * math.pi),
+            acceleration=20.0,
+            quick_stop=100.0,
+            homing_method=37,
+            following_error=SafetyLimits.rotation_following_error,
+            tolerance=1e-3,
+        ),
+    ],
+    bases=(_RigParameters,),
+    frozen=True,
+)
+DeviceDriverParameters.__doc__ = "Parameters of device_driver, fixed at start."

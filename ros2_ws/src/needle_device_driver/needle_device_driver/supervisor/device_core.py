@@ -1,0 +1,278 @@
+"""The device's state, its axes and what moves them: every way from one state to another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from needle_device_driver.axes.axis import Axis, AxisError
+from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.motion_run import MotionRun
+from needle_device_driver.supervisor.reports import SUCCEEDED, Event, Notice, StepResult
+from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
+from needle_device_driver.supervisor.watch import axes_problem
+from needle_device_driver.supervisor.way_out import WayOut
+
+_WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
+
+
+class DeviceCore:
+    """Carries out what the motion supervisor has allowed, and stops what must not go on.
+
+    Parameters
+    ----------
+    axes : AxisPair
+        The two axes.
+    limits : SafetyLimits
+        The bounds of the rules.
+    feedback_delay : int
+        How many cycles after its order a set-point shows in the axes' snapshots.
+    on_stop : callable
+        Called whenever a fault or emergency stop ends everything.
+
+    Attributes
+    ----------
+    state, activity : State, Activity
+        What the device may do, and what moves.
+    configured : bool
+        Whether the axes are set up.
+    fault, reason : str
+        Why the state is FAULT or ESTOPPED; why the device last stopped, refused or waits.
+    watchdog_trips : int
+        How often a hold, tip or reply was too old.
+    snapshot : PairSnapshot or None
+        The axes' newest replies.
+    step_stamp_ns : int or None
+        Stamp of the step under way [ns].
+    """
+
+    def __init__(
+        self,
+        axes: AxisPair,
+        limits: SafetyLimits,
+        *,
+        feedback_delay: int,
+        on_stop: Callable[[], None],
+    ) -> None:
+        self._axes = axes
+        self._limits = limits
+        self._feedback_delay = feedback_delay
+        self._on_stop = on_stop
+        self._way_out = WayOut(limits.max_depth)
+        self._run: MotionRun | None = None
+        self._homing_time = 0.0
+        self._seen_powered = False
+        self._events: list[Event] = []
+        self.state = State.UNCONFIGURED
+        self.activity = Activity.NONE
+        self.configured = False
+        self.fault = ""
+        self.reason = ""
+        self.watchdog_trips = 0
+        self.snapshot: PairSnapshot | None = None
+        self.step_stamp_ns: int | None = None
+
+    # ---- what is told -------------------------------------------------------------------------
+
+    @property
+    def moves_with_hold(self) -> bool:
+        """Whether something is under way that the hold lets go on."""
+        return self.activity in (Activity.STEP, Activity.RETRACTION)
+
+    @property
+    def way_out(self) -> float:
+        """How far the needle may be drawn out at most [m]; none without a snapshot."""
+        if self.snapshot is None:
+            return 0.0
+        insertion = self.snapshot.insertion
+        return insertion.position - self._way_out.target(insertion)
+
+    def notice(self, text: str, rule: Rule | None = None) -> None:
+        """Tell a person something once."""
+        self._events.append(Notice(text, rule))
+
+    def answer(self, stamp_ns: int, outcome: str) -> None:
+        """Tell the end of a command."""
+        self._events.append(StepResult(stamp_ns, outcome))
+
+    def take_events(self) -> tuple[Event, ...]:
+        """Return what happened since the last call."""
+        events = tuple(self._events)
+        self._events.clear()
+        return events
+
+    # ---- orders to both axes ------------------------------------------------------------------
+
+    def order(self, order: Callable[[Axis], None]) -> str:
+        """Give both axes an order; a refusal is a fault, and its text is returned."""
+        try:
+            self._axes.each(order)
+        except AxisError as error:
+            self.fail(str(error), error.rule)
+            return str(error)
+        return ""
+
+    def power_on(self) -> str:
+        """Switch both axes on, where they stand; return what went wrong."""
+        self._seen_powered = False
+        return self.order(lambda axis: axis.power(True))
+
+    def power_off(self) -> str:
+        """Switch both axes off; return what went wrong."""
+        return self.order(lambda axis: axis.power(False))
+
+    # ---- ways from state to state -------------------------------------------------------------
+
+    def go(self, trigger: Trigger, reason: str) -> None:
+        """Change the state."""
+        self.state = next_state(self.state, trigger)
+        self.reason = reason
+
+    def start(self, activity: Activity, end: tuple[float, float], duration: float) -> None:
+        """Begin a step or retraction from where the axes are; `duration` at full speed [s]."""
+        assert self.snapshot is not None
+        self.activity = activity
+        self._run = MotionRun(
+            activity,
+            end,
+            duration,
+            self.snapshot,
+            self._limits,
+            feedback_delay=self._feedback_delay,
+            pushed=not self._axes.insertion.actuated,
+        )
+        self.go(Trigger.MOTION_START, "")
+        if not self.snapshot.ready:
+            # After a stop, an axis is made ready by the order to move, never by itself.
+            self.order(lambda axis: axis.power(True))
+
+    def start_homing(self) -> str:
+        """Begin to look for both home switches; return what went wrong."""
+        error = self.power_on()
+        if error:
+            return error
+        try:
+            self._axes.insertion.home(self._limits.homing_speed)
+            self._axes.rotation.home(self._limits.homing_rotation_rate)
+        except AxisError as refusal:
+            self.fail(str(refusal), refusal.rule)
+            return str(refusal)
+        self._homing_time = 0.0
+        self.activity = Activity.HOMING
+        self.go(Trigger.HOMING_START, "homing")
+        return ""
+
+    def end_motion(self, outcome: str, *, stop: bool) -> None:
+        """End what is under way, whatever it is; a step's outcome is told."""
+        if stop:
+            try:
+                self._axes.each(lambda axis: axis.stop())
+            except AxisError as error:
+                self.notice(str(error), error.rule)
+        if self.activity is Activity.STEP and self.step_stamp_ns is not None:
+            self.answer(self.step_stamp_ns, outcome)
+        self.activity = Activity.NONE
+        self._run = self.step_stamp_ns = None
+
+    def abort(self, reason: str) -> None:
+        """Stop what is under way."""
+        homing = self.activity is Activity.HOMING
+        self.end_motion(f"aborted: {reason}", stop=True)
+        self.go(Trigger.HOMING_END if homing else Trigger.MOTION_END, reason)
+        if homing:
+            self.power_off()
+
+    def fail(self, reason: str, rule: Rule | None = None) -> None:
+        """Stop both axes for a fault; it takes a reset to go on."""
+        if self.state not in (State.FAULT, State.ESTOPPED):
+            self._stop_for_good(Trigger.FAIL, reason, rule)
+
+    def emergency_stop(self) -> None:
+        """Stop both axes, whatever the state."""
+        if self.state is not State.ESTOPPED:
+            self._stop_for_good(Trigger.ESTOP, "emergency stop", Rule.ESTOP_LATCHES)
+
+    def _stop_for_good(self, trigger: Trigger, reason: str, rule: Rule | None) -> None:
+        self._on_stop()
+        self.fault = reason
+        self.end_motion(f"aborted: {reason}", stop=True)
+        self.go(trigger, reason)
+        self._events.append(Notice(reason, rule, fault=True))
+        try:
+            # A drive that keeps its power pulls a blocked axis on as soon as it comes free.
+            self._axes.each(lambda axis: axis.power(False))
+        except AxisError as error:
+            self.notice(str(error), error.rule)
+
+    # ---- the cycle ----------------------------------------------------------------------------
+
+    def drive_homing(self, period: float) -> None:
+        """Let `period` [s] of a homing go by."""
+        self._homing_time += period
+        longest = self._limits.max_homing_time
+        if self._homing_time > longest:
+            self.fail(f"no home switch within {longest:.0f} s", Rule.HOMING_TIME)
+
+    def drive(self, period: float, speed_scale: float, now: float) -> None:
+        """Order the set-points of the next `period` [s] of what is under way."""
+        if self._run is None:
+            return
+        at = self.poll(now)
+        if not at.answered:
+            # Nothing is sent on that may have lost its way: silence stops, then is a fault.
+            return
+        problem = self._run.problem(at)
+        if problem is not None:
+            self.fail(problem[1], problem[0])
+            return
+        set_point = self._run.advance(at, period, speed_scale)
+        if set_point is None:
+            return
+        try:
+            if self._axes.insertion.actuated:
+                self._axes.insertion.start_move(set_point.insertion, set_point.insertion_speed)
+            if self.activity is Activity.STEP:
+                self._axes.rotation.start_move(set_point.rotation, set_point.rotation_speed)
+        except AxisError as error:
+            self.fail(str(error), error.rule)
+
+    def poll(self, now: float) -> PairSnapshot:
+        """Read the axes."""
+        self.snapshot = self._axes.poll(now)
+        self._way_out.note(self.snapshot.insertion)
+        return self.snapshot
+
+    def watch_axes(self, now: float) -> None:
+        """Read the axes and stop both for what is wrong with one."""
+        at = self.poll(now)
+        if self.state not in _WATCHED:
+            return
+        on = self.state is not State.DISABLED
+        problem = axes_problem(
+            at,
+            now,
+            self._limits,
+            # Drives take a while to switch on: only a loss counts.
+            powered_wanted=on and self._seen_powered,
+            homed_wanted=self.activity is Activity.STEP,
+        )
+        self._seen_powered = on and (self._seen_powered or at.powered)
+        if problem is not None:
+            self.watchdog_trips += problem[0] is Rule.REPLY_AGE
+            self.fail(problem[1], problem[0])
+
+    def end_what_has_ended(self) -> None:
+        """End a homing, step or retraction that has arrived."""
+        at = self.snapshot
+        if at is None:
+            return
+        if self.activity is Activity.HOMING:
+            if at.homed and not (at.insertion.moving or at.rotation.moving):
+                self.end_motion("", stop=False)
+                self.go(Trigger.HOMING_END, "homed")
+                self.power_off()
+        elif self._run is not None and self._run.arrived(at):
+            # At the switch a retraction may have a target still.
+            self.end_motion(SUCCEEDED, stop=self.activity is Activity.RETRACTION)
+            self.go(Trigger.MOTION_END, "")

@@ -1,0 +1,139 @@
+"""A step or retraction under way: its set-points, what is wrong with it, when it has ended."""
+
+from __future__ import annotations
+
+from collections import deque
+
+from needle_device_driver.axes.axis_pair import PairSnapshot
+from needle_device_driver.axes.motion import CoordinatedMotion, SetPoint
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.states import Activity
+
+Problem = tuple[Rule, str]
+
+INNER_SWITCH = "the insertion axis is at its inner limit switch"
+
+
+class MotionRun:
+    """Leads both axes along one straight way.
+
+    Parameters
+    ----------
+    activity : Activity
+        STEP or RETRACTION; a retraction leaves the rotation axis alone.
+    end : tuple of float
+        Target of insertion [m] and rotation [rad].
+    duration : float
+        Time at full speed [s].
+    at : PairSnapshot
+        Where the axes are.
+    limits : SafetyLimits
+        The bounds.
+    feedback_delay : int
+        How many cycles after its order a set-point shows in a snapshot.
+    pushed : bool
+        Whether a hand moves the insertion axis: then rotation follows the measured insertion.
+    """
+
+    def __init__(
+        self,
+        activity: Activity,
+        end: tuple[float, float],
+        duration: float,
+        at: PairSnapshot,
+        limits: SafetyLimits,
+        *,
+        feedback_delay: int,
+        pushed: bool,
+    ) -> None:
+        self.activity = activity
+        self._end = end
+        self._duration = duration
+        self._limits = limits
+        self._pushed = pushed
+        self._motion = self._begin(at)
+        self._due: deque[SetPoint] = deque(maxlen=feedback_delay + 1)
+        self._settling = 0.0
+
+    def advance(self, at: PairSnapshot, period: float, speed_scale: float) -> SetPoint | None:
+        """Return the set-point of the next `period` [s]; None while the axes come to rest."""
+        if not at.ready:
+            return None
+        if not self._due:
+            # The axes may have come to rest elsewhere since the order.
+            self._motion = self._begin(at)
+        if self._pushed:
+            set_point = self._motion.follow(
+                at.insertion.position, self._limits.max_rotation_rate, period
+            )
+        else:
+            set_point = self._motion.advance(period, speed_scale)
+        if self._motion.complete:
+            self._settling += period
+        self._due.append(set_point)
+        return set_point
+
+    def problem(self, at: PairSnapshot) -> Problem | None:
+        """Return the rule that the motion breaks, and how."""
+        limits = self._limits
+        if self.activity is Activity.STEP and at.insertion.at_inner_switch:
+            return Rule.INNER_LIMIT_SWITCH, INNER_SWITCH
+        if self._settling > limits.settling_time:
+            return (
+                Rule.SETTLING_TIME,
+                f"the axes are not at their target {limits.settling_time:g} s after the last "
+                f"set-point: {self._off(at)}",
+            )
+        if len(self._due) < (self._due.maxlen or 1):
+            return None
+        due = self._due[0]
+        insertion = abs(due.insertion - at.insertion.position)
+        if not self._pushed and insertion > limits.insertion_following_error:
+            return (
+                Rule.FOLLOWING_ERROR,
+                f"the insertion axis is {insertion * 1e3:.3f} mm off its set-point, "
+                f"limit {limits.insertion_following_error * 1e3:g} mm",
+            )
+        rotation = abs(due.rotation - at.rotation.position)
+        if self.activity is Activity.STEP and rotation > limits.rotation_following_error:
+            return (
+                Rule.FOLLOWING_ERROR,
+                f"the rotation axis is {rotation:.3f} rad off its set-point, "
+                f"limit {limits.rotation_following_error:g} rad",
+            )
+        return None
+
+    def arrived(self, at: PairSnapshot) -> bool:
+        """Return whether the motion has ended; a retraction also ends at the home switch."""
+        if self.activity is Activity.RETRACTION and at.insertion.at_home_switch:
+            return True
+        insertion, rotation = self._end
+        return (
+            self._motion.complete
+            and (
+                self._pushed
+                or abs(insertion - at.insertion.position) <= self._limits.insertion_tolerance
+            )
+            and (
+                self.activity is Activity.RETRACTION
+                or abs(rotation - at.rotation.position) <= self._limits.rotation_tolerance
+            )
+        )
+
+    def _begin(self, at: PairSnapshot) -> CoordinatedMotion:
+        # From the last set-point: a motor rests beside it, and counted from there the first
+        # set-point could be too far ahead.
+        start = at.insertion.set_point, at.rotation.set_point
+        limits, retracts = self._limits, self.activity is Activity.RETRACTION
+        shortest = max(
+            abs(self._end[0] - start[0])
+            / (limits.retraction_speed if retracts else limits.max_speed),
+            0.0 if retracts else abs(self._end[1] - start[1]) / limits.max_rotation_rate,
+        )
+        return CoordinatedMotion(start, self._end, max(self._duration, shortest))
+
+    def _off(self, at: PairSnapshot) -> str:
+        insertion = abs(self._end[0] - at.insertion.position)
+        rotation = abs(self._end[1] - at.rotation.position)
+        return f"insertion {insertion * 1e3:.4f} mm, rotation {rotation:.5f} rad off"

@@ -1,0 +1,129 @@
+"""What the motion supervisor has to say: answers, results, status."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TypeAlias
+
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.states import Activity, State
+
+SUCCEEDED = "succeeded"
+
+
+@dataclasses.dataclass(frozen=True)
+class StepResult:
+    """The end of a step, or of a command that never became one.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        The command's stamp [ns].
+    outcome : str
+        `succeeded` or `aborted: why`.
+    """
+
+    stamp_ns: int
+    outcome: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Notice:
+    """Something a person should read once in the log.
+
+    Attributes
+    ----------
+    text : str
+        One sentence with value, unit and bound.
+    rule : Rule or None
+        The safety rule behind it.
+    fault : bool
+        Whether it led to FAULT or ESTOPPED.
+    """
+
+    text: str
+    rule: Rule | None = None
+    fault: bool = False
+
+    def __str__(self) -> str:
+        """Return the sentence with the rule's name."""
+        return self.text if self.rule is None else f"{self.text} [{self.rule.value}]"
+
+
+Event: TypeAlias = StepResult | Notice
+
+
+@dataclasses.dataclass(frozen=True)
+class Reply:
+    """The answer to a service.
+
+    Attributes
+    ----------
+    success : bool
+        Whether it was done or begun.
+    message : str
+        Why not, or what.
+    """
+
+    success: bool
+    message: str
+
+
+@dataclasses.dataclass(frozen=True)
+class DeviceStatus:
+    """What device/status tells.
+
+    Attributes
+    ----------
+    state : State
+        What the device may do.
+    activity : Activity
+        What moves.
+    homed : bool
+        Whether both axes are homed.
+    hold_owner : str
+        Whose hold counts; empty: nobody's.
+    speed_scale : float
+        The owner's share of the nominal speed.
+    insertion, rotation : float or None
+        Where the joints are [m], [rad]; None where that is not known.
+    fault : str
+        Why the state is FAULT or ESTOPPED; else empty.
+    reason : str
+        Why the device last stopped, refused or waits.
+    needle_out_confirmed : bool
+        Whether a person said that the needle is out.
+    watchdog_trips : int
+        How often a hold, tip or reply was too old; a lapse that only pauses is none.
+    commands_refused : int
+        How many commands were refused.
+    needs_time : bool
+        Whether something goes on when time does: a simulated clock may stand still otherwise.
+    simulated : bool or None
+        Whether no real needle can move; None while that is not known.
+    """
+
+    state: State
+    activity: Activity
+    homed: bool
+    hold_owner: str
+    speed_scale: float
+    insertion: float | None
+    rotation: float | None
+    fault: str
+    reason: str
+    needle_out_confirmed: bool
+    watchdog_trips: int
+    commands_refused: int
+    needs_time: bool
+    simulated: bool | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class JointSample:
+    """Measured joints: insertion [m], rotation [rad] and their velocities."""
+
+    insertion: float
+    rotation: float
+    insertion_velocity: float
+    rotation_velocity: float

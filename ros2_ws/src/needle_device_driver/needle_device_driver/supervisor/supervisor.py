@@ -1,0 +1,426 @@
+"""Who may move the needle, when, where to and how fast: every safety rule of the rig, once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from needle_common.foreign_text import plain
+from needle_device_driver.axes.axis import Axis, AxisError
+from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
+from needle_device_driver.supervisor.command_stamps import CommandStamps
+from needle_device_driver.supervisor.device_core import DeviceCore
+from needle_device_driver.supervisor.hold import Hold, HoldMessage, HoldRefusals
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.motion_run import INNER_SWITCH
+from needle_device_driver.supervisor.reports import DeviceStatus, Event, JointSample, Reply
+from needle_device_driver.supervisor.states import Activity, State, Trigger
+from needle_device_driver.supervisor.watch import axes_problem
+
+_SWITCHING = "waiting for the axes to switch off"
+
+
+class MotionSupervisor:
+    """The only way to the axes. `now` is everywhere the steady clock [s].
+
+    A cycle is `drive(period, now)`, which orders the next set-points, and `observe(now)`, which
+    reads the axes, watches over them and ends what has ended. `take_events` has what there is to
+    tell.
+
+    Parameters
+    ----------
+    insertion, rotation : Axis
+        The two axes.
+    limits : SafetyLimits
+        The bounds of the rules.
+    pause_on_lapse : bool
+        A hold that falls silent pauses instead of aborting: only for a simulation in lock step,
+        where the axes' own time stands still meanwhile. A release always aborts.
+    feedback_delay : int
+        How many cycles after its order a set-point shows in the axes' snapshots.
+    switching : callable, optional
+        Returns whether an axis is on its way to where it was ordered, apart from set-points.
+    """
+
+    def __init__(
+        self,
+        insertion: Axis,
+        rotation: Axis,
+        limits: SafetyLimits,
+        *,
+        pause_on_lapse: bool = False,
+        feedback_delay: int = 0,
+        switching: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._switching = switching
+        self._axes = AxisPair(insertion, rotation)
+        self._limits = limits
+        self._pause_on_lapse = pause_on_lapse
+        self._hold = Hold(limits.hold_timeout)
+        self._hold_refusals = HoldRefusals()
+        self._stamps = CommandStamps(2.0 * limits.tip_age_limit)
+        self._estop_pressed = False
+        self._needle_out = False
+        self._others = ""
+        self._commands_refused = 0
+        self._core = DeviceCore(
+            self._axes,
+            limits,
+            feedback_delay=feedback_delay,
+            on_stop=self._hold.require_new_press,
+        )
+
+    # ---- what is told -------------------------------------------------------------------------
+
+    @property
+    def state(self) -> State:
+        """What the device may do."""
+        return self._core.state
+
+    @property
+    def activity(self) -> Activity:
+        """What moves."""
+        return self._core.activity
+
+    def take_events(self) -> tuple[Event, ...]:
+        """Return what happened since the last call."""
+        return self._core.take_events()
+
+    def joints(self, now: float) -> JointSample | None:
+        """Return the measured joints; None when there is no reply within the age limit."""
+        snapshot = self._core.snapshot
+        if snapshot is None or snapshot.age(now) > self._limits.reply_age_limit:
+            return None
+        return JointSample(
+            snapshot.insertion.position,
+            snapshot.rotation.position,
+            snapshot.insertion.velocity,
+            snapshot.rotation.velocity,
+        )
+
+    def may_move(self, now: float) -> bool:
+        """Return whether what is under way would go on if `drive` were called now."""
+        if self._core.activity is Activity.HOMING:
+            return True
+        return (
+            self._core.activity is not Activity.NONE
+            and self._hold.is_fresh(now)
+            and self._hold.speed_scale > 0.0
+        )
+
+    def status(self, now: float) -> DeviceStatus:
+        """Return the device's status."""
+        joints = self.joints(now)
+        return DeviceStatus(
+            state=self._core.state,
+            activity=self._core.activity,
+            homed=self._core.snapshot is not None and self._core.snapshot.homed,
+            hold_owner=plain(self._hold.owner or ""),
+            speed_scale=self._hold.speed_scale,
+            insertion=None if joints is None else joints.insertion,
+            rotation=None if joints is None else joints.rotation,
+            fault=self._core.fault,
+            reason=self._core.reason,
+            needle_out_confirmed=self._needle_out,
+            watchdog_trips=self._core.watchdog_trips,
+            commands_refused=self._commands_refused,
+            needs_time=self.may_move(now) or self._switching(),
+        )
+
+    # ---- what comes from outside --------------------------------------------------------------
+
+    def configure(self, now: float) -> Reply:
+        """Set the axes up; moves nothing."""
+        if self._core.state is not State.UNCONFIGURED:
+            return Reply(False, f"the device is {self._core.state.value}, not UNCONFIGURED")
+        error = self._core.order(lambda axis: axis.configure())
+        if error:
+            # The other axis may be set up, and would wait for a computer that says no more.
+            self._core.order(lambda axis: axis.close())
+            return Reply(False, error)
+        self._core.configured = True
+        self._core.go(Trigger.CONFIGURE, "configured")
+        self.observe(now)
+        return Reply(True, "configured")
+
+    def close(self) -> None:
+        """Stop whatever moves, switch the axes off and let go of them."""
+        if self._core.activity is not Activity.NONE:
+            self._core.end_motion("aborted: the device is shut down", stop=True)
+        self._axes.each(lambda axis: axis.close())
+
+    def deconfigure(self) -> Reply:
+        """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
+        if self._core.state in (State.HOLDING, State.MOVING):
+            self._disable()
+        if self._core.configured:
+            self._core.configured = False
+            self._core.order(lambda axis: axis.close())
+        if self._core.state is not State.DISABLED:
+            return Reply(False, f"the device is {self._core.state.value}")
+        self._core.snapshot = None
+        self._core.go(Trigger.DECONFIGURE, "deconfigured")
+        return Reply(True, "deconfigured")
+
+    def note_time(self, ros_ns: int, now: float) -> None:
+        """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
+        self._stamps.note(ros_ns, now)
+
+    def receive_hold(self, message: HoldMessage, now: float) -> None:
+        """Take a hold message that arrived now."""
+        # A silence that nobody watched is one all the same.
+        self._watch_hold(now)
+        counting = self._core.state in (State.HOLDING, State.MOVING)
+        rule = self._hold.receive(message, now, counting=counting)
+        text = self._hold_refusals.take(
+            message.sender, rule, known=self._hold.knows(message.sender)
+        )
+        if text and counting:
+            self._core.reason = text
+            self._core.notice(text, rule)
+        if self._core.moves_with_hold and self._hold.owner is None:
+            self._core.abort("hold released")
+
+    def receive_estop(self, pressed: bool) -> None:
+        """Take the state of the emergency stop; pressed latches."""
+        self._estop_pressed = pressed
+        if pressed:
+            self._core.emergency_stop()
+
+    def see_others(self, others: str) -> None:
+        """Take who else is a device on these topics; empty: nobody, as it must be."""
+        if others == self._others:
+            return
+        self._others = others
+        if others:
+            # Whoever said that a needle is out may have meant the other's.
+            self._needle_out = False
+            self._core.fail(others, Rule.ONE_DEVICE)
+
+    def fail(self, reason: str, rule: Rule | None = None) -> None:
+        """Stop both axes for a fault; it takes a reset to go on."""
+        self._core.fail(reason, rule)
+
+    def submit(self, command: Command, now: float, publishers: int = 1) -> None:
+        """Take a step command: it starts at once, or is refused whole; a result tells which.
+
+        Parameters
+        ----------
+        command : Command
+            As received, nothing checked.
+        now : float
+            Steady time [s].
+        publishers : int
+            How many publish commands at present.
+        """
+        self._watch_hold(now)
+        at = self._ready_for_step(now)
+        if isinstance(at, Refusal):
+            self._refuse(command, at)
+            return
+        context = CommandContext(
+            insertion=at.insertion.set_point,
+            rotation=at.rotation.set_point,
+            homed=at.homed,
+            not_new=self._stamps.why_not_new(command.stamp_ns),
+            tip_age=self._stamps.age(command.stamp_ns, now),
+            publishers=publishers,
+        )
+        step = check_command(command, context, self._limits)
+        if isinstance(step, Refusal):
+            self._refuse(command, step)
+            return
+        self._needle_out = False
+        self._stamps.use(command.stamp_ns)
+        self._core.step_stamp_ns = command.stamp_ns
+        self._core.start(Activity.STEP, (step.insertion, step.rotation), step.duration)
+
+    def count_watchdog_trip(self) -> None:
+        """Count a watchdog of the supervisor's owner among its own."""
+        self._core.watchdog_trips += 1
+
+    # ---- services -----------------------------------------------------------------------------
+
+    def enable(self, on: bool, now: float) -> Reply:
+        """Switch the axes on, where nothing moves, or off."""
+        if not on:
+            return self._disable()
+        if self._core.state is State.HOLDING:
+            return Reply(True, "already enabled")
+        if self._core.state is not State.DISABLED:
+            return self._not_in(State.DISABLED)
+        if self._switching():
+            return Reply(False, _SWITCHING)
+        error = self._core.power_on()
+        if error:
+            return Reply(False, error)
+        self._hold.require_new_press()
+        self._hold_refusals.clear()
+        self._core.go(Trigger.ENABLE, "enabled; hold to run")
+        self.observe(now)
+        return Reply(True, "enabled; nothing moves without hold")
+
+    def confirm_needle_out(self, confirmed: bool) -> Reply:
+        """Take a person's word that the needle is out of the tissue; a step ends its validity."""
+        if self._core.activity is not Activity.NONE:
+            return Reply(False, f"a {self._core.activity.value} is under way")
+        if confirmed and self._others:
+            return Reply(False, self._others)
+        self._needle_out = confirmed
+        return Reply(True, "needle out" if confirmed else "needle not out")
+
+    def home(self, now: float) -> Reply:
+        """Begin to look for both home switches; only with the needle out."""
+        if self._core.state is not State.DISABLED:
+            return self._not_in(State.DISABLED)
+        if not self._needle_out:
+            return Reply(False, "confirm first that the needle is out (confirm_needle_out)")
+        if self._switching():
+            return Reply(False, _SWITCHING)
+        error = self._core.start_homing()
+        if error:
+            return Reply(False, error)
+        self.observe(now)
+        return Reply(True, "homing" if self._core.activity is Activity.HOMING else "homed")
+
+    def retract(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
+        """Begin to draw the needle out: insertion axis only, slowly, while the hold lasts."""
+        self._watch_hold(now)
+        if self._core.state is not State.HOLDING:
+            return self._not_in(State.HOLDING)
+        if self._hold.owner is None:
+            return Reply(False, "press and keep the hold first")
+        at = self._core.poll(now)
+        if not at.powered:
+            return Reply(False, "the axes are not powered yet")
+        if not self._axes.insertion.actuated:
+            return Reply(False, "the insertion axis is moved by hand: draw the needle out by hand")
+        distance = self._core.way_out
+        if distance <= self._limits.insertion_tolerance or at.insertion.at_home_switch:
+            return Reply(True, "the needle is out")
+        end = (at.insertion.position - distance, at.rotation.position)
+        self._core.start(Activity.RETRACTION, end, distance / self._limits.retraction_speed)
+        if self._core.activity is not Activity.RETRACTION:
+            return Reply(False, self._core.fault)
+        return Reply(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
+
+    def stop(self) -> Reply:
+        """Stop whatever moves; it takes a new press to move again."""
+        self._hold.require_new_press()
+        if self._core.activity is Activity.NONE:
+            return Reply(True, "nothing moves")
+        activity = self._core.activity.value
+        self._core.abort("stopped on request")
+        return Reply(True, f"{activity} stopped")
+
+    def reset(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
+        """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
+        if self._core.state is State.MOVING:
+            return Reply(False, f"a {self._core.activity.value} is under way")
+        self._hold.readmit(now)
+        self._hold_refusals.clear()
+        self._stamps.readmit()
+        if self._core.state not in (State.FAULT, State.ESTOPPED):
+            return Reply(True, "nothing to reset")
+        if self._others:
+            return Reply(False, self._others)
+        if self._estop_pressed:
+            return Reply(False, "the emergency stop is still pressed")
+        if not self._hold.is_off(now):
+            return Reply(False, "release the hold first")
+        if not self._core.configured:
+            self._core.fault = ""
+            self._core.go(Trigger.RESET_UNCONFIGURED, "reset")
+            return Reply(True, "reset; the device is not configured")
+        try:
+            self._axes.each(lambda axis: axis.reset())
+            self._axes.each(lambda axis: axis.power(False))
+        except AxisError as error:
+            return Reply(False, str(error))
+        problem = axes_problem(
+            self._core.poll(now), now, self._limits, powered_wanted=False, homed_wanted=False
+        )
+        if problem is not None:
+            return Reply(False, problem[1])
+        self._core.fault = ""
+        self._core.go(Trigger.RESET, "reset; enable to go on")
+        return Reply(True, "reset; enable to go on")
+
+    # ---- the cycle ----------------------------------------------------------------------------
+
+    def drive(self, period: float, now: float) -> None:
+        """Order the set-points of the next `period` [s] of the axes' time, if anything may move."""
+        if self._core.activity is Activity.HOMING:
+            self._core.drive_homing(period)
+            return
+        self._watch_hold(now)
+        if self.may_move(now):
+            self._core.drive(period, self._hold.speed_scale, now)
+
+    def observe(self, now: float) -> None:
+        """Read the axes, watch over them and the hold, and end what has ended."""
+        if not self._core.configured:
+            return
+        self._core.watch_axes(now)
+        self._watch_hold(now)
+        self._core.end_what_has_ended()
+
+    def _watch_hold(self, now: float) -> None:
+        age = self._hold.age(now)
+        if not self._hold.lapses(now):
+            return
+        core = self._core
+        moving = core.moves_with_hold
+        text = f"no hold message for {age:.3f} s, limit {self._limits.hold_timeout:g} s"
+        core.notice(text, Rule.HOLD_AGE)
+        if self._pause_on_lapse:
+            # Simulated time waits too: the same motion goes on later.
+            core.reason = text + ": paused"
+            return
+        core.watchdog_trips += moving
+        self._hold.require_new_press()
+        core.reason = text + ": release and press again"
+        if moving:
+            core.abort(text)
+
+    # ---- answers ------------------------------------------------------------------------------
+
+    def _not_in(self, wanted: State) -> Reply:
+        return Reply(False, f"the device is {self._core.state.value}, not {wanted.value}")
+
+    def _disable(self) -> Reply:
+        self._hold.require_new_press()
+        if self._core.activity is not Activity.NONE:
+            self._core.abort("disabled on request")
+        if self._core.state is State.HOLDING:
+            self._core.go(Trigger.DISABLE, "disabled on request")
+        error = self._core.power_off() if self._core.configured else ""
+        return Reply(False, error) if error else Reply(True, "disabled")
+
+    def _ready_for_step(self, now: float) -> PairSnapshot | Refusal:
+        if self._core.state is not State.HOLDING:
+            return Refusal(
+                Rule.COMMAND_STATE,
+                f"the device is {self._core.state.value}, not {State.HOLDING.value}",
+            )
+        if self._hold.owner is None:
+            return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
+        # Not the last cycle's: a stop since then must be known.
+        at = self._core.poll(now)
+        if at.age(now) > self._limits.reply_age_limit:
+            return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
+        if not at.powered:
+            return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
+        if at.insertion.at_inner_switch:
+            return Refusal(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
+        return at
+
+    def _refuse(self, command: Command, refusal: Refusal) -> None:
+        self._commands_refused += 1
+        self._core.watchdog_trips += refusal.rule is Rule.TIP_AGE
+        self._core.reason = f"command refused: {refusal.reason}"
+        self._core.notice(self._core.reason, refusal.rule)
+        # The running step's own stamp would tell its sender that the step has ended.
+        if command.stamp_ns != self._core.step_stamp_ns:
+            self._core.answer(command.stamp_ns, f"aborted: {refusal.reason}")

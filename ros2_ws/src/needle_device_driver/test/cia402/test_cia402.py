@@ -1,0 +1,149 @@
+"""The drive's state machine: statuswords, transitions, the way to each goal."""
+
+from __future__ import annotations
+
+import itertools
+
+import pytest
+
+from needle_device_driver.cia402.cia402 import (
+    FAULTS,
+    TRANSITIONS,
+    DriveCommand,
+    DriveState,
+    Goal,
+    TransitionWatch,
+    drive_state,
+    next_command,
+)
+
+# CiA 402-2: bits 6, 5 and 3..0 of the statusword; x is any.
+PATTERNS = {
+    "x0xx 0000": "NOT_READY_TO_SWITCH_ON",
+    "x1xx 0000": "SWITCH_ON_DISABLED",
+    "x01x 0001": "READY_TO_SWITCH_ON",
+    "x01x 0011": "SWITCHED_ON",
+    "x01x 0111": "OPERATION_ENABLED",
+    "x00x 0111": "QUICK_STOP_ACTIVE",
+    "x0xx 1111": "FAULT_REACTION_ACTIVE",
+    "x0xx 1000": "FAULT",
+}
+# Every way that a controlword opens, by the standard's numbers.
+WAYS = {
+    2: "SWITCH_ON_DISABLED SHUTDOWN READY_TO_SWITCH_ON",
+    3: "READY_TO_SWITCH_ON SWITCH_ON SWITCHED_ON",
+    4: "SWITCHED_ON ENABLE_OPERATION OPERATION_ENABLED",
+    5: "OPERATION_ENABLED SWITCH_ON SWITCHED_ON",
+    6: "SWITCHED_ON SHUTDOWN READY_TO_SWITCH_ON",
+    7: "READY_TO_SWITCH_ON DISABLE_VOLTAGE SWITCH_ON_DISABLED",
+    -7: "READY_TO_SWITCH_ON QUICK_STOP SWITCH_ON_DISABLED",
+    8: "OPERATION_ENABLED SHUTDOWN READY_TO_SWITCH_ON",
+    9: "OPERATION_ENABLED DISABLE_VOLTAGE SWITCH_ON_DISABLED",
+    10: "SWITCHED_ON DISABLE_VOLTAGE SWITCH_ON_DISABLED",
+    -10: "SWITCHED_ON QUICK_STOP SWITCH_ON_DISABLED",
+    11: "OPERATION_ENABLED QUICK_STOP QUICK_STOP_ACTIVE",
+    12: "QUICK_STOP_ACTIVE DISABLE_VOLTAGE SWITCH_ON_DISABLED",
+    15: "FAULT FAULT_RESET SWITCH_ON_DISABLED",
+    16: "QUICK_STOP_ACTIVE ENABLE_OPERATION OPERATION_ENABLED",
+}
+# The bits of each command: 7 fault reset, 3 enable operation, 2 quick stop (low), 1 voltage, 0 on.
+CONTROLWORDS = {
+    "SHUTDOWN": "0xxx x110",
+    "SWITCH_ON": "0xxx 0111",
+    "DISABLE_VOLTAGE": "0xxx xx0x",
+    "QUICK_STOP": "0xxx x01x",
+    "ENABLE_OPERATION": "0xxx 1111",
+    "FAULT_RESET": "1xxx xxxx",
+}
+
+
+def fits(word: int, pattern: str) -> bool:
+    bits = pattern.replace(" ", "")
+    return all(bit in ("x", value) for bit, value in zip(bits, f"{word & 0xFF:08b}", strict=True))
+
+
+@pytest.mark.parametrize("word", range(256))
+def test_every_statusword_is_the_state_that_the_standard_says_or_none(word: int) -> None:
+    # The upper byte and bits 4 and 7 say nothing about the state.
+    wanted = [name for pattern, name in PATTERNS.items() if fits(word, pattern)]
+    found = drive_state(word | 0x1600)
+    assert [found.name] * len(wanted) == wanted if found else wanted == []
+
+
+@pytest.mark.parametrize("command", list(DriveCommand))
+def test_every_controlword_has_its_bits(command: DriveCommand) -> None:
+    assert fits(command, CONTROLWORDS[command.name])
+
+
+@pytest.mark.parametrize(("state", "command"), list(itertools.product(DriveState, DriveCommand)))
+def test_each_transition_leads_where_the_standard_says_or_nowhere(
+    state: DriveState, command: DriveCommand
+) -> None:
+    wanted = [w.split()[2] for w in WAYS.values() if w.split()[:2] == [state.name, command.name]]
+    found = TRANSITIONS.get((state, command))
+    assert ([found.name] if found else []) == wanted
+
+
+@pytest.mark.parametrize("state", [s for s in DriveState if s not in FAULTS])
+def test_the_way_to_every_goal_ends_there(state: DriveState) -> None:
+    if state is DriveState.NOT_READY_TO_SWITCH_ON:
+        # A drive leaves it by itself (transition 1).
+        assert next_command(Goal.ON, state, at_rest=True) is DriveCommand.DISABLE_VOLTAGE
+        return
+    ends = {
+        Goal.ON: {DriveState.OPERATION_ENABLED},
+        Goal.OFF: {DriveState.SWITCH_ON_DISABLED},
+        Goal.STOPPED: {DriveState.QUICK_STOP_ACTIVE, DriveState.SWITCH_ON_DISABLED},
+    }
+    for goal, wanted in ends.items():
+        at: DriveState = state
+        for _ in range(5):
+            at = TRANSITIONS.get((at, next_command(goal, at, at_rest=True)), at)
+        assert at in wanted, goal
+
+
+@pytest.mark.parametrize(("goal", "state"), list(itertools.product(Goal, DriveState)))
+def test_no_way_to_a_goal_acknowledges_a_fault(goal: Goal, state: DriveState) -> None:
+    assert next_command(goal, state, at_rest=True) is not DriveCommand.FAULT_RESET
+
+
+def test_a_moving_axis_is_never_left_to_coast() -> None:
+    for goal in (Goal.OFF, Goal.STOPPED):
+        for state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
+            assert next_command(goal, state, at_rest=False) is DriveCommand.QUICK_STOP
+    on = next_command(Goal.ON, DriveState.QUICK_STOP_ACTIVE, at_rest=False)
+    assert on is DriveCommand.QUICK_STOP
+
+
+def test_what_no_statusword_explains_disables() -> None:
+    assert next_command(Goal.ON, None, at_rest=True) is DriveCommand.DISABLE_VOLTAGE
+    assert next_command(Goal.STOPPED, None, at_rest=True) is DriveCommand.QUICK_STOP
+
+
+def test_the_watch_knows_commands_and_statuswords_that_cross() -> None:
+    watch = TransitionWatch()
+    for state, command in (
+        (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN),
+        (DriveState.SWITCH_ON_DISABLED, DriveCommand.SHUTDOWN),
+        (DriveState.READY_TO_SWITCH_ON, DriveCommand.SWITCH_ON),
+        (DriveState.SWITCHED_ON, DriveCommand.ENABLE_OPERATION),
+        (DriveState.SWITCHED_ON, DriveCommand.QUICK_STOP),
+        (DriveState.QUICK_STOP_ACTIVE, DriveCommand.DISABLE_VOLTAGE),
+        (DriveState.SWITCH_ON_DISABLED, DriveCommand.DISABLE_VOLTAGE),
+    ):
+        assert watch.unexplained(state) == ""
+        watch.sent(command)
+
+
+def test_the_watch_names_what_nobody_ordered_but_not_a_fault() -> None:
+    watch = TransitionWatch()
+    watch.unexplained(DriveState.OPERATION_ENABLED)
+    for _ in range(6):
+        watch.sent(DriveCommand.ENABLE_OPERATION)
+    assert "OPERATION_ENABLED to SWITCH_ON_DISABLED" in watch.unexplained(
+        DriveState.SWITCH_ON_DISABLED
+    )
+    assert watch.unexplained(DriveState.FAULT_REACTION_ACTIVE) == ""
+    assert watch.unexplained(DriveState.FAULT) == ""
+    watch.forget()
+    assert watch.unexplained(DriveState.OPERATION_ENABLED) == ""

@@ -1,0 +1,207 @@
+"""Who may let the needle move, named as in docs/safety.md."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.states import State
+
+from ..checks import in_state
+from ..ideal_axes import Bench
+
+
+def test_hold_to_run_release_stops_at_once_and_discards_the_step(bench: Bench) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(5, holding=True)
+    at = bench.positions
+    bench.hold(False)
+    assert bench.results[-1].outcome == "aborted: hold released"
+    bench.cycle(5)
+    bench.hold()
+    bench.cycle(5, holding=True)
+    assert bench.positions == at
+    assert in_state(bench, State.HOLDING)
+
+
+def test_hold_to_run_without_hold_a_command_is_refused(bench: Bench) -> None:
+    bench.ready(holding=False)
+    bench.command()
+    bench.cycle(3)
+    assert bench.last_rule is Rule.HOLD_TO_RUN
+    assert bench.positions == (0.0, 0.0)
+
+
+def test_hold_age_silence_aborts_within_the_timeout_and_takes_a_new_press(bench: Bench) -> None:
+    bench.ready()
+    bench.command(0.002, 0.1, duration=2.0)
+    started = bench.now
+    while in_state(bench, State.MOVING):
+        bench.cycle()
+    assert bench.now - started <= bench.limits.hold_timeout + 2 * bench.period
+    assert "no hold message" in bench.results[-1].outcome
+    assert bench.status.watchdog_trips == 1
+    bench.hold()
+    assert bench.status.hold_owner == ""
+    bench.hold(False)
+    bench.hold()
+    assert bench.status.hold_owner == "a"
+
+
+def test_hold_age_a_message_counts_for_a_quarter_of_a_second(bench: Bench) -> None:
+    bench.ready()
+    bench.command(0.002, 0.1, duration=2.0)
+    arrival = bench.now
+    assert bench.supervisor.may_move(arrival + 0.249)
+    assert not bench.supervisor.may_move(arrival + 0.251)
+    bench.supervisor.drive(bench.period, arrival + 0.251)
+    assert in_state(bench, State.HOLDING)
+    assert bench.last_rule is Rule.HOLD_AGE
+
+
+def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same(bench: Bench) -> None:
+    bench.ready()
+    bench.command(0.002, 0.1, duration=2.0)
+    bench.now += 0.3
+    bench.hold()
+    assert "no hold message" in bench.results[-1].outcome
+
+
+def test_hold_age_pauses_a_lock_step_simulation_and_goes_on(make_bench: type[Bench]) -> None:
+    bench = make_bench(pause_on_lapse=True)
+    bench.ready()
+    bench.command()
+    bench.cycle(5, holding=True)
+    bench.now += 1.0
+    at = bench.positions
+    bench.cycle(5)
+    assert bench.positions == at
+    assert not bench.supervisor.may_move(bench.now)
+    assert in_state(bench, State.MOVING)
+    assert "paused" in bench.status.reason
+    # What happens is what would have happened: the run repeats.
+    assert bench.status.watchdog_trips == 0
+    bench.cycle(20, holding=True)
+    assert bench.results[-1].outcome == "succeeded"
+    bench.command()
+    bench.now += 1.0
+    bench.hold(False)
+    assert bench.results[-1].outcome == "aborted: hold released"
+
+
+@pytest.mark.parametrize("press_before", ["enable", "reset", "stop"])
+def test_hold_new_press_one_from_before_does_not_count(bench: Bench, press_before: str) -> None:
+    bench.home()
+    if press_before == "enable":
+        bench.hold()
+        bench.supervisor.enable(True, bench.now)
+    else:
+        bench.supervisor.enable(True, bench.now)
+        bench.hold()
+        assert bench.status.hold_owner == "a"
+        if press_before == "reset":
+            bench.supervisor.reset(bench.now)
+        else:
+            bench.supervisor.stop()
+    bench.cycle(5, holding=True)
+    assert bench.status.hold_owner == ""
+    assert bench.status.speed_scale == 0.0
+    bench.hold(False)
+    bench.hold()
+    assert bench.status.hold_owner == "a"
+
+
+def test_hold_one_owner_until_released(bench: Bench) -> None:
+    bench.ready()
+    bench.hold(sender="b")
+    assert bench.status.hold_owner == "a"
+    assert bench.last_rule is Rule.HOLD_ONE_OWNER
+    bench.hold(False, sender="b")
+    bench.command()
+    bench.cycle(1, holding=True)
+    assert in_state(bench, State.MOVING)
+    bench.hold(sender="b")
+    bench.hold(False)
+    bench.hold(sender="b")
+    assert bench.status.hold_owner == "", "b pressed while a had it: that press must not take over"
+    bench.hold(False, sender="b")
+    bench.hold(sender="b")
+    assert bench.status.hold_owner == "b"
+
+
+def test_hold_one_owner_a_crowd_of_senders_is_refused(bench: Bench) -> None:
+    bench.ready(holding=False)
+    for number in range(40):
+        bench.hold(False, sender=str(number))
+    bench.hold(sender="late")
+    assert bench.status.hold_owner == ""
+
+
+def test_hold_one_owner_sixteen_senders_are_known(bench: Bench) -> None:
+    bench.ready(holding=False)
+    for number in range(16):
+        bench.hold(False, sender=str(number))
+    bench.hold(False, sender="16")
+    bench.hold(sender="16")
+    assert bench.status.hold_owner == ""
+    bench.hold(sender="15")
+    assert bench.status.hold_owner == "15"
+
+
+def test_hold_stamp_increases_an_old_one_keeps_nothing_alive(bench: Bench) -> None:
+    bench.ready(holding=False)
+    bench.hold(stamp_ns=50)
+    bench.command(0.002, 0.1, duration=2.0)
+    for _ in range(20):
+        bench.hold(stamp_ns=50)
+        bench.cycle()
+    assert in_state(bench, State.HOLDING)
+    assert bench.results[-1].outcome.startswith("aborted: no hold message")
+
+
+def test_hold_stamp_increases_yet_an_old_release_still_stops(bench: Bench) -> None:
+    bench.ready(holding=False)
+    bench.hold(stamp_ns=50)
+    bench.command()
+    bench.hold(False, stamp_ns=10)
+    assert bench.results[-1].outcome == "aborted: hold released"
+
+
+@pytest.mark.parametrize("scale", [math.nan, -0.1, 1.1, math.inf])
+def test_speed_scale_outside_0_to_1_is_a_release(bench: Bench, scale: float) -> None:
+    bench.ready()
+    bench.command()
+    bench.hold(scale=scale)
+    assert bench.results[-1].outcome == "aborted: hold released"
+    assert bench.last_rule is Rule.SPEED_SCALE
+
+
+def test_speed_scale_slows_and_0_stands_still(bench: Bench) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(10, holding=True, scale=0.5)
+    assert bench.insertion.position == pytest.approx(0.0002)
+    bench.cycle(10, holding=True, scale=0.0)
+    assert bench.insertion.position == pytest.approx(0.0002)
+    assert not bench.supervisor.may_move(bench.now)
+
+
+def test_no_motion_by_itself_on_configure_enable_reset(bench: Bench) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(3, holding=True)
+    bench.insertion.fault = "stalled"
+    bench.cycle(1, holding=True)
+    at = bench.positions
+    assert in_state(bench, State.FAULT)
+    bench.insertion.orders.clear()
+    bench.hold(False)
+    assert bench.supervisor.reset(bench.now).success
+    assert bench.supervisor.enable(True, bench.now).success
+    bench.cycle(5)
+    bench.cycle(20, holding=True)
+    assert bench.positions == at
+    assert "move" not in bench.insertion.orders + bench.rotation.orders[-3:]

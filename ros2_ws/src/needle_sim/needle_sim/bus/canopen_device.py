@@ -1,0 +1,261 @@
+"""A CANopen device (CiA 301): network states, heartbeats both ways, SDO, PDOs and emergencies."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+from functools import partial
+
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.object_dictionary import Access, Kind, ObjectDictionary
+from needle_sim.bus.process_data import INVALID, ReceivePdo, TransmitPdo
+from needle_sim.bus.sdo_server import SdoServer
+
+NMT = 0x000
+SYNC = 0x080
+EMERGENCY = 0x080
+SDO_ANSWER = 0x580
+SDO_REQUEST = 0x600
+HEARTBEAT = 0x700
+# COB-IDs of the predefined connection set.
+_RECEIVE = (0x200, 0x300, 0x400, 0x500)
+_TRANSMIT = (0x180, 0x280, 0x380, 0x480)
+_HEARTBEAT_CONSUMERS = 2
+_ERRORS_KEPT = 4
+HEARTBEAT_LOST = 0x8130
+_COMMUNICATION_ERROR = 0x10
+_GENERIC_ERROR = 0x01
+# 0x1029: what a lost heartbeat does to the network state.
+_STAY, _STOP = 1, 2
+
+
+class NetworkState(enum.IntEnum):
+    """NMT states, as heartbeats carry them."""
+
+    BOOTING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+class CanopenDevice:
+    """What every device does; what it is for is in `dictionary` and the callbacks.
+
+    Frames that it sends collect in `outbox`. All times are readings of one steady clock [s].
+
+    Parameters
+    ----------
+    node_id : int
+        1..127.
+    dictionary : ObjectDictionary
+        Objects from 0x2000 up; those of the communication are added here.
+    default_receive, default_transmit : tuple of int
+        What the first PDO of each direction carries after power-up.
+    boot_time : float
+        From power-up to the boot-up message [s].
+    on_power_up, on_boot : callable
+        Called when the power comes (also by an NMT reset), and at the boot-up message.
+    on_connection_lost : callable
+        Called when a monitored heartbeat stays away or the device is told to stop.
+    """
+
+    def __init__(
+        self,
+        node_id: int,
+        dictionary: ObjectDictionary,
+        *,
+        default_receive: tuple[int, ...],
+        default_transmit: tuple[int, ...],
+        boot_time: float,
+        on_power_up: Callable[[], None],
+        on_boot: Callable[[], None],
+        on_connection_lost: Callable[[], None],
+    ) -> None:
+        self.node_id = node_id
+        self.dictionary = dictionary
+        self.outbox: list[CanFrame] = []
+        self.state = NetworkState.BOOTING
+        self._boot_time = boot_time
+        self._on_power_up = on_power_up
+        self._on_boot = on_boot
+        self._on_connection_lost = on_connection_lost
+        self._boots_at = 0.0
+        self._heartbeat_at = 0.0
+        self._heard: dict[int, float] = {}
+        self._errors: list[int] = []
+        self._sdo = SdoServer(dictionary)
+        self._add_communication_objects()
+        self._receive = [
+            ReceivePdo(
+                dictionary,
+                k,
+                base + node_id | (INVALID if k else 0),
+                default_receive if k == 0 else (),
+            )
+            for k, base in enumerate(_RECEIVE)
+        ]
+        self._transmit = [
+            TransmitPdo(
+                dictionary,
+                k,
+                base + node_id | (INVALID if k else 0),
+                default_transmit if k == 0 else (),
+            )
+            for k, base in enumerate(_TRANSMIT)
+        ]
+
+    def power_up(self, now: float) -> None:
+        """Start as if the power had just come: everything written is forgotten."""
+        self.dictionary.power_up()
+        self.state = NetworkState.BOOTING
+        self._boots_at = now + self._boot_time
+        self._heard.clear()
+        self._errors.clear()
+        self._forget()
+        self._on_power_up()
+
+    def receive(self, frame: CanFrame, now: float) -> None:
+        """Take a frame from the bus, SYNC excepted."""
+        if self.state is NetworkState.BOOTING:
+            return
+        identifier = frame.identifier
+        if identifier == NMT:
+            self._obey(frame.data, now)
+        elif identifier == SDO_REQUEST + self.node_id:
+            self._answer(frame)
+        elif identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
+            if identifier & ~0x7F == HEARTBEAT:
+                self._heard[identifier & 0x7F] = now
+        elif self.state is NetworkState.OPERATIONAL:
+            if frame.remote:
+                self._answer_remote(identifier)
+                return
+            for pdo in self._receive:
+                if pdo.cob_id == identifier:
+                    pdo.take(frame.data)
+
+    def sync(self) -> None:
+        """Take a SYNC: sample what goes out with it, then apply what waited for it."""
+        if self.state is not NetworkState.OPERATIONAL:
+            return
+        for transmit in self._transmit:
+            self._send_pdo(transmit, transmit.sync())
+        for receive in self._receive:
+            receive.sync()
+
+    def tick(self, now: float) -> None:
+        """Do what is due by the clock: booting, heartbeats, watchdogs, event timers."""
+        if self.state is NetworkState.BOOTING:
+            if now >= self._boots_at:
+                self.state = NetworkState.PRE_OPERATIONAL
+                self._send(HEARTBEAT, bytes([NetworkState.BOOTING]))
+                self._heartbeat_at = now
+                self._on_boot()
+            return
+        period = self.dictionary.value(0x1017) * 1e-3
+        if period > 0.0 and now - self._heartbeat_at >= period:
+            # On a starved machine late heartbeats are not made up for.
+            self._heartbeat_at = max(self._heartbeat_at + period, now - period)
+            self._send(HEARTBEAT, bytes([self.state]))
+        self._watch(now)
+        if self.state is NetworkState.OPERATIONAL:
+            for pdo in self._transmit:
+                self._send_pdo(pdo, pdo.event(now))
+
+    def emergency(self, code: int, register: int = 0) -> None:
+        """Tell an error, or with code 0 that there is none left."""
+        if code:
+            self._errors = [code, *self._errors][:_ERRORS_KEPT]
+            register |= _GENERIC_ERROR
+        self.dictionary.set(0x1001, 0, register)
+        self.dictionary.set(0x1003, 0, len(self._errors))
+        for k, error in enumerate(self._errors):
+            self.dictionary.set(0x1003, k + 1, error)
+        if self.state is not NetworkState.BOOTING:
+            self._send(EMERGENCY, code.to_bytes(2, "little") + bytes([register]) + bytes(5))
+
+    def _add_communication_objects(self) -> None:
+        add = self.dictionary.add
+        writable = partial(add, access=Access.READ_WRITE)
+        add(0x1001, 0, Kind.U8, mappable=True)
+        writable(0x1003, 0, Kind.U8)
+        for k in range(1, _ERRORS_KEPT + 1):
+            add(0x1003, k, Kind.U32)
+        writable(0x1005, 0, Kind.U32, SYNC)
+        writable(0x1006, 0, Kind.U32, 0)
+        add(0x1014, 0, Kind.U32, EMERGENCY + self.node_id)
+        add(0x1016, 0, Kind.U8, _HEARTBEAT_CONSUMERS)
+        for k in range(1, _HEARTBEAT_CONSUMERS + 1):
+            writable(0x1016, k, Kind.U32, 0)
+            # What was heard before it was monitored says nothing.
+            self.dictionary.on_write(0x1016, k, then=self._forget_heard)
+        writable(0x1017, 0, Kind.U16, 0)
+        add(0x1029, 0, Kind.U8, 1)
+        writable(0x1029, 1, Kind.U8, 0)
+        self.dictionary.on_write(0x1003, 0, then=lambda _: self._errors.clear())
+
+    def _forget_heard(self, consumer: int) -> None:
+        self._heard.pop(consumer >> 16 & 0x7F, None)
+
+    def _obey(self, data: bytes, now: float) -> None:
+        if len(data) != 2 or data[1] not in (0, self.node_id):
+            return
+        command = data[0]
+        states = {
+            0x01: NetworkState.OPERATIONAL,
+            0x02: NetworkState.STOPPED,
+            0x80: NetworkState.PRE_OPERATIONAL,
+        }
+        if command in states:
+            self._enter(states[command])
+            if command == 0x02:
+                self._on_connection_lost()
+        elif command in (0x81, 0x82):
+            self.power_up(now)
+
+    def _enter(self, state: NetworkState) -> None:
+        if state is not self.state:
+            self.state = state
+            self._forget()
+
+    def _forget(self) -> None:
+        for receive in self._receive:
+            receive.forget()
+        for transmit in self._transmit:
+            transmit.forget()
+
+    def _answer(self, frame: CanFrame) -> None:
+        if self.state is NetworkState.STOPPED or frame.remote:
+            return
+        answer = self._sdo.answer(frame.data)
+        if answer is not None:
+            self._send(SDO_ANSWER, answer)
+
+    def _answer_remote(self, identifier: int) -> None:
+        for pdo in self._transmit:
+            if pdo.cob_id == identifier:
+                self._send_pdo(pdo, pdo.data())
+
+    def _watch(self, now: float) -> None:
+        for k in range(1, _HEARTBEAT_CONSUMERS + 1):
+            consumer = self.dictionary.value(0x1016, k)
+            node, limit = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
+            # Monitoring begins with the first heartbeat.
+            heard = self._heard.get(node)
+            if limit == 0.0 or heard is None or now - heard <= limit:
+                continue
+            del self._heard[node]
+            self.emergency(HEARTBEAT_LOST, _COMMUNICATION_ERROR)
+            self._on_connection_lost()
+            behaviour = self.dictionary.value(0x1029, 1)
+            if behaviour == _STOP:
+                self._enter(NetworkState.STOPPED)
+            elif behaviour != _STAY and self.state is NetworkState.OPERATIONAL:
+                self._enter(NetworkState.PRE_OPERATIONAL)
+
+    def _send_pdo(self, pdo: TransmitPdo, data: bytes | None) -> None:
+        if data is not None and pdo.cob_id is not None:
+            self.outbox.append(CanFrame(pdo.cob_id, data))
+
+    def _send(self, function: int, data: bytes) -> None:
+        self.outbox.append(CanFrame(function + self.node_id, data))

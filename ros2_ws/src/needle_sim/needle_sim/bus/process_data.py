@@ -1,0 +1,210 @@
+"""PDOs of a CANopen device (CiA 301): communication parameters, mapping, and when they go."""
+
+from __future__ import annotations
+
+import contextlib
+from functools import partial
+
+from needle_sim.bus.object_dictionary import (
+    Abort,
+    Access,
+    Kind,
+    ObjectDictionary,
+    SdoAbortError,
+)
+
+INVALID = 1 << 31
+_NO_REMOTE = 1 << 30
+_MOST_ENTRIES = 8
+_LAST_SYNCHRONOUS = 240
+_EVENT_DRIVEN = 254
+
+
+class _Pdo:
+    """What both directions have in common: COB-ID, transmission type, mapping.
+
+    Parameters
+    ----------
+    dictionary : ObjectDictionary
+        The device's, where the parameters live.
+    number : int
+        0 is the first of its direction.
+    cob_id : int
+        Identifier after power-up, with bit 31 where the PDO is off.
+    mapped : tuple of int
+        Mapping after power-up: index << 16 | subindex << 8 | bits.
+    """
+
+    # Of each direction: indices of the first communication and mapping parameters, and the highest
+    # subindex of the former.
+    _first_parameters: int
+    _first_mapping: int
+    _last_parameter: int
+
+    def __init__(
+        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
+    ) -> None:
+        self._dictionary = dictionary
+        self._parameters = parameters = self._first_parameters + number
+        self._mapping = mapping = self._first_mapping + number
+        add = dictionary.add
+        writable = partial(add, access=Access.READ_WRITE)
+        add(parameters, 0, Kind.U8, self._last_parameter)
+        writable(parameters, 1, Kind.U32, cob_id)
+        writable(parameters, 2, Kind.U8, 255)
+        writable(mapping, 0, Kind.U8, len(mapped))
+        for entry in range(1, _MOST_ENTRIES + 1):
+            value = mapped[entry - 1] if entry <= len(mapped) else 0
+            writable(mapping, entry, Kind.U32, value)
+            dictionary.on_write(mapping, entry, check=self._check_entry)
+        dictionary.on_write(parameters, 1, check=self._check_cob_id)
+        dictionary.on_write(mapping, 0, check=self._check_count)
+
+    @property
+    def cob_id(self) -> int | None:
+        """Identifier; None while the PDO is off."""
+        value = self._dictionary.value(self._parameters, 1)
+        return None if value & INVALID else value & 0x7FF
+
+    @property
+    def transmission_type(self) -> int:
+        """When it is sent or applied: 0..240 with SYNC, 254 and 255 at once."""
+        return self._dictionary.value(self._parameters, 2)
+
+    @property
+    def mapped(self) -> list[tuple[int, int, int]]:
+        """(index, subindex, bytes) of each object that it carries."""
+        count = self._dictionary.value(self._mapping, 0)
+        values = [self._dictionary.value(self._mapping, k) for k in range(1, count + 1)]
+        return [(value >> 16, value >> 8 & 0xFF, (value & 0xFF) // 8) for value in values]
+
+    def _check_cob_id(self, value: int) -> None:
+        changed = (value ^ self._dictionary.value(self._parameters, 1)) & 0x1FFFFFFF
+        # An identifier may change only while the PDO is off.
+        if changed and self.cob_id is not None and not value & INVALID:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+        if value & 0x1FFFF800:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+
+    def _check_off(self) -> None:
+        if self.cob_id is not None:
+            raise SdoAbortError(Abort.DEVICE_STATE)
+
+    def _check_entry(self, value: int) -> None:
+        self._check_off()
+        if self._dictionary.value(self._mapping, 0) != 0:
+            raise SdoAbortError(Abort.DEVICE_STATE)
+        if value:
+            self._size(value)
+
+    def _check_count(self, count: int) -> None:
+        self._check_off()
+        if count > _MOST_ENTRIES:
+            raise SdoAbortError(Abort.VALUE_RANGE)
+        values = [self._dictionary.value(self._mapping, k) for k in range(1, count + 1)]
+        if sum(self._size(value) for value in values) > 8:
+            raise SdoAbortError(Abort.MAPPING_TOO_LONG)
+
+    def _size(self, value: int) -> int:
+        entry = self._dictionary.entry(value >> 16, value >> 8 & 0xFF)
+        if entry.kind is None or not entry.mappable or value & 0xFF != 8 * entry.kind.size:
+            raise SdoAbortError(Abort.NOT_MAPPABLE)
+        return entry.kind.size
+
+
+class ReceivePdo(_Pdo):
+    """Takes values from the bus; parameters as of `_Pdo`."""
+
+    _first_parameters, _first_mapping, _last_parameter = 0x1400, 0x1600, 2
+
+    def __init__(
+        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
+    ) -> None:
+        super().__init__(dictionary, number, cob_id, mapped)
+        self._waiting: bytes | None = None
+
+    def take(self, data: bytes) -> None:
+        """Take a frame's data: applied now or with the next SYNC."""
+        if self.transmission_type <= _LAST_SYNCHRONOUS:
+            self._waiting = data
+        else:
+            self._apply(data)
+
+    def sync(self) -> None:
+        """Apply what waits for a SYNC."""
+        if self._waiting is not None:
+            data, self._waiting = self._waiting, None
+            self._apply(data)
+
+    def forget(self) -> None:
+        """Drop what waits for a SYNC."""
+        self._waiting = None
+
+    def _apply(self, data: bytes) -> None:
+        mapped = self.mapped
+        # A shorter frame must not be taken for half a command.
+        if sum(size for _, _, size in mapped) > len(data):
+            return
+        begin = 0
+        for index, subindex, size in mapped:
+            # A PDO has no answer: a value that is refused is just not taken.
+            with contextlib.suppress(SdoAbortError):
+                self._dictionary.write(index, subindex, data[begin : begin + size])
+            begin += size
+
+
+class TransmitPdo(_Pdo):
+    """Puts values on the bus: with every n-th SYNC, on change, by timer or on request.
+
+    Parameters as of `_Pdo`.
+    """
+
+    _first_parameters, _first_mapping, _last_parameter = 0x1800, 0x1A00, 5
+
+    def __init__(
+        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
+    ) -> None:
+        super().__init__(dictionary, number, cob_id, mapped)
+        dictionary.add(self._parameters, 3, Kind.U16, 0, access=Access.READ_WRITE)
+        dictionary.add(self._parameters, 5, Kind.U16, 0, access=Access.READ_WRITE)
+        self._syncs = 0
+        self._sent: bytes | None = None
+        self._sent_at = 0.0
+
+    def data(self) -> bytes:
+        """Return the values as they are now."""
+        return b"".join(self._dictionary.read(index, sub) for index, sub, _ in self.mapped)
+
+    def sync(self) -> bytes | None:
+        """Return what goes out with this SYNC, if anything."""
+        kind = self.transmission_type
+        if self.cob_id is None or kind > _LAST_SYNCHRONOUS:
+            return None
+        data = self.data()
+        if kind == 0:
+            changed, self._sent = data != self._sent, data
+            return data if changed else None
+        self._syncs += 1
+        if self._syncs < kind:
+            return None
+        self._syncs = 0
+        return data
+
+    def event(self, now: float) -> bytes | None:
+        """Return what goes out now for a change or the event timer, if anything; `now` in s."""
+        if self.cob_id is None or self.transmission_type < _EVENT_DRIVEN:
+            return None
+        data = self.data()
+        age = now - self._sent_at
+        inhibit = self._dictionary.value(self._parameters, 3) * 1e-4
+        timer = self._dictionary.value(self._parameters, 5) * 1e-3
+        due = (data != self._sent and age >= inhibit) or (timer > 0.0 and age >= timer)
+        if not due:
+            return None
+        self._sent, self._sent_at = data, now
+        return data
+
+    def forget(self) -> None:
+        """Send the next one whatever was sent before."""
+        self._sent = None
+        self._syncs = 0

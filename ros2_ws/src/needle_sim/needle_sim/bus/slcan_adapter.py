@@ -1,0 +1,124 @@
+"""The device side of a serial CAN adapter: the LAWICEL protocol ("slcan") of USB adapters.
+
+Commands end with CR; an adapter answers CR for done, BEL for refused, `z` CR for a frame taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_sim.bus.can_frame import CanFrame
+
+DONE = b"\r"
+REFUSED = b"\a"
+_SENT = b"z\r"
+_SENT_EXTENDED = b"Z\r"
+_VERSION = b"V1013\r"
+_SERIAL_NUMBER = b"NSIM1\r"
+_NO_ERRORS = b"F00\r"
+# The longest command is an extended frame of 8 bytes.
+_LONGEST = 64
+_MOST_DATA = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class SlcanInput:
+    """What a stretch of bytes from the computer came to.
+
+    Attributes
+    ----------
+    frames : tuple of CanFrame
+        Frames for the bus, in order.
+    reply : bytes
+        What the adapter answers.
+    opened : bool
+        Whether the channel was opened or closed: what waits for the computer is obsolete.
+    """
+
+    frames: tuple[CanFrame, ...]
+    reply: bytes
+    opened: bool
+
+
+class SlcanAdapter:
+    """Turns bytes into frames and frames into bytes; frames pass only while the channel is open."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._open = False
+        self._listens_only = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the computer has opened the channel."""
+        return self._open
+
+    def feed(self, data: bytes) -> SlcanInput:
+        """Take bytes from the computer, complete commands or not."""
+        self._buffer += data
+        frames: list[CanFrame] = []
+        reply = bytearray()
+        opened = False
+        while (end := self._buffer.find(DONE)) >= 0:
+            command = bytes(self._buffer[:end])
+            del self._buffer[: end + 1]
+            opened = opened or command in (b"O", b"L", b"C")
+            reply += self._obey(command, frames)
+        if len(self._buffer) > _LONGEST:
+            self._buffer.clear()
+            reply += REFUSED
+        return SlcanInput(tuple(frames), bytes(reply), opened)
+
+    def encode(self, frame: CanFrame) -> bytes:
+        """Return a frame as the computer reads it; nothing while the channel is closed."""
+        if not self._open:
+            return b""
+        kind = "r" if frame.remote else "t"
+        return (
+            f"{kind}{frame.identifier:03X}{len(frame.data):d}{frame.data.hex().upper()}\r".encode()
+        )
+
+    def _obey(self, command: bytes, frames: list[CanFrame]) -> bytes:  # noqa: PLR0911 - one a kind
+        kind, rest = command[:1], command[1:]
+        if kind == b"":
+            return DONE
+        if kind in b"tTrR":
+            return self._send(kind, rest, frames)
+        if kind in b"OL":
+            if self._open or rest:
+                return REFUSED
+            self._open = True
+            self._listens_only = kind == b"L"
+            return DONE
+        if kind == b"C" and not rest:
+            self._open = False
+            return DONE
+        if kind in b"Ss":
+            return REFUSED if self._open or not rest else DONE
+        answers = {b"V": _VERSION, b"N": _SERIAL_NUMBER, b"F": _NO_ERRORS}
+        if kind in answers:
+            return answers[kind]
+        # Time stamps, polling, filters: nothing to switch here.
+        return DONE if kind in b"ZXMmQWUY" else REFUSED
+
+    def _send(self, kind: bytes, rest: bytes, frames: list[CanFrame]) -> bytes:
+        if not self._open or self._listens_only:
+            return REFUSED
+        extended = kind in b"TR"
+        digits = 8 if extended else 3
+        try:
+            identifier = int(rest[:digits], 16)
+            length = int(rest[digits : digits + 1])
+            data = bytes.fromhex(rest[digits + 1 :].decode("ascii"))
+        except ValueError:
+            return REFUSED
+        remote = kind in b"rR"
+        if len(rest) < digits + 1 or length > _MOST_DATA or len(data) != (0 if remote else length):
+            return REFUSED
+        if extended:
+            # No drive listens to 29 bits.
+            return _SENT_EXTENDED
+        if identifier > 0x7FF:
+            return REFUSED
+        frames.append(CanFrame(identifier, data, remote))
+        return _SENT

@@ -1,0 +1,1 @@
+"""Stereo images of a needle in a clear phantom."""

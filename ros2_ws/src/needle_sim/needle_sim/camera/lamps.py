@@ -1,0 +1,109 @@
+"""Light that is neither even nor steady, and the reflections it leaves."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from needle_sim.camera.optics import FloatImage, Optics
+from needle_sim.camera.scenarios import Glints, Lighting
+from needle_sim.camera.stereo_rig import Camera
+from needle_sim.needle.se3 import FloatArray
+
+_BLOTCH_SIZE = 0.13
+_COARSE = 16
+_SIDE = 0.05
+_LENGTHS = (0.0, 0.140)
+_WAY_SIDE = 0.006
+_WAY_LENGTHS = (0.02, 0.115)
+_SLIMNESS = (0.12, 0.5)
+_FLICKER_PERIOD = 23.0
+_SHINE_LENGTHS = (0.0015, 0.0045)
+_SHINE = 160.0
+_BEND = 0.25
+
+
+def lamp_light(camera: Camera) -> FloatImage:
+    """Return the light over the image: a lamp to one side, and the lens's fall-off."""
+    u = np.linspace(-1.0, 1.0, camera.image_width, dtype=np.float32)
+    v = np.linspace(-1.0, 1.0, camera.image_height, dtype=np.float32)[:, np.newaxis]
+    return np.asarray(1.0 + 0.09 * u - 0.06 * v - 0.05 * (u * u + v * v), dtype=np.float32)
+
+
+def uneven_light(lighting: Lighting, camera: Camera, rng: np.random.Generator) -> FloatImage:
+    """Return what multiplies the lamp's light: wide blotches, and one side in a soft shade."""
+    size = (camera.image_width, camera.image_height)
+    small = (-(-size[0] // _COARSE), -(-size[1] // _COARSE))
+    field = cv2.GaussianBlur(
+        rng.standard_normal(small[::-1], dtype=np.float32),
+        (0, 0),
+        _BLOTCH_SIZE * small[0],
+        borderType=cv2.BORDER_REFLECT,
+    )
+    field = lighting.blotches * (field - field.mean()) / field.std()
+    angle = rng.uniform(0.0, 2.0 * np.pi)
+    u = np.linspace(-1.0, 1.0, small[0])
+    v = np.linspace(-1.0, 1.0, small[1])[:, np.newaxis]
+    across = np.cos(angle) * u + np.sin(angle) * v - rng.uniform(0.1, 0.6)
+    light = 1.0 + field - lighting.shade / (1.0 + np.exp(-across / 0.06))
+    return np.asarray(
+        cv2.resize(light.astype(np.float32), size, interpolation=cv2.INTER_CUBIC), dtype=np.float32
+    )
+
+
+def drift(lighting: Lighting, exposure_number: int, phase: float) -> float:
+    """Return what multiplies all light of one exposure; `phase` is where it starts [rad]."""
+    angle = 2.0 * np.pi * exposure_number / lighting.drift_period + phase
+    return float(1.0 + lighting.drift * np.sin(angle))
+
+
+def flicker(glints: Glints, exposure_number: int, phase: float) -> float:
+    """Return what multiplies the surface's glints in one exposure."""
+    angle = 2.0 * np.pi * exposure_number / _FLICKER_PERIOD + phase
+    return float(1.0 - glints.flicker * (0.5 + 0.5 * np.sin(angle)))
+
+
+def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> FloatImage:
+    """Return what lamps add to one camera's image, mirrored in the surface's unevenness."""
+    width, height = optics.image_size
+    count = glints.on_surface + glints.over_needle
+    over = np.arange(count) >= glints.on_surface
+    place = np.empty((count, 3))
+    place[:, 0] = optics.surface_height
+    for axis, bounds in ((1, (-_SIDE, _SIDE)), (2, _LENGTHS)):
+        place[:, axis] = rng.uniform(*bounds, count)
+    place[over, 1] = rng.uniform(-_WAY_SIDE, _WAY_SIDE, glints.over_needle)
+    place[over, 2] = rng.uniform(*_WAY_LENGTHS, glints.over_needle)
+    half = glints.largest / 2.0 * rng.uniform(0.15, 1.0, count) ** 1.5
+    half[over] = glints.largest / 2.0 * rng.uniform(0.5, 1.0, glints.over_needle)
+    half_px = optics.radius_px(place, half)
+    slim = rng.uniform(*_SLIMNESS, count)
+    angle = rng.uniform(0.0, np.pi, count)
+    bend = rng.uniform(-_BEND, _BEND, count)
+    peak = glints.brightness * rng.uniform(0.4, 1.0, count)
+    blur = np.broadcast_to(optics.blur_px(place), (count,))
+    image = np.zeros((height, width), dtype=np.float32)
+    for i, (u0, v0) in enumerate(optics.project(place)):
+        reach = int(np.ceil(1.5 * half_px[i] + 3.0 * blur[i]))
+        rows = slice(max(int(v0) - reach, 0), max(min(int(v0) + reach + 2, height), 0))
+        columns = slice(max(int(u0) - reach, 0), max(min(int(u0) + reach + 2, width), 0))
+        u = np.arange(columns.start, columns.stop) - u0
+        v = (np.arange(rows.start, rows.stop) - v0)[:, np.newaxis]
+        along = (np.cos(angle[i]) * u + np.sin(angle[i]) * v) / np.hypot(half_px[i], blur[i])
+        # A little bent, as water's ripples make them.
+        across = np.cos(angle[i]) * v - np.sin(angle[i]) * u + bend[i] * half_px[i] * along**2
+        across /= np.hypot(slim[i] * half_px[i] / 2.0, blur[i])
+        image[rows, columns] += peak[i] * np.exp(-(along**4) - across**2)
+    return image
+
+
+def shine(glints: Glints, length: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return what the lamp adds to the middle of the needle at places along `rig`'s z, (M,).
+
+    The needle follows its own path, so that a stretch which shines once does so ever after.
+    """
+    middle = rng.uniform(*_LENGTHS, glints.on_needle)
+    half = rng.uniform(*_SHINE_LENGTHS, glints.on_needle) / 2.0
+    peak = _SHINE * rng.uniform(0.5, 1.0, glints.on_needle)
+    bumps = peak * np.exp(-(((length[:, np.newaxis] - middle) / half) ** 4))
+    return np.asarray(bumps.max(axis=1, initial=0.0))

@@ -1,0 +1,180 @@
+"""What moves over the phantom: a cable, the needle's shadow on its floor, hands and covers."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from needle_sim.camera.scenarios import Cable, FloorShadow, Occlusion
+from needle_sim.needle.se3 import FloatArray
+
+_CABLE_POINTS = 120
+_CABLE_HALF_LENGTH = 0.075
+_CABLE_MIDDLE = 0.07
+
+# A hand as capsules in a level plane, pointing along +a: (a0, b0, a1, b1, radius), palm at 0 [m].
+_HAND = (
+    (-0.30, 0.01, -0.06, 0.0, 0.034),
+    (-0.06, 0.0, 0.0, 0.0, 0.036),
+    (-0.01, -0.024, 0.044, -0.034, 0.0095),
+    (-0.005, -0.009, 0.056, -0.012, 0.010),
+    (-0.005, 0.009, 0.054, 0.010, 0.010),
+    (-0.01, 0.024, 0.042, 0.032, 0.009),
+    (-0.03, 0.028, 0.015, 0.056, 0.011),
+)
+_FAR = 0.26
+_HIGH = 0.18
+_LOW = 0.03
+
+
+def cable_line(
+    cable: Cable, surface_height: float, exposure_number: int, rng: np.random.Generator
+) -> FloatArray:
+    """Return where the cable lies at one exposure.
+
+    Parameters
+    ----------
+    cable : Cable
+        The cable.
+    surface_height : float
+        x of the phantom's surface in `rig` [m].
+    exposure_number : int
+        When.
+    rng : numpy.random.Generator
+        In the same state for every exposure of a run.
+
+    Returns
+    -------
+    ndarray, shape (M, 3)
+        Its middle line in `rig`, with both ends [m].
+    """
+    phases = rng.uniform(0.0, 2.0 * np.pi, 4)
+    paces = rng.uniform(0.8, 1.25, 4)
+    half_length = _CABLE_HALF_LENGTH * rng.uniform(0.4, 1.0)
+    sway, turn, slide, bow = np.sin(
+        2.0 * np.pi * exposure_number / cable.period * paces + phases
+    ).tolist()
+    angle = 0.5 * turn
+    along = np.linspace(-half_length, half_length, _CABLE_POINTS)
+    across = 0.006 * bow * (1.0 - (along / half_length) ** 2)
+    line = np.empty((_CABLE_POINTS, 3))
+    line[:, 0] = surface_height + cable.height
+    line[:, 1] = cable.sway * sway + np.sin(angle) * along + np.cos(angle) * across
+    line[:, 2] = _CABLE_MIDDLE + 0.03 * slide + np.cos(angle) * along - np.sin(angle) * across
+    return line
+
+
+def shadow_line(
+    shadow: FloorShadow, surface_height: float, line: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return where parallel light throws a line's shadow on the phantom's floor.
+
+    Parameters
+    ----------
+    shadow : FloorShadow
+        The shadow.
+    surface_height : float
+        x of the phantom's surface in `rig` [m].
+    line : ndarray, shape (M, 3)
+        What throws it, in `rig` [m].
+    rng : numpy.random.Generator
+        In the same state for every exposure of a run.
+
+    Returns
+    -------
+    thrown : ndarray, shape (M, 3)
+        The shadow's middle line in `rig` [m].
+    fall : ndarray, shape (M,)
+        How high above the floor each point of the line is [m].
+    """
+    slant = rng.uniform(-shadow.largest_slant, shadow.largest_slant, 2)
+    floor = surface_height - shadow.floor_depth
+    fall = np.maximum(line[:, 0] - floor, 0.0)
+    thrown = np.empty_like(line)
+    thrown[:, 0] = floor
+    thrown[:, 1:] = line[:, 1:] + fall[:, np.newaxis] * slant
+    return thrown, fall
+
+
+@dataclasses.dataclass(frozen=True)
+class Event:
+    """Something that blocks the view at one exposure.
+
+    Attributes
+    ----------
+    blocks : pair of bool
+        Whether the left and the right camera are meant.
+    covered : bool
+        Whether the cameras meant see nothing at all; a hand passes otherwise.
+    progress : float
+        How far the event is, between 0 and 1.
+    """
+
+    blocks: tuple[bool, bool]
+    covered: bool
+    progress: float
+
+
+def event_at(occlusion: Occlusion, seed: int, exposure_number: int) -> Event | None:
+    """Return what blocks the view at an exposure; None where nothing does."""
+    if exposure_number < occlusion.first:
+        return None
+    stretch, within = divmod(exposure_number - occlusion.first, occlusion.every)
+    # Every three stretches each of the three: left, right, both; a hand or a cover by chance.
+    round_, place = divmod(stretch, 3)
+    order = np.random.default_rng([seed, round_, 8]).permutation(3)
+    rng = np.random.default_rng([seed, stretch, 9])
+    blocks = ((True, False), (False, True), (True, True))[int(order[place])]
+    length = occlusion.length_both if all(blocks) else occlusion.length
+    begin = int(rng.integers(0, max(occlusion.every - length, 0) + 1))
+    covered = bool(rng.random() < 0.4)
+    if not begin <= within < begin + length:
+        return None
+    return Event(blocks, covered, (within - begin + 0.5) / length)
+
+
+def hand_capsules(
+    event: Event, target: FloatArray, camera_centres: tuple[FloatArray, FloatArray]
+) -> list[tuple[FloatArray, FloatArray, float]]:
+    """Return a hand on its way over the target and back.
+
+    High above the phantom it stands in the line of sight of one camera and beside the other's; for
+    both it is low.
+
+    Parameters
+    ----------
+    event : Event
+        Whom the hand blocks, and how far it is.
+    target : ndarray, shape (3,)
+        What it passes over, in `rig` [m].
+    camera_centres : pair of ndarray, shape (3,)
+        In `rig` [m].
+
+    Returns
+    -------
+    list of (ndarray (3,), ndarray (3,), float)
+        Capsules from point to point, in `rig`, and their radii [m].
+    """
+    left, right = camera_centres
+    if all(event.blocks):
+        centre, height, side = (left + right) / 2.0, _LOW, 0.0
+    else:
+        centre, height = (left, _HIGH) if event.blocks[0] else (right, _HIGH)
+        side = float(np.sign(centre[1] - (left[1] + right[1]) / 2.0))
+    share = height / (centre[0] - target[0])
+    over = target + share * (centre - target)
+    # From the blocked camera's side, so that the arm is in nobody else's way.
+    forward = np.array([0.0, -side if side else 1.0, 0.0])
+    aside = np.array([0.0, 0.0, 1.0])
+    # In and out fast, a while over the target.
+    there = min(1.0, 1.6 * np.sin(np.pi * event.progress))
+    over = over - (1.0 - there) * _FAR * forward
+    return [
+        (
+            over + a0 * forward + b0 * aside,
+            over + a1 * forward + b1 * aside,
+            radius,
+        )
+        for a0, b0, a1, b1, radius in _HAND
+    ]

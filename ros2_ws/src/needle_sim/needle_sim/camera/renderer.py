@@ -1,0 +1,181 @@
+"""Stereo images of a needle in a clear phantom, as the cameras above its surface see it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from needle_sim.camera.bubbles import BubbleCloud, place_bubbles
+from needle_sim.camera.optics import Optics
+from needle_sim.camera.passing import Event, cable_line, event_at, hand_capsules, shadow_line
+from needle_sim.camera.scenarios import CLEAN, Scenario
+from needle_sim.camera.stereo_rig import StereoRig
+from needle_sim.camera.view import GreyImage, Moment, View
+from needle_sim.needle.needle_shape import NeedleShape
+from needle_sim.needle.se3 import FloatArray
+
+_LINE_SPACING = 0.0003
+# What is judged when one asks whether a camera saw the needle's end.
+_DISTAL_LENGTH = 0.01
+# A blurred shadow needs fewer points, the last one among them.
+_SHADOW_PART = slice(None, None, -4)
+_NOTHING: FloatArray = np.empty((0, 3))
+
+# Streams of a seed's randomness at exposure 0: the mottle of either view, what both share (bubbles,
+# cable, light), the troubles of either view. The sensor's noise takes 0 and 1 of each exposure.
+_MOTTLE_STREAMS = (2, 3)
+_SCENE_STREAM = 5
+_TROUBLE_STREAMS = (6, 7)
+_CABLE_KEY = 1
+_SHADOW_KEY = 2
+
+
+class StereoRenderer:
+    """Draws the needle as both cameras see it, refracted by the phantom's surface.
+
+    Seen are the shaft inside the phantom, dark on bright plastisol in uneven light, the entry
+    hole's rim at rig's origin and the support sheath before it, which hides the shaft outside; and
+    the scenario's troubles.
+    Refraction is that of an endless surface: what little is seen before the phantom's front face is
+    drawn as if it were inside. Two renderers of one rig, seed and scenario draw the same images,
+    bit for bit, in whatever order: an image depends on the exposure's number, not on those before.
+
+    Parameters
+    ----------
+    rig : StereoRig
+        Cameras and phantom.
+    seed : int
+        Not negative.
+    needle : NeedleShape
+        What is drawn along the tip's path.
+    scenario : Scenario
+        What troubles the cameras; nothing by default.
+    """
+
+    def __init__(
+        self,
+        rig: StereoRig,
+        seed: int,
+        needle: NeedleShape | None = None,
+        scenario: Scenario = CLEAN,
+    ) -> None:
+        self._seed = seed
+        self._rig = rig
+        self._needle = NeedleShape() if needle is None else needle
+        self._scenario = scenario
+        optics = [Optics(rig, camera, scenario.lens) for camera in (rig.left, rig.right)]
+        self._centres = (optics[0].centre, optics[1].centre)
+        rng = np.random.default_rng([seed, 0, _SCENE_STREAM])
+        self._drift_phase = float(rng.uniform(0.0, 2.0 * np.pi))
+        self.bubbles: BubbleCloud | None = None
+        if scenario.bubbles is not None:
+            self.bubbles = place_bubbles(scenario.bubbles, rig.surface_height, rng)
+        self._views = tuple(
+            View(
+                optics[side],
+                scenario,
+                self.bubbles,
+                np.random.default_rng([seed, 0, _MOTTLE_STREAMS[side]]),
+                [seed, 0, _TROUBLE_STREAMS[side]],
+            )
+            for side in (0, 1)
+        )
+
+    def render(
+        self,
+        T_rig_tip: ArrayLike,  # noqa: N803
+        centreline: ArrayLike,
+        exposure_number: int,
+    ) -> tuple[GreyImage, GreyImage]:
+        """Return the images of one exposure.
+
+        Parameters
+        ----------
+        T_rig_tip : array_like, shape (4, 4)
+            Pose of the tip in `rig` [m].
+        centreline : array_like, shape (N, 3)
+            Path of the tip from the entry point, at distances of 1 mm or less, the tip last [m];
+            a single point draws no needle.
+        exposure_number : int
+            Keys the sensor's noise and all that moves or changes; not negative.
+
+        Returns
+        -------
+        left, right : ndarray of uint8, shape (image_height, image_width)
+            Grey images.
+        """
+        event = self._event(exposure_number)
+        moment = self._moment(T_rig_tip, centreline, exposure_number, event)
+        left, right = (
+            view.exposure(
+                moment,
+                event is not None and event.covered and event.blocks[side],
+                self._drift_phase,
+                np.random.default_rng([self._seed, exposure_number, side]),
+            )
+            for side, view in enumerate(self._views)
+        )
+        return left, right
+
+    def share_seen(
+        self,
+        T_rig_tip: ArrayLike,  # noqa: N803
+        centreline: ArrayLike,
+        exposure_number: int,
+    ) -> tuple[float, float]:
+        """Return which share of the needle's last 10 mm the left and the right camera see.
+
+        What counts is hands, covers and the image's bounds: 0 is hidden, 1 is in full view; 0 too
+        where there is no needle. The arguments are those of `render`.
+        """
+        event = self._event(exposure_number)
+        moment = self._moment(T_rig_tip, centreline, exposure_number, event)
+        distal = moment.needle[-int(_DISTAL_LENGTH / _LINE_SPACING) :]
+        left, right = (
+            0.0
+            if event is not None and event.covered and event.blocks[side]
+            else view.share_seen(distal, moment)
+            for side, view in enumerate(self._views)
+        )
+        return left, right
+
+    def _event(self, exposure_number: int) -> Event | None:
+        if self._scenario.occlusion is None:
+            return None
+        return event_at(self._scenario.occlusion, self._seed, exposure_number)
+
+    def _moment(
+        self,
+        T_rig_tip: ArrayLike,  # noqa: N803
+        centreline: ArrayLike,
+        exposure_number: int,
+        event: Event | None,
+    ) -> Moment:
+        scenario, height = self._scenario, self._rig.surface_height
+        pose = np.asarray(T_rig_tip, dtype=np.float64)
+        needle = shadow = cable = _NOTHING
+        fall = np.empty(0)
+        if scenario.needle:
+            path = np.asarray(centreline, dtype=np.float64)
+            needle = self._needle.middle_line(pose, path, _LINE_SPACING)
+        if scenario.shadow is not None and len(needle):
+            part = needle[_SHADOW_PART]
+            shadow, fall = shadow_line(scenario.shadow, height, part, self._rng(_SHADOW_KEY))
+        if scenario.cable is not None:
+            cable = cable_line(scenario.cable, height, exposure_number, self._rng(_CABLE_KEY))
+        return Moment(
+            number=exposure_number,
+            needle=needle,
+            diameter=self._needle.diameter,
+            shadow=shadow,
+            shadow_fall=fall,
+            cable=cable,
+            cable_diameter=0.0 if scenario.cable is None else scenario.cable.diameter,
+            hand=[]
+            if event is None or event.covered
+            else hand_capsules(event, pose[:3, 3], self._centres),
+        )
+
+    def _rng(self, key: int) -> np.random.Generator:
+        """Return randomness that is the same at every exposure."""
+        return np.random.default_rng([self._seed, 0, _SCENE_STREAM, key])

@@ -1,0 +1,271 @@
+"""One camera's image: what never moves in it, and what one exposure draws over that."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from needle_sim.camera.bubbles import BubbleCloud, BubbleImage, draw_bubbles
+from needle_sim.camera.lamps import drift, flicker, lamp_light, shine, surface_glints, uneven_light
+from needle_sim.camera.optics import SHARP_PX, FloatImage, Optics
+from needle_sim.camera.scenarios import Scenario
+from needle_sim.camera.stroke import Stroke, stroke
+from needle_sim.needle.se3 import FloatArray
+
+GreyImage = NDArray[np.uint8]
+
+# Grey levels under full light.
+_PHANTOM = 188.0
+_BENCH = 150.0
+_NEEDLE = 46.0
+_SHEATH = 92.0
+_ENTRY_RIM = 34.0
+_CABLE = 40.0
+_HAND = 118.0
+_HAND_EDGE = 62.0
+_COVER = 24.0
+# The sensor's noise at 65536 equally likely levels: one 16-bit draw a pixel takes a third of the
+# time of a normal one.
+_NORMAL_TABLE = ndtri((np.arange(65536) + 0.5) / 65536.0)
+_NOISE_BAND_ROWS = 32
+_MOTTLE = 1.5
+_MOTTLE_SIZE_PX = 15.0
+_BENCH_EDGE_PX = 1.5
+
+_SHEATH_LENGTH = 0.04
+_SHEATH_DIAMETER = 0.003
+_RIM_LENGTH = 0.0044
+_RIM_DIAMETER = 0.0012
+# A lamp is no point: its shadow's edge is this wide for each length of fall.
+_PENUMBRA = 0.02
+# Hands are near the lens and drawn this much coarser.
+_HAND_COARSE = 4
+_HAND_EDGE_PX = 7.0
+_HAND_ROUND_PX = 45.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """What one exposure shows, in `rig`; the same for both cameras.
+
+    Attributes
+    ----------
+    number : int
+        Of the exposure.
+    needle, shadow, cable : ndarray, shape (M, 3)
+        Middle lines [m]; empty where there is none.
+    diameter, cable_diameter : float
+        Of needle and cable [m].
+    shadow_fall : ndarray, shape (M,)
+        How high above the floor what throws the shadow is [m].
+    hand : list of (ndarray (3,), ndarray (3,), float)
+        Capsules: from, to, radius [m].
+    """
+
+    number: int
+    needle: FloatArray
+    diameter: float
+    shadow: FloatArray
+    shadow_fall: FloatArray
+    cable: FloatArray
+    cable_diameter: float
+    hand: list[tuple[FloatArray, FloatArray, float]]
+
+
+class View:
+    """One camera's light, what never moves in its image, and what is drawn over it.
+
+    Parameters
+    ----------
+    optics : Optics
+        The camera.
+    scenario : Scenario
+        What troubles it.
+    cloud : BubbleCloud or None
+        The phantom's bubbles.
+    still : numpy.random.Generator
+        For the phantom's mottle.
+    trouble_key : list of int
+        Keys the randomness of this camera's light and glints.
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        scenario: Scenario,
+        cloud: BubbleCloud | None,
+        still: np.random.Generator,
+        trouble_key: list[int],
+    ) -> None:
+        self._optics = optics
+        self._scenario = scenario
+        self._noise_table = (scenario.noise * _NORMAL_TABLE).astype(np.float32)
+        rng = np.random.default_rng(trouble_key)
+        self._shine_key = [*trouble_key, 1]
+        self._phase = float(rng.uniform(0.0, 2.0 * np.pi))
+        self._light = lamp_light(optics.camera)
+        if scenario.lighting is not None:
+            self._light *= uneven_light(scenario.lighting, optics.camera, rng)
+        self._bubbles: BubbleImage | None = None
+        if cloud is not None:
+            self._bubbles = draw_bubbles(cloud, optics)
+            self._bubbles.added[:] *= self._light
+        self._background = self._still_scene(still)
+        self._glints: FloatImage | None = None
+        if scenario.glints is not None:
+            self._glints = surface_glints(scenario.glints, optics, rng)
+
+    def exposure(
+        self, moment: Moment, covered: bool, drift_phase: float, rng: np.random.Generator
+    ) -> GreyImage:
+        """Return the image of one exposure.
+
+        Parameters
+        ----------
+        moment : Moment
+            What there is to see.
+        covered : bool
+            Whether something covers the lens.
+        drift_phase : float
+            Where the light's drift starts [rad].
+        rng : numpy.random.Generator
+            For the sensor's noise.
+        """
+        if covered:
+            image = np.asarray(_COVER * self._light, dtype=np.float32)
+        else:
+            image = self._background.copy()
+            self._draw_moment(image, moment)
+        lighting = self._scenario.lighting
+        if lighting is not None:
+            image *= np.float32(drift(lighting, moment.number, drift_phase))
+        # In bands that stay in the cache: large temporaries cost more than the noise itself.
+        for top in range(0, len(image), _NOISE_BAND_ROWS):
+            band = image[top : top + _NOISE_BAND_ROWS]
+            band += self._noise_table.take(rng.integers(0, 65536, band.shape, dtype=np.uint16))
+        # Rounds and saturates.
+        return np.asarray(cv2.convertScaleAbs(cv2.max(image, 0.0)), dtype=np.uint8)
+
+    def share_seen(self, points: FloatArray, moment: Moment) -> float:
+        """Return the share of points (M, 3) in `rig` that are in the image and under no hand."""
+        width, height = self._optics.image_size
+        pixels = self._optics.project(points)
+        seen = np.all((pixels >= 0.0) & (pixels <= [width - 1, height - 1]), axis=1)
+        if moment.hand and len(points):
+            hidden = self._hand_mask(moment)
+            column, row = np.rint(pixels[seen]).astype(np.intp).T
+            seen[seen] = hidden[row, column] < 0.5
+        return float(seen.mean()) if len(points) else 0.0
+
+    def _draw_moment(self, image: FloatImage, moment: Moment) -> None:
+        if len(moment.shadow):
+            self._draw_shadow(image, moment)
+        if len(moment.needle):
+            self._draw_tube(image, moment.needle, moment.diameter, _NEEDLE, is_needle=True)
+        glints = self._scenario.glints
+        if self._glints is not None and glints is not None:
+            factor = flicker(glints, moment.number, self._phase)
+            cv2.scaleAdd(self._glints, factor, image, dst=image)
+        if len(moment.cable):
+            self._draw_tube(image, moment.cable, moment.cable_diameter, _CABLE)
+        if moment.hand:
+            mask = self._hand_mask(moment)
+            inner = cv2.GaussianBlur(
+                cv2.resize(mask, None, fx=1.0 / _HAND_COARSE, fy=1.0 / _HAND_COARSE),
+                (0, 0),
+                _HAND_ROUND_PX / _HAND_COARSE,
+            )
+            skin = cv2.resize(
+                _HAND_EDGE + (_HAND - _HAND_EDGE) * inner * inner, self._optics.image_size
+            )
+            image += mask * (skin * self._light - image)
+
+    def _still_scene(self, rng: np.random.Generator) -> FloatImage:
+        image = np.full(self._light.shape, _PHANTOM, dtype=np.float32)
+        mottle = cv2.GaussianBlur(
+            rng.standard_normal(image.shape, dtype=np.float32), (0, 0), _MOTTLE_SIZE_PX
+        )
+        image += _MOTTLE * mottle / mottle.std()
+        # The bench before the phantom's front face, up to the upper edge of that face.
+        edge = np.array([[self._optics.surface_height, y, 0.0] for y in (-0.1, 0.1)])
+        beside = edge - [0.0, 0.0, 0.1]
+        outline = np.rint(self._optics.project(np.concatenate([edge, beside[::-1]])))
+        bench = cv2.fillPoly(np.zeros_like(image), [outline.astype(np.int32)], 1.0)
+        softness = float(np.hypot(_BENCH_EDGE_PX, np.max(self._optics.blur_px(edge)) - SHARP_PX))
+        image += (_BENCH - _PHANTOM) * cv2.GaussianBlur(bench, (0, 0), softness)
+        image *= self._light
+        if self._bubbles is not None:
+            image *= self._bubbles.gain
+            image += self._bubbles.added
+        rim = np.zeros((12, 3))
+        rim[:, 1] = np.linspace(-_RIM_LENGTH / 2.0, _RIM_LENGTH / 2.0, 12)
+        sheath = np.zeros((120, 3))
+        sheath[:, 2] = np.linspace(-_SHEATH_LENGTH, 0.0, 120)
+        self._draw_tube(image, sheath, _SHEATH_DIAMETER, _SHEATH)
+        self._draw_tube(image, rim, _RIM_DIAMETER, _ENTRY_RIM)
+        return image
+
+    def _draw_tube(
+        self,
+        image: FloatImage,
+        line: FloatArray,
+        diameter: float,
+        grey: float,
+        is_needle: bool = False,
+    ) -> None:
+        """Draw a metal tube: dark at its edges, a soft reflection of the light along its middle."""
+        tube = self._stroke(line, diameter, self._optics.blur_px(line))
+        pixels = (tube.row, tube.column)
+        metal = grey * (0.8 + 0.6 * np.exp(-((tube.across / 0.5) ** 2)))
+        colour = metal * self._light[pixels]
+        if is_needle:
+            glints = self._scenario.glints
+            if glints is not None:
+                bright = shine(glints, line[:, 2], np.random.default_rng(self._shine_key))
+                colour += bright[tube.sample] * np.exp(-((tube.across / 0.45) ** 2))
+            if self._bubbles is not None:
+                above = self._bubbles.height[pixels] > line[tube.sample, 0]
+                seen_through = colour * self._bubbles.gain[pixels] + self._bubbles.added[pixels]
+                colour = np.where(above, seen_through, colour)
+        image[pixels] += tube.coverage * (colour - image[pixels])
+
+    def _draw_shadow(self, image: FloatImage, moment: Moment) -> None:
+        trouble = self._scenario.shadow
+        assert trouble is not None
+        line = moment.shadow
+        px_per_m = self._optics.radius_px(line, 1e-3) / 1e-3
+        penumbra = _PENUMBRA * moment.shadow_fall * px_per_m
+        seen = self._stroke(line, moment.diameter, np.hypot(self._optics.blur_px(line), penumbra))
+        pixels = (seen.row, seen.column)
+        dark = image[pixels] * (1.0 - trouble.darkness * seen.coverage)
+        if self._bubbles is not None:
+            # What a bubble above reflects is in no shadow.
+            added = self._bubbles.added[pixels]
+            dark = added + (image[pixels] - added) * (1.0 - trouble.darkness * seen.coverage)
+        image[pixels] = dark
+
+    def _stroke(self, line: FloatArray, diameter: float, blur: float | FloatArray) -> Stroke:
+        sideways = self._optics.sideways(line, diameter / 2.0)
+        middle, edge, other_edge = self._optics.project(
+            np.stack([line, line + sideways, line - sideways])
+        )
+        half_width = np.linalg.norm(edge - other_edge, axis=1) / 2.0
+        return stroke(middle, half_width, blur, self._optics.image_size)
+
+    def _hand_mask(self, moment: Moment) -> FloatImage:
+        """Return which share of each pixel a hand takes."""
+        width, height = self._optics.image_size
+        small = np.zeros((-(-height // _HAND_COARSE), -(-width // _HAND_COARSE)), dtype=np.float32)
+        for begin, end, radius in moment.hand:
+            ends = np.stack([begin, end])
+            thickness = 2.0 * self._optics.radius_px(ends, radius).mean() / _HAND_COARSE
+            place = np.clip(np.rint(self._optics.project(ends) / _HAND_COARSE), -9999, 9999)
+            (u0, v0), (u1, v1) = place.astype(int).tolist()
+            cv2.line(small, (u0, v0), (u1, v1), 1.0, max(round(thickness), 1))
+        small = cv2.GaussianBlur(small, (0, 0), _HAND_EDGE_PX / _HAND_COARSE)
+        mask = cv2.resize(small, (small.shape[1] * _HAND_COARSE, small.shape[0] * _HAND_COARSE))
+        return np.asarray(mask[:height, :width], dtype=np.float32)

@@ -1,0 +1,1 @@
+"""The needle on SE(3), in tissue."""

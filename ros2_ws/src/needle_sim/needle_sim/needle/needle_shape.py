@@ -1,0 +1,95 @@
+"""The visible needle: the path of the tip with the pre-bent distal end laid over it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from needle_sim.needle.se3 import FloatArray
+
+# A path that is shorter than this is a point in any image [m].
+_SHORTEST = 1e-6
+
+
+@dataclass(frozen=True)
+class NeedleShape:
+    """A bevel-tip needle with a pre-bent distal end ([KC09] section II: 0.7 mm, 10 deg at 9 mm).
+
+    The bevel leans the distal segment by `lean` towards -y of the tip's frame, so that the bend
+    lies beside the tip's path; behind the bend the shaft comes back onto the path, on a parabola.
+
+    Parameters
+    ----------
+    diameter : float
+        Of the shaft [m].
+    bend_angle : float
+        Angle between shaft and distal segment, above `lean` [rad].
+    bend_distance : float
+        From the bend to the tip [m].
+    lean : float
+        Angle between distal segment and heading at the tip [rad].
+    """
+
+    diameter: float = 0.0007
+    bend_angle: float = float(np.deg2rad(10.0))
+    bend_distance: float = 0.009
+    lean: float = float(np.deg2rad(5.6))
+
+    def sideways(self, distance: FloatArray) -> FloatArray:
+        """Return how far the shaft lies beside the tip's path, towards +y of the tip's frame.
+
+        Parameters
+        ----------
+        distance : ndarray, shape (...)
+            Distance behind the tip [m].
+
+        Returns
+        -------
+        ndarray, shape (...)
+            Offset [m]: 0.88 mm at the bend, 0 from 32 mm on, with the default figures.
+        """
+        at_bend = self.bend_distance * np.tan(self.lean)
+        return_length = 2.0 * at_bend / np.tan(self.bend_angle - self.lean)
+        behind_bend = np.clip((distance - self.bend_distance) / return_length, 0.0, 1.0)
+        distal = distance * np.tan(self.lean)
+        behind = at_bend * (1.0 - behind_bend) ** 2
+        return np.asarray(np.where(distance < self.bend_distance, distal, behind))
+
+    def middle_line(
+        self,
+        T_rig_tip: FloatArray,  # noqa: N803
+        centreline: FloatArray,
+        spacing: float,
+    ) -> FloatArray:
+        """Return the middle line of the visible shaft.
+
+        Parameters
+        ----------
+        T_rig_tip : ndarray, shape (4, 4)
+            Pose of the tip [m].
+        centreline : ndarray, shape (N, 3)
+            Path of the tip in `rig`, from the entry point; the tip last [m].
+        spacing : float
+            Largest distance of neighbours [m].
+
+        Returns
+        -------
+        ndarray, shape (M, 3)
+            Points in `rig`, the tip last and exactly; empty where the path has no length [m].
+        """
+        if len(centreline) < 2:
+            return np.empty((0, 3))
+        from_tip = centreline[::-1]
+        steps = np.linalg.norm(np.diff(from_tip, axis=0), axis=1)
+        distance_known = np.concatenate([[0.0], np.cumsum(steps)])
+        length = distance_known[-1]
+        if length < _SHORTEST:
+            return np.empty((0, 3))
+        distance = np.linspace(length, 0.0, int(np.ceil(length / spacing)) + 1)
+        line = np.stack(
+            [np.interp(distance, distance_known, from_tip[:, axis]) for axis in range(3)], axis=-1
+        )
+        line += self.sideways(distance)[:, np.newaxis] * T_rig_tip[:3, 1]
+        line[-1] = T_rig_tip[:3, 3]
+        return line

@@ -1,0 +1,218 @@
+"""The needle on SE(3): what insertion and base rotation do to the tip, and the path behind it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from needle_sim.needle.channel import Channel
+from needle_sim.needle.se3 import FloatArray, exp_twist, rotation_about_y, rotation_about_z
+from needle_sim.needle.tissue import Torsion
+
+# Insertion at which the needle counts as out [m].
+_OUT = 1e-6
+
+
+def initial_pose(pitch: float, roll: float) -> FloatArray:
+    """Return the tip's pose at the entry point: R = Rx(0) Ry(pitch) Rz(roll) at rig's origin.
+
+    Parameters
+    ----------
+    pitch : float
+        Pitch of the heading out of the wanted plane, towards +x [rad].
+    roll : float
+        Rotation about the heading [rad].
+
+    Returns
+    -------
+    ndarray, shape (4, 4)
+        T_rig_tip [m].
+    """
+    return np.asarray(rotation_about_y(pitch) @ rotation_about_z(roll))
+
+
+def bicycle_curvature(front_wheel_angle: ArrayLike, wheel_base: ArrayLike) -> FloatArray:
+    """Return kappa = tan(phi) / l1 of the bicycle model ([KC09] section II).
+
+    Parameters
+    ----------
+    front_wheel_angle : array_like, shape (...)
+        phi, the fixed angle of the front wheel against the rear one [rad].
+    wheel_base : array_like, shape (...)
+        l1, the distance between the wheels [m].
+
+    Returns
+    -------
+    ndarray, shape (...)
+        Curvature [1/m].
+    """
+    return np.asarray(np.tan(front_wheel_angle) / np.asarray(wheel_base, dtype=np.float64))
+
+
+class NeedlePlant:
+    """An exact plant for [KC09] eqs (1)-(2), one needle or many over leading axes.
+
+    A call of `advance` is one combined twist, T <- T exp((V1 dl + V2 dtheta)^): the rotation runs
+    along with the insertion in proportion, as the drives do it. With torsion, dtheta is the tip's
+    rotation over the call, spread evenly over it.
+
+    A needle drawn back follows its path in reverse, for nothing is cut: position and heading are
+    the path's, and about its axis the tip is turned by what the base (through the torsion) turned
+    since it passed there on the way in. Pushed again, it follows the same channel to its end and
+    cuts on from there. Fully drawn out (to 1 um, for increments add up
+    no better) it leaves the channel behind: the next
+    insertion is a new one at the same entry point. Outside it moves straight along its heading.
+
+    Parameters
+    ----------
+    T_rig_tip : array_like, shape (..., 4, 4)
+        Pose of the tip at insertion 0, frame `rig` [m].
+    curvature : array_like, shape (...)
+        kappa, the curvature of the path under pure insertion [1/m]; may be set later on.
+    torsion : Torsion, optional
+        Torsion of the shaft; none by default.
+    tip_offset : float
+        l2, how far the tip is ahead of frame B, the rear wheel, along its axis [m]. 0 is the
+        unicycle: the tip is frame B's origin. The poses here are always the tip's.
+
+    Raises
+    ------
+    ValueError
+        If `T_rig_tip` has no shape (..., 4, 4) or something is not finite.
+    """
+
+    def __init__(
+        self,
+        T_rig_tip: ArrayLike,  # noqa: N803
+        *,
+        curvature: ArrayLike,
+        torsion: Torsion | None = None,
+        tip_offset: float = 0.0,
+    ) -> None:
+        pose = np.array(T_rig_tip, dtype=np.float64)
+        if pose.shape[-2:] != (4, 4):
+            raise ValueError(f"T_rig_tip has shape (..., 4, 4), got {pose.shape}")
+        self.curvature = np.asarray(curvature, dtype=np.float64)
+        if not (np.all(np.isfinite(pose)) and np.all(np.isfinite(self.curvature))):
+            raise ValueError(f"T_rig_tip and curvature must be finite, got {pose}, {curvature!r}")
+        self._pose = pose
+        self._torsion = Torsion() if torsion is None else torsion
+        self._tip_offset = tip_offset
+        self._insertion: FloatArray = np.zeros(pose.shape[:-2])
+        self._channel = Channel(pose, float(self._torsion.tip_angle)) if pose.ndim == 2 else None
+
+    @property
+    def T_rig_tip(self) -> FloatArray:  # noqa: N802
+        """Pose of the tip in `rig`, shape (..., 4, 4) [m]."""
+        return np.array(self._pose)
+
+    @property
+    def insertion(self) -> FloatArray:
+        """Inserted length, shape (...) [m]; 0 is the tip at its start, below 0 is outside."""
+        return np.array(self._insertion)
+
+    @property
+    def rotation(self) -> FloatArray:
+        """Rotation of the tip about its axis since the start, shape (...) [rad]."""
+        return np.array(np.broadcast_to(self._torsion.tip_angle, self._insertion.shape))
+
+    def advance(self, d_insertion: ArrayLike, d_rotation: ArrayLike) -> None:
+        """Move the base, and the tip with it.
+
+        Parameters
+        ----------
+        d_insertion : array_like, shape (...)
+            Insertion of the base [m]; negative draws the needle back (one needle only).
+        d_rotation : array_like, shape (...)
+            Rotation of the base over that insertion [rad].
+
+        Raises
+        ------
+        ValueError
+            If an input is not finite, or many needles are to be drawn back.
+        """
+        length = np.asarray(d_insertion, dtype=np.float64)
+        turned = np.asarray(d_rotation, dtype=np.float64)
+        if not (np.all(np.isfinite(length)) and np.all(np.isfinite(turned))):
+            raise ValueError(f"d_insertion = {length}, d_rotation = {turned} must be finite")
+        if self._channel is None:
+            if np.any(length < 0.0):
+                raise ValueError(f"many needles have no path to return on: d_insertion = {length}")
+            self._cut(length, self._torsion.advance(length, turned))
+        else:
+            self._advance_one(self._channel, float(length), float(turned))
+
+    def centreline(self, spacing: float) -> FloatArray:
+        """Return the path of the tip from the entry point to where it is.
+
+        Parameters
+        ----------
+        spacing : float
+            Largest distance between neighbours, along the path [m].
+
+        Returns
+        -------
+        ndarray, shape (N, 3)
+            Positions in `rig`, the tip last [m]; the tip alone when it is outside.
+
+        Raises
+        ------
+        ValueError
+            If `spacing` is not above 0, or there are many needles.
+        """
+        if self._channel is None:
+            raise ValueError("only a single needle keeps its path")
+        if not spacing > 0.0:
+            raise ValueError(f"spacing = {spacing} m must be above 0")
+        insertion = float(self._insertion)
+        tip = self._pose[np.newaxis, :3, 3]
+        if insertion <= 0.0:
+            return np.array(tip)
+        count = int(np.ceil(insertion / spacing))
+        poses, _ = self._channel.at(np.linspace(0.0, insertion, count + 1)[:-1])
+        return np.concatenate([poses[:, :3, 3], tip])
+
+    def _advance_one(self, channel: Channel, length: float, turned: float) -> None:
+        start = float(self._insertion)
+        in_channel = min(length, max(channel.length - start, 0.0)) if length != 0.0 else 0.0
+        if in_channel != 0.0:
+            share = in_channel / length
+            self._torsion.advance(in_channel, share * turned)
+            self._follow(channel, start + in_channel)
+            length -= in_channel
+            turned -= share * turned
+            if length == 0.0:
+                return
+        angle = float(self._torsion.tip_angle)
+        tip_turned = float(self._torsion.advance(length, turned))
+        before = self._pose
+        twist = self._cut(np.asarray(length), np.asarray(tip_turned))
+        if length > 0.0:
+            channel.append(before, twist, length, angle, tip_turned)
+
+    def _follow(self, channel: Channel, insertion: float) -> None:
+        """Put the tip at a place on the path it cut, turned by what it turned since."""
+        path, angle = channel.at(insertion)
+        tip_angle = float(self._torsion.tip_angle)
+        self._pose = np.asarray(path @ rotation_about_z(tip_angle - angle))
+        self._insertion = np.asarray(insertion)
+        if insertion <= _OUT:
+            entry, angle = channel.at(0.0)
+            entry = np.asarray(entry @ rotation_about_z(tip_angle - angle))
+            self._channel = Channel(entry, tip_angle)
+            if insertion > 0.0:
+                straight = np.array([0.0, 0.0, insertion, 0.0, 0.0, 0.0])
+                self._channel.append(entry, straight, insertion, tip_angle, 0.0)
+
+    def _cut(self, length: FloatArray, tip_turned: FloatArray) -> FloatArray:
+        """Move the tip by V1 dl + V2 dtheta of [KC09] eq. (2), and return that twist."""
+        shape = np.broadcast_shapes(self._insertion.shape, length.shape, tip_turned.shape)
+        twist = np.zeros((*shape, 6))
+        # V1 = [0, 0, 1, kappa, 0, 0] of frame B, written at the tip, l2 e3 ahead of it.
+        twist[..., 1] = -self.curvature * self._tip_offset * length
+        twist[..., 2] = length
+        twist[..., 3] = self.curvature * length
+        twist[..., 5] = tip_turned
+        self._pose = np.asarray(self._pose @ exp_twist(twist))
+        self._insertion = self._insertion + length
+        return twist

@@ -1,0 +1,1 @@
+"""The simulated rig behind the rig's topics and services."""

@@ -1,0 +1,88 @@
+"""What sim_rig publishes, as messages."""
+
+from __future__ import annotations
+
+import array
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CameraInfo, Image
+
+from needle_sim.camera.stereo_rig import Camera
+from needle_sim.needle.se3 import FloatArray
+
+RIG_FRAME = "rig"
+# A tip alone says nothing about the heading [rad^2].
+_UNKNOWN_ORIENTATION = 1e6
+# A variance of 0 would read as "not known" [m^2].
+_LEAST_POSITION_VARIANCE = 1e-12
+
+
+def to_truth(T_rig_tip: FloatArray, stamp: Time) -> PoseStamped:  # noqa: N803
+    """Return the true pose of the tip, shape (4, 4), as a message."""
+    message = PoseStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = RIG_FRAME
+    position, orientation = message.pose.position, message.pose.orientation
+    position.x, position.y, position.z = map(float, T_rig_tip[:3, 3])
+    quaternion = Rotation.from_matrix(T_rig_tip[:3, :3]).as_quat()
+    orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
+    return message
+
+
+def to_tip(tip: FloatArray, stamp: Time) -> PointStamped:
+    """Return a measured tip in `rig`, shape (3,), as a message."""
+    message = PointStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = RIG_FRAME
+    message.point.x, message.point.y, message.point.z = map(float, tip)
+    return message
+
+
+def to_tip_pose(tip: FloatArray, noise: float, stamp: Time) -> PoseWithCovarianceStamped:
+    """Return a measured tip with uniform noise of +-`noise` [m] and no known orientation."""
+    message = PoseWithCovarianceStamped()
+    message.header.stamp = stamp
+    message.header.frame_id = RIG_FRAME
+    position = message.pose.pose.position
+    position.x, position.y, position.z = map(float, tip)
+    variance = max(noise**2 / 3.0, _LEAST_POSITION_VARIANCE)
+    message.pose.covariance = np.diag([variance] * 3 + [_UNKNOWN_ORIENTATION] * 3).ravel()
+    return message
+
+
+def to_image(image: NDArray[np.uint8], frame: str, stamp: Time) -> Image:
+    """Return a grey image as a message."""
+    message = Image(
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding="mono8",
+        is_bigendian=0,
+        step=image.shape[1],
+    )
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    # Anything but an array of bytes is copied element by element.
+    data = array.array("B")
+    data.frombytes(np.ascontiguousarray(image).data)
+    message.data = data
+    return message
+
+
+def to_camera_info(camera: Camera, frame: str, stamp: Time) -> CameraInfo:
+    """Return a camera's calibration as a message; the images are not rectified."""
+    message = CameraInfo(
+        height=camera.image_height,
+        width=camera.image_width,
+        distortion_model="plumb_bob",
+        d=[float(value) for value in camera.distortion],
+        k=camera.camera_matrix.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([camera.camera_matrix, np.zeros((3, 1))]).ravel(),
+    )
+    message.header.stamp = stamp
+    message.header.frame_id = frame
+    return message

@@ -1,0 +1,128 @@
+"""The parameters of drive_emulator."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from needle_common.errors import UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_sim.drives.drive_motion import LimitAction
+from needle_sim.drives.drive_objects import SERVO, STEPPER
+from needle_sim.drives.emulated_bus import MotionClock
+from needle_sim.drives.emulated_drive import DriveSettings
+from needle_sim.drives.motor import MotorSettings
+
+# Encoder of the rotation axis: 16 bits a turn, no gear.
+COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
+_LAST_NODE = 127
+
+
+@dataclasses.dataclass(frozen=True)
+class DriveEmulatorParameters:
+    """Parameters of drive_emulator, fixed at start."""
+
+    pty: str = fixed_parameter(
+        "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
+    )
+    socketcand_port: int = fixed_parameter(
+        0,
+        "-",
+        "Serve TCP clients of socketcand on this port of localhost, in place of a pty.",
+        0,
+        65535,
+    )
+    motion_clock: str = fixed_parameter(
+        MotionClock.STEADY.value,
+        "-",
+        "steady: motors move as time goes by; sync: one SYNC period with every SYNC.",
+        choices=tuple(clock.value for clock in MotionClock),
+    )
+    limit_action: str = fixed_parameter(
+        LimitAction.CLAMP.value,
+        "-",
+        "What a drive does with a target beyond 0x607D once it is homed.",
+        choices=tuple(action.value for action in LimitAction),
+    )
+    boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
+    insertion_node_id: int = fixed_parameter(1, "-", "Of the stepper drive.", 1, _LAST_NODE)
+    insertion_counts_per_unit: float = fixed_parameter(
+        2.0e7, "1/m", "Position counts of the insertion axis.", 1.0, 1e12
+    )
+    insertion_max_speed: float = fixed_parameter(
+        0.01, "m/s", "Fastest that the insertion motor can go.", 1e-6, 1.0
+    )
+    insertion_lag: float = fixed_parameter(
+        0.0, "s", "Time constant with which the insertion motor follows its drive.", 0.0, 1.0
+    )
+    insertion_start: float = fixed_parameter(
+        0.0, "m", "Where the insertion axis stands at power-up, from its home switch.", -0.003, 1.0
+    )
+    insertion_travel: float = fixed_parameter(
+        0.25, "m", "From the home switch to the other limit switch.", 0.001, 2.0
+    )
+    rotation_node_id: int = fixed_parameter(2, "-", "Of the servo drive.", 1, _LAST_NODE)
+    rotation_counts_per_unit: float = fixed_parameter(
+        COUNTS_PER_RADIAN, "1/rad", "Position counts of the rotation axis.", 1.0, 1e12
+    )
+    rotation_max_speed: float = fixed_parameter(
+        20.0, "rad/s", "Fastest that the rotation motor can go.", 1e-3, 1e4
+    )
+    rotation_lag: float = fixed_parameter(
+        0.005, "s", "Time constant with which the rotation motor follows its drive.", 0.0, 1.0
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be emulated.
+
+        Raises
+        ------
+        UserError
+            A parameter out of bounds, two drives of one node id, two ways to the bus.
+        """
+        check_fields(self)
+        if self.insertion_node_id == self.rotation_node_id:
+            raise UserError(f"both drives have node id {self.insertion_node_id}")
+        if self.pty and self.socketcand_port:
+            raise UserError("give pty or socketcand_port, not both")
+        if self.insertion_start > self.insertion_travel:
+            raise UserError(
+                f"insertion_start = {self.insertion_start:g} m is beyond insertion_travel = "
+                f"{self.insertion_travel:g} m"
+            )
+
+    @property
+    def insertion(self) -> DriveSettings:
+        """The insertion axis: a stepper on a screw, with a limit switch at either end."""
+        scale = self.insertion_counts_per_unit
+        return DriveSettings(
+            "insertion",
+            self.insertion_node_id,
+            STEPPER,
+            MotorSettings(
+                counts_per_unit=scale,
+                max_speed=self.insertion_max_speed * scale,
+                lag=self.insertion_lag,
+                start=self.insertion_start * scale,
+                travel=self.insertion_travel * scale,
+            ),
+            LimitAction(self.limit_action),
+            self.boot_time,
+        )
+
+    @property
+    def rotation(self) -> DriveSettings:
+        """The rotation axis: a servo that turns without end."""
+        scale = self.rotation_counts_per_unit
+        return DriveSettings(
+            "rotation",
+            self.rotation_node_id,
+            SERVO,
+            MotorSettings(
+                counts_per_unit=scale,
+                max_speed=self.rotation_max_speed * scale,
+                lag=self.rotation_lag,
+            ),
+            LimitAction(self.limit_action),
+            self.boot_time,
+        )

@@ -1,0 +1,166 @@
+"""sim_rig's own device at levels tip and camera: the motion supervisor on simulated axes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+
+from needle_common.errors import UserError
+from needle_common.ros.base_node import DiagnosticsPublisher
+from needle_device_driver.ros.device_interface import DeviceInterface
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.reports import StepResult
+from needle_device_driver.supervisor.states import Activity
+from needle_device_driver.supervisor.supervisor import MotionSupervisor
+from needle_sim.rig.bench import SimulatedBench
+from needle_sim.rig.simulated_axis import SimulatedAxis
+
+
+class OwnDevice:
+    """Answers to `device/...` and moves the bench.
+
+    Parameters
+    ----------
+    node : Node
+        Gets the interface.
+    diagnostics : DiagnosticsPublisher
+        Where the device's health goes.
+    bench : SimulatedBench
+        What is moved.
+    limits : SafetyLimits
+        The supervisor's.
+    in_lock_step : bool
+        A hold that falls silent pauses instead of aborting.
+    refuse : callable
+        Returns why services are not ready yet; empty when they are.
+    on_step_end : callable
+        Called after each result.
+    now : float
+        Steady time [s].
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        diagnostics: DiagnosticsPublisher,
+        bench: SimulatedBench,
+        limits: SafetyLimits,
+        *,
+        in_lock_step: bool,
+        refuse: Callable[[], str],
+        on_step_end: Callable[[], None],
+        now: float,
+    ) -> None:
+        self._bench = bench
+        self._insertion = SimulatedAxis("insertion")
+        self._rotation = SimulatedAxis("rotation")
+        self._supervisor = MotionSupervisor(
+            self._insertion, self._rotation, limits, pause_on_lapse=in_lock_step
+        )
+        self._supervisor.configure(now)
+
+        def on_result(_: StepResult) -> None:
+            on_step_end()
+
+        self._interface = DeviceInterface(
+            node,
+            self._supervisor,
+            diagnostics,
+            simulated=True,
+            refuse=refuse,
+            on_result=on_result,
+        )
+
+    @property
+    def publishers(self) -> list[Publisher[Any]]:
+        """What partners must listen to."""
+        interface = self._interface
+        return [interface.joint_states, interface.results, interface.statuses]
+
+    @property
+    def subscriptions(self) -> list[Subscription[Any]]:
+        """What partners must publish."""
+        return [self._interface.commands, self._interface.holds]
+
+    def missing(self) -> list[str]:
+        """Return what else is not there yet: nothing.
+
+        Raises
+        ------
+        UserError
+            If there is another device.
+        """
+        if self._interface.others:
+            raise UserError(self._interface.others)
+        return []
+
+    def observe(self, now: float) -> None:
+        """Look at axes and hold."""
+        self._supervisor.observe(now)
+
+    def under_way(self) -> bool:
+        """Return whether a step, retraction or homing is under way."""
+        return self._supervisor.activity is not Activity.NONE
+
+    def may_move(self, now: float) -> bool:
+        """Return whether it would go on if time did."""
+        return self._supervisor.may_move(now)
+
+    def held(self, now: float) -> bool:
+        """Return whether somebody's hold counts."""
+        return bool(self._supervisor.status(now).hold_owner)
+
+    def begin_tick(self, time_ns: int, period: float, now: float) -> None:
+        """Let `period` [s] go by that ends at `time_ns` [ns]."""
+        self._supervisor.note_time(time_ns, now)
+        self._supervisor.drive(period, now)
+        self._insertion.advance(period)
+        self._rotation.advance(period)
+        self._bench.move_to(self._insertion.position, self._rotation.position)
+        self._supervisor.observe(now)
+
+    def end_tick(self, time_ns: int, _: float) -> bool:
+        """Tell what the tick came to; returns whether it is over."""
+        self._interface.publish_joint_states(time_ns)
+        self._interface.report()
+        return True
+
+    @property
+    def patience(self) -> float:
+        """How long to wait for callbacks while a tick is under way [s]: it never is."""
+        return 0.0
+
+    def idle(self, time_ns: int, now: float, *, repeat: bool) -> None:
+        """Look after the device while time stands still.
+
+        Parameters
+        ----------
+        time_ns : int
+            The time [ns].
+        now : float
+            Steady time [s].
+        repeat : bool
+            Whether somebody may have missed the joints.
+        """
+        self._supervisor.note_time(time_ns, now)
+        self._interface.report()
+        if repeat:
+            self._interface.publish_joint_states(time_ns)
+
+    def count_watchdog_trip(self) -> None:
+        """Count a watchdog of sim_rig's."""
+        self._supervisor.count_watchdog_trip()
+
+    def end_run(self, reason: str) -> None:
+        """Stop both axes for good."""
+        self._supervisor.fail(reason)
+
+    def close(self) -> None:
+        """Stop the simulated axes and say so."""
+        self._supervisor.close()
+        self._interface.report()
+        self._interface.close()

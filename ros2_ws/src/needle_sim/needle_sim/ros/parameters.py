@@ -1,0 +1,114 @@
+"""The parameters of sim_rig."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+from needle_common.errors import UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_device_driver.ros.limit_parameters import limit_parameter, limits_of
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_sim.camera.scenarios import CLEAN, SCENARIOS
+
+LEVELS = ("tip", "camera", "drive")
+
+
+@dataclasses.dataclass(frozen=True)
+class SimRigParameters:
+    """Parameters of sim_rig, fixed at start; `check` in `__post_init__` refuses what cannot be."""
+
+    level: str = fixed_parameter(
+        "camera",
+        "-",
+        "tip: measured tips; camera: images; drive: images and emulated drives.",
+        choices=LEVELS,
+    )
+    seed: int = fixed_parameter(
+        0, "-", "Keys all chance; the same seed gives the same run in lock step.", 0, 2**31 - 1
+    )
+    real_time_factor: float = fixed_parameter(
+        0.0,
+        "-",
+        "Simulated over real time; 0 is lock step, as fast as the graph answers.",
+        0.0,
+        100.0,
+    )
+    curvature: float = fixed_parameter(
+        1.0 / 0.122, "1/m", "Curvature of the needle's path in this tissue.", 0.0, 100.0
+    )
+    initial_pitch: float = fixed_parameter(
+        0.0, "rad", "Pitch of the needle at its entry point.", -math.pi / 2, math.pi / 2
+    )
+    initial_roll: float = fixed_parameter(
+        0.0, "rad", "Roll of the bevel at the entry point.", -math.pi, math.pi
+    )
+    tip_noise: float = fixed_parameter(
+        0.001, "m", "Level tip: largest error of each measured coordinate, uniform.", 0.0, 0.1
+    )
+    torsion_play: float = fixed_parameter(
+        0.0, "rad", "Dead band between base and tip angle, either way.", 0.0, math.pi
+    )
+    torsion_lag: float = fixed_parameter(
+        0.0, "m", "First-order lag of the tip's angle in inserted length.", 0.0, 1.0
+    )
+    camera_rate: float = fixed_parameter(
+        10.0,
+        "Hz",
+        "Exposures per simulated second; lock step exposes when one is due instead.",
+        0.1,
+        50.0,
+    )
+    calibration_file: str = fixed_parameter(
+        "", "-", "Calibration of the simulated cameras; empty: needle_tracker's own."
+    )
+    scenario: str = fixed_parameter(
+        CLEAN.name, "-", "What troubles the cameras.", choices=tuple(SCENARIOS)
+    )
+    images: str = fixed_parameter(
+        "", "-", "New folder for every image, calibration, insertions and truth; empty: none."
+    )
+    wait_for_recorder: bool = fixed_parameter(
+        False,
+        "-",
+        "Time starts only when a node named recorder listens to everything and all "
+        "partners know this node.",
+    )
+    reexpose_after: float = fixed_parameter(
+        2.0,
+        "s",
+        "Lock step: expose again when a steered, held needle hears nothing so long.",
+        0.1,
+        60.0,
+    )
+    tick_timeout: float = fixed_parameter(
+        0.5, "s", "Level drive: how long driver and drives may leave a tick unanswered.", 0.02, 60.0
+    )
+    max_depth: float = limit_parameter("max_depth")
+    max_step_length: float = limit_parameter("max_step_length")
+    max_speed: float = limit_parameter("max_speed")
+    max_rotation_step: float = limit_parameter("max_rotation_step")
+    max_rotation_rate: float = limit_parameter("max_rotation_rate")
+    max_turns: float = limit_parameter("max_turns")
+    hold_timeout: float = limit_parameter("hold_timeout")
+    tip_age_limit: float = limit_parameter("tip_age_limit")
+    retraction_speed: float = limit_parameter("retraction_speed")
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be simulated.
+
+        Raises
+        ------
+        UserError
+            A parameter out of bounds, or images wanted of a level that has none.
+        """
+        check_fields(self)
+        if self.level == "tip" and self.scenario != CLEAN.name:
+            raise UserError(f"scenario = {self.scenario!r}: level tip has no images")
+        if self.level == "tip" and self.images:
+            raise UserError(f"images = {self.images!r}: level tip has no images")
+
+    @property
+    def limits(self) -> SafetyLimits:
+        """The motion supervisor's limits."""
+        return limits_of(self)

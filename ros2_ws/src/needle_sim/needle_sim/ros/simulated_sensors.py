@@ -1,0 +1,163 @@
+"""What sim_rig exposes: the measured tip at level tip, images of the needle at the others."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ament_index_python.packages import get_package_share_directory
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from sensor_msgs.msg import CameraInfo, Image
+
+from needle_common.ros.conversions import IMAGES, RELIABLE
+from needle_sim.camera.image_folder import ImageFolder, truth_of
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.scenarios import SCENARIOS
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.rig.bench import SimulatedBench
+from needle_sim.ros.conversions import to_camera_info, to_image, to_tip, to_tip_pose
+from needle_sim.ros.parameters import SimRigParameters
+
+_FRAMES = ("left_camera_optical", "right_camera_optical")
+_CENTRELINE_SPACING = 0.001
+
+
+class SimulatedTips:
+    """Publishes the tip with the noise of each exposure.
+
+    Parameters
+    ----------
+    node : Node
+        Gets the publishers.
+    bench : SimulatedBench
+        What is measured.
+    values : SimRigParameters
+        The node's.
+    """
+
+    surface_height = math.inf
+    """Where the phantom ends, either way [m]: without cameras nowhere."""
+
+    def __init__(self, node: Node, bench: SimulatedBench, values: SimRigParameters) -> None:
+        self._bench = bench
+        self._noise = values.tip_noise
+        self._tip = node.create_publisher(PointStamped, "needle/tip", RELIABLE)
+        self._tip_pose = node.create_publisher(
+            PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE
+        )
+
+    @property
+    def publishers(self) -> list[Publisher[Any]]:
+        """All of its publishers."""
+        return [self._tip, self._tip_pose]
+
+    @property
+    def heard(self) -> list[Publisher[Any]]:
+        """What partners must listen to."""
+        return [self._tip]
+
+    @property
+    def subscriptions(self) -> list[Subscription[Any]]:
+        """What partners must publish."""
+        return []
+
+    def expose(self, number: int, stamp: Time) -> None:
+        """Publish the measurement of an exposure."""
+        tip = self._bench.measure_tip(number)
+        self._tip_pose.publish(to_tip_pose(tip, self._noise, stamp))
+        self._tip.publish(to_tip(tip, stamp))
+
+    def close(self) -> None:
+        """Do nothing: nothing is open."""
+
+
+class SimulatedCameras:
+    """Publishes rendered image pairs, and writes them into a folder where that is wanted.
+
+    Parameters
+    ----------
+    node : Node
+        Gets publishers and subscription.
+    bench : SimulatedBench
+        What is seen.
+    values : SimRigParameters
+        The node's.
+    on_answer : callable
+        Called with what the tracker says of each pair.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        bench: SimulatedBench,
+        values: SimRigParameters,
+        on_answer: Callable[[PoseWithCovarianceStamped], None],
+    ) -> None:
+        self._bench = bench
+        file = values.calibration_file or str(
+            Path(get_package_share_directory("needle_tracker")) / "config" / "calibration.yaml"
+        )
+        rig = load_stereo_rig(file)
+        self.surface_height = rig.surface_height
+        self._cameras = (rig.left, rig.right)
+        scenario = SCENARIOS[values.scenario]
+        self._has_needle = scenario.needle
+        self._renderer = StereoRenderer(rig, values.seed, scenario=scenario)
+        self._folder: ImageFolder | None = None
+        if values.images:
+            self._folder = ImageFolder(Path(values.images).expanduser(), Path(file))
+        self._views = [
+            (
+                node.create_publisher(Image, f"stereo/{side}/image_raw", IMAGES),
+                node.create_publisher(CameraInfo, f"stereo/{side}/camera_info", IMAGES),
+            )
+            for side in ("left", "right")
+        ]
+        self._answers = node.create_subscription(
+            PoseWithCovarianceStamped, "needle/tip_pose", on_answer, RELIABLE
+        )
+
+    @property
+    def publishers(self) -> list[Publisher[Any]]:
+        """All of its publishers."""
+        return [publisher for view in self._views for publisher in view]
+
+    @property
+    def heard(self) -> list[Publisher[Any]]:
+        """What partners must listen to."""
+        return [image_raw for image_raw, _ in self._views]
+
+    @property
+    def subscriptions(self) -> list[Subscription[Any]]:
+        """What partners must publish."""
+        return [self._answers]
+
+    def expose(self, number: int, stamp: Time) -> None:
+        """Publish the images of an exposure."""
+        pose = self._bench.plant.T_rig_tip
+        line = self._bench.plant.centreline(_CENTRELINE_SPACING)
+        images = self._renderer.render(pose, line, number)
+        if self._folder is not None:
+            self._folder.write(
+                number,
+                images,
+                self._bench.insertion,
+                truth_of(pose) if self._has_needle and len(line) > 1 else None,
+                self._renderer.share_seen(pose, line, number),
+            )
+        for image, frame, camera, (image_raw, camera_info) in zip(
+            images, _FRAMES, self._cameras, self._views, strict=True
+        ):
+            camera_info.publish(to_camera_info(camera, frame, stamp))
+            image_raw.publish(to_image(image, frame, stamp))
+
+    def close(self) -> None:
+        """End the folder's files."""
+        if self._folder is not None:
+            self._folder.close()

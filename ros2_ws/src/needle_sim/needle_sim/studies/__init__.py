@@ -1,0 +1,1 @@
+"""Thousands of simulated needles at a time."""

@@ -1,0 +1,172 @@
+"""What goes wrong in a study: with the measured tips, and with the tissue's curvature.
+
+The controller is told of none of it.
+"""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_common.compiled import compiled
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies import study_noise
+
+OUTLIER_SIZE = (0.005, 0.010)
+"""How far an outlier is off [m]."""
+PATCH_LENGTH = 0.020
+"""Insertion over which the curvature stays the same [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Disturbances:
+    """All that can go wrong; nothing does by default.
+
+    Attributes
+    ----------
+    noise : float
+        Largest error of a measured coordinate, uniform [m].
+    outliers : float
+        Share of measurements that are off by 5-10 mm in a random direction instead.
+    dropped : float
+        Share of measurements that are missing.
+    delay : int
+        How many steps late a measurement arrives.
+    pitch_noise : float
+        Largest error of a measured pitch, uniform, for controllers that measure it [rad].
+    curvature_scale : float
+        The plant's curvature as a multiple of what the controller assumes.
+    curvature_patches : float
+        The curvature is off by up to this share, uniform, anew every 20 mm for each needle.
+    play : float
+        Dead band of the shaft's torsion, +- [rad].
+    lag_length : float
+        Lag of the shaft's torsion [m].
+    """
+
+    noise: float = 0.0
+    outliers: float = 0.0
+    dropped: float = 0.0
+    delay: int = 0
+    pitch_noise: float = 0.0
+    curvature_scale: float = 1.0
+    curvature_patches: float = 0.0
+    play: float = 0.0
+    lag_length: float = 0.0
+
+
+def measured(
+    tips: FloatArray, disturbances: Disturbances, seed: int, exposure: int, first: int
+) -> FloatArray:
+    """Return what is measured of some needles' tips.
+
+    The first measurement, exposure 0, is neither an outlier nor missing: the needle rests at its
+    entry point, which is known, and the rig waits there until it has seen the tip.
+
+    Parameters
+    ----------
+    tips : ndarray, shape (N, 3)
+        The true tips [m].
+    disturbances : Disturbances
+        What goes wrong.
+    seed, exposure, first : int
+        Key the randomness: of the study, the exposure and the first needle.
+
+    Returns
+    -------
+    ndarray, shape (N, 3)
+        The measured tips [m]; NaN where missing.
+    """
+    count = len(tips)
+    share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
+    seen = np.empty((count, 3))
+    _add_noise(tips, share, disturbances.noise, seen)
+    if exposure == 0:
+        return seen
+    if disturbances.outliers > 0.0:
+        chance = study_noise.uniform(seed, study_noise.OUTLIER, exposure, first, count)[:, 0]
+        off = tips + _outliers(seed, exposure, first, count)
+        seen = np.where((chance < disturbances.outliers)[:, np.newaxis], off, seen)
+    if disturbances.dropped > 0.0:
+        chance = study_noise.uniform(seed, study_noise.MISSED, exposure, first, count)[:, 0]
+        seen[chance < disturbances.dropped] = np.nan
+    return seen
+
+
+def measured_pitch(
+    pitch: FloatArray, disturbances: Disturbances, seed: int, exposure: int, first: int
+) -> FloatArray:
+    """Return what is measured of some needles' pitch, (N,) [rad]; see `measured`."""
+    share = study_noise.uniform(seed, study_noise.PITCH, exposure, first, len(pitch))[:, 0]
+    off = 2.0 * share.astype(np.float64) - 1.0
+    return np.asarray(pitch + disturbances.pitch_noise * off)
+
+
+def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
+    """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
+    share = study_noise.uniform(seed, study_noise.CURVATURE, patch, first, count)[:, 0]
+    return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
+
+
+class DelayLine:
+    """Measurements that arrive some steps late.
+
+    The first one arrives before the needle moves; until the second does, nothing arrives.
+
+    Parameters
+    ----------
+    steps : int
+        How many steps late, >= 0.
+    """
+
+    def __init__(self, steps: int) -> None:
+        self._steps = steps
+        self._under_way: collections.deque[tuple[FloatArray, float]] = collections.deque()
+
+    def pass_on(self, tips: FloatArray, insertion: float) -> tuple[FloatArray, float]:
+        """Take what was exposed now; return what arrives now.
+
+        Parameters
+        ----------
+        tips : ndarray, shape (N, 3)
+            Measured at this insertion [m]; further columns come along.
+        insertion : float
+            Where the needles are now [m].
+
+        Returns
+        -------
+        tips : ndarray, shape (N, 3)
+            Measured earlier [m]; NaN if nothing arrives.
+        age : float
+            Insertion since [m].
+        """
+        if self._steps == 0:
+            return tips, 0.0
+        self._under_way.append((tips, insertion))
+        if len(self._under_way) <= self._steps:
+            return np.full_like(tips, np.nan), 0.0
+        late, then = self._under_way.popleft()
+        return late, insertion - then
+
+
+@compiled
+def _add_noise(
+    tips: FloatArray, share: NDArray[np.float32], amplitude: float, seen: FloatArray
+) -> None:
+    for i in range(tips.shape[0]):
+        for j in range(3):
+            seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
+
+
+def _outliers(seed: int, exposure: int, first: int, count: int) -> FloatArray:
+    numbers = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+    share = numbers.astype(np.float64)
+    up = 2.0 * share[:, 0] - 1.0
+    across = np.sqrt(1.0 - up * up)
+    around = 2.0 * np.pi * share[:, 1]
+    direction = np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)
+    low, high = OUTLIER_SIZE
+    return np.asarray(direction * (low + (high - low) * share[:, 2, np.newaxis]))

@@ -1,0 +1,140 @@
+"""How well a study's runs went: one row for each run, and the figures over all of them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_sim.needle.se3 import FloatArray
+
+BAND = 1e-3
+"""Half width of what counts as in the plane [m]: the paper's +-1 mm."""
+LAST_STEPS = 20
+"""Steps at the end over which a run is judged."""
+
+BoolArray = NDArray[np.bool_]
+
+
+@dataclasses.dataclass(frozen=True)
+class Outcomes:
+    """What became of each run; all of it from the true tips.
+
+    Attributes
+    ----------
+    x_start, x_end : ndarray, shape (N,)
+        Distance from the plane at insertion 0 and at the end [m].
+    x_last : ndarray, shape (N, K)
+        Distance from the plane after each of the last K = `LAST_STEPS` steps [m].
+    settled : ndarray, shape (N,)
+        Insertion at which the tip entered the band for the last time [m]; infinite if it ended
+        outside.
+    rotation : ndarray, shape (N,)
+        Sum of all the base turned, either way [rad].
+    """
+
+    x_start: FloatArray
+    x_last: FloatArray
+    settled: FloatArray
+    rotation: FloatArray
+
+    @property
+    def x_end(self) -> FloatArray:
+        """Distance from the plane at the end, (N,) [m]."""
+        return np.asarray(self.x_last[:, -1])
+
+    @property
+    def converged_at_end(self) -> BoolArray:
+        """Whether |x| <= 1 mm at the end."""
+        return np.asarray(np.abs(self.x_end) <= BAND)
+
+    @property
+    def converged_last_steps(self) -> BoolArray:
+        """Whether |x| <= 1 mm after each of the last steps."""
+        return np.asarray(np.all(np.abs(self.x_last) <= BAND, axis=1))
+
+    @property
+    def diverged(self) -> BoolArray:
+        """Whether a run that missed ended farther off than it started, and still moved away."""
+        end = np.abs(self.x_end)
+        away = (end > np.abs(self.x_start)) & (end > np.abs(self.x_last[:, 0]))
+        return np.asarray(~self.converged_at_end & away)
+
+
+def joined(parts: Sequence[Outcomes]) -> Outcomes:
+    """Return the outcomes of all parts as one."""
+    names = [field.name for field in dataclasses.fields(Outcomes)]
+    return Outcomes(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+
+
+class Tally:
+    """Follows some needles from start to end, in memory that does not grow with the steps.
+
+    Parameters
+    ----------
+    x : ndarray, shape (N,)
+        Distance from the plane at insertion 0 [m].
+    steps : int
+        How many steps there will be.
+    """
+
+    def __init__(self, x: FloatArray, steps: int) -> None:
+        self._start = np.array(x)
+        self._skip = max(steps - LAST_STEPS, 0)
+        self._last: FloatArray = np.empty((min(steps, LAST_STEPS), len(x)))
+        self._step = 0
+        self._settled: FloatArray = np.where(np.abs(x) <= BAND, 0.0, np.inf)
+        self._rotation: FloatArray = np.zeros(len(x))
+
+    def add(self, x: FloatArray, insertion: float, turned: FloatArray) -> None:
+        """Take one step.
+
+        Parameters
+        ----------
+        x : ndarray, shape (N,)
+            Distance from the plane after it [m].
+        insertion : float
+            Inserted length after it [m].
+        turned : ndarray, shape (N,)
+            What the base turned in it [rad].
+        """
+        outside = np.abs(x) > BAND
+        # infinite while outside; the insertion of the entry once inside again
+        np.minimum(self._settled, insertion, out=self._settled)
+        self._settled[outside] = np.inf
+        self._rotation += np.abs(turned)
+        if self._step >= self._skip:
+            self._last[self._step - self._skip] = x
+        self._step += 1
+
+    def outcomes(self) -> Outcomes:
+        """Return what became of the needles."""
+        return Outcomes(self._start, self._last.T.copy(), self._settled, self._rotation)
+
+
+def figures(outcomes: Outcomes) -> dict[str, float | None]:
+    """Return the figures of a study, by the names of `monte_carlo --json`.
+
+    Settling figures are over the runs that ended inside the band, for the others never settled;
+    null if there is none.
+    """
+    at_end = outcomes.converged_at_end
+    last = np.abs(outcomes.x_last) * 1e3
+    end = np.abs(outcomes.x_end) * 1e3
+    settled = outcomes.settled[at_end] * 1e3
+    return {
+        "converged_at_end": float(np.mean(at_end)),
+        "converged_last_20": float(np.mean(outcomes.converged_last_steps)),
+        "rms_last_20_mm": float(np.sqrt(np.mean(last**2))),
+        "p95_last_20_mm": float(np.percentile(last, 95.0)),
+        "max_last_20_mm": float(np.max(last)),
+        "settle_median_mm": float(np.median(settled)) if settled.size else None,
+        "settle_p95_mm": float(np.percentile(settled, 95.0)) if settled.size else None,
+        "rotation_mean_deg": float(np.rad2deg(np.mean(outcomes.rotation))),
+        "final_p95_mm": float(np.percentile(end, 95.0)),
+        "final_max_mm": float(np.max(end)),
+        "missed_runs": float(np.sum(~at_end)),
+        "diverged": float(np.mean(outcomes.diverged)),
+    }

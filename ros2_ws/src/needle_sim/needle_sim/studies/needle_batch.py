@@ -1,0 +1,174 @@
+"""Many needles at once, compiled: the plant of a study, step for step that of `plant.NeedlePlant`.
+
+It follows [KC09] (1)-(2) with the unicycle's tip (l2 = 0): one combined twist a call. It keeps no
+channel: studies only insert.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from needle_common.compiled import compiled
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.needle.tissue import Torsion
+
+# Square of the largest angle of one step for which the series below are exact to the last digit.
+_SERIES_UP_TO = 0.5
+_TERMS = 9
+# Their coefficients, the highest power first.
+_FIRST = tuple((-1.0) ** k / math.factorial(2 * k + 1) for k in reversed(range(_TERMS)))
+_SECOND = tuple((-1.0) ** k / math.factorial(2 * k + 2) for k in reversed(range(_TERMS)))
+_THIRD = tuple((-1.0) ** k / math.factorial(2 * k + 3) for k in reversed(range(_TERMS)))
+
+
+class NeedleBatch:
+    """The tips of many needles, from their starts on.
+
+    Parameters
+    ----------
+    starts : ndarray, shape (N, 3)
+        x [m], pitch, roll [rad] of each needle at insertion 0; y, z and yaw are 0.
+    torsion : Torsion, optional
+        Torsion of the shafts; none by default.
+    """
+
+    def __init__(self, starts: FloatArray, torsion: Torsion | None = None) -> None:
+        x, pitch, roll = np.asarray(starts, dtype=np.float64).T
+        cp, sp, cr, sr = np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll)
+        none = np.zeros_like(x)
+        self._position: FloatArray = np.stack([x, none, none])
+        # R = Ry(pitch) Rz(roll), row by row.
+        self._rotation: FloatArray = np.stack(
+            [cp * cr, -cp * sr, sp, sr, cr, none, -sp * cr, sp * sr, cp]
+        )
+        self._torsion = torsion
+
+    @property
+    def x(self) -> FloatArray:
+        """The tips' distance from the plane, shape (N,) [m]; a view."""
+        return np.asarray(self._position[0])
+
+    @property
+    def tips(self) -> FloatArray:
+        """The tips, shape (N, 3) [m]; a view."""
+        return np.asarray(self._position.T)
+
+    @property
+    def pitch(self) -> FloatArray:
+        """The tips' pitch out of the plane, shape (N,) [rad]."""
+        return np.asarray(np.arcsin(np.clip(self._rotation[2], -1.0, 1.0)))
+
+    @property
+    def T_rig_tip(self) -> FloatArray:  # noqa: N802
+        """The tips' poses, shape (N, 4, 4) [m]."""
+        count = self._position.shape[1]
+        poses = np.zeros((count, 4, 4))
+        poses[:, :3, :3] = self._rotation.T.reshape(count, 3, 3)
+        poses[:, :3, 3] = self._position.T
+        poses[:, 3, 3] = 1.0
+        return poses
+
+    def advance(self, d_insertion: float, d_rotation: ArrayLike, curvature: ArrayLike) -> None:
+        """Insert all needles by one length, and turn each base over it.
+
+        Parameters
+        ----------
+        d_insertion : float
+            Insertion, >= 0 [m].
+        d_rotation : array_like, shape (N,)
+            Rotation of each base [rad].
+        curvature : array_like, shape (N,) or ()
+            kappa of each needle's path over that length [1/m].
+        """
+        turned = np.asarray(d_rotation, dtype=np.float64)
+        if self._torsion is not None:
+            turned = self._torsion.advance(d_insertion, turned)
+        shape = self._position.shape[1:]
+        _cut(
+            self._position,
+            self._rotation,
+            float(d_insertion),
+            np.ascontiguousarray(np.broadcast_to(turned, shape)),
+            np.ascontiguousarray(np.broadcast_to(np.asarray(curvature, dtype=np.float64), shape)),
+        )
+
+
+@compiled
+def _cut(
+    position: FloatArray,
+    rotation: FloatArray,
+    length: float,
+    turned: FloatArray,
+    curvature: FloatArray,
+) -> None:
+    """Move each tip by exp((V1 length + V2 turned)^) of (2), in closed form.
+
+    With omega = (bend, 0, turn) and K its cross-product matrix, the rotation is I + first K +
+    second K^2, and the translation length times the last column of I + second K + third K^2.
+    """
+    coefficients = np.empty((3, turned.shape[0]))
+    _fill_coefficients(length, turned, curvature, coefficients)
+    motion = (length, turned, curvature)
+    _move_row(position[0], rotation[0:3], motion, coefficients)
+    _move_row(position[1], rotation[3:6], motion, coefficients)
+    _move_row(position[2], rotation[6:9], motion, coefficients)
+
+
+@compiled
+def _fill_coefficients(
+    length: float, turned: FloatArray, curvature: FloatArray, coefficients: FloatArray
+) -> None:
+    """Set sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 for each angle a."""
+    far = 0
+    for i in range(turned.shape[0]):
+        bend = curvature[i] * length
+        square = bend * bend + turned[i] * turned[i]
+        first = second = third = 0.0
+        for k in range(_TERMS):
+            first = first * square + _FIRST[k]
+            second = second * square + _SECOND[k]
+            third = third * square + _THIRD[k]
+        coefficients[0, i] = first
+        coefficients[1, i] = second
+        coefficients[2, i] = third
+        far += square > _SERIES_UP_TO
+    if far == 0:
+        return
+    for i in range(turned.shape[0]):
+        bend = curvature[i] * length
+        square = bend * bend + turned[i] * turned[i]
+        if square > _SERIES_UP_TO:
+            angle = np.sqrt(square)
+            half = np.sin(0.5 * angle) / angle
+            coefficients[0, i] = np.sin(angle) / angle
+            coefficients[1, i] = 2.0 * half * half
+            coefficients[2, i] = (1.0 - coefficients[0, i]) / square
+
+
+@compiled
+def _move_row(
+    along_axis: FloatArray,
+    row: FloatArray,
+    motion: tuple[float, FloatArray, FloatArray],
+    coefficients: FloatArray,
+) -> None:
+    """Move one coordinate of the tips, and turn one row of their rotation matrices."""
+    length, turned, curvature = motion
+    for i in range(turned.shape[0]):
+        bend = curvature[i] * length
+        turn = turned[i]
+        first, second, third = coefficients[0, i], coefficients[1, i], coefficients[2, i]
+        r0, r1, r2 = row[0, i], row[1, i], row[2, i]
+        forward = third * bend * turn * r0 - second * bend * r1 + (1.0 - third * bend * bend) * r2
+        along_axis[i] += length * forward
+        both = second * bend * turn
+        row[0, i] = r0 * (1.0 - second * turn * turn) + r1 * (first * turn) + r2 * both
+        row[1, i] = (
+            r1 * (1.0 - second * (bend * bend + turn * turn))
+            - r0 * (first * turn)
+            + r2 * (first * bend)
+        )
+        row[2, i] = r0 * both - r1 * (first * bend) + r2 * (1.0 - second * bend * bend)

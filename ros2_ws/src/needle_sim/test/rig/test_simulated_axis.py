@@ -1,0 +1,127 @@
+"""The ideal axis, and the bench that it moves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from needle_device_driver.axes.axis import AxisError
+from needle_sim.rig.bench import SimulatedBench
+from needle_sim.rig.pace import Pace
+from needle_sim.rig.simulated_axis import SimulatedAxis
+
+PERIOD = 0.02
+
+
+def make_bench(**changes: float) -> SimulatedBench:
+    values = {
+        "curvature": 8.0,
+        "pitch": 0.03,
+        "roll": 0.2,
+        "torsion_play": 0.0,
+        "torsion_lag": 0.0,
+        "tip_noise": 1e-3,
+    }
+    return SimulatedBench(**{**values, **changes}, seed=3)
+
+
+def test_an_axis_reaches_its_target_exactly_and_in_time_both_ways() -> None:
+    axis = SimulatedAxis("insertion")
+    axis.power(True)
+    for target in (0.001, -0.002):
+        speed = abs(target - axis.position) / 0.2
+        axis.start_move(target, speed)
+        for _ in range(9):
+            axis.advance(PERIOD)
+        assert axis.position != target
+        assert abs(axis.poll(0.0).velocity) == pytest.approx(speed)
+        axis.advance(PERIOD)
+        assert axis.position == target
+        axis.advance(PERIOD)
+        assert axis.poll(0.0).velocity == 0.0
+        assert not axis.poll(0.0).moving
+
+
+def test_an_axis_that_is_off_stopped_or_at_fault_stands_still() -> None:
+    axis = SimulatedAxis("insertion")
+    with pytest.raises(AxisError, match="insertion axis cannot move: not powered"):
+        axis.start_move(1.0, 1.0)
+    axis.power(True)
+    axis.start_move(1.0, 1.0)
+    axis.stop()
+    axis.advance(PERIOD)
+    axis.start_move(1.0, 1.0)
+    axis.power(False)
+    axis.advance(PERIOD)
+    axis.power(True)
+    axis.advance(PERIOD)
+    axis.start_move(1.0, 1.0)
+    axis.fault = "stalled"
+    axis.advance(PERIOD)
+    assert axis.position == 0.0
+    with pytest.raises(AxisError, match="stalled"):
+        axis.home(1.0)
+    axis.reset()
+    axis.home(1.0)
+    assert axis.poll(7.0).homed
+    assert axis.poll(7.0).time == 7.0
+
+
+def test_homing_goes_to_zero_and_is_not_homed_until_there() -> None:
+    axis = SimulatedAxis("rotation", position=0.05)
+    axis.power(True)
+    axis.home(1.0)
+    assert not axis.poll(0.0).homed
+    assert axis.poll(0.0).moving
+    for _ in range(3):
+        axis.advance(PERIOD)
+    assert axis.position == 0.0
+    assert axis.poll(0.0).homed
+    assert not axis.poll(0.0).moving
+
+
+def test_the_needle_moves_by_what_the_axes_did() -> None:
+    bench = make_bench()
+    axes = SimulatedAxis("insertion"), SimulatedAxis("rotation")
+    for axis, target in zip(axes, (0.001, 0.3), strict=True):
+        axis.configure()
+        axis.power(True)
+        axis.start_move(target, target / 0.5)
+    for _ in range(25):
+        for axis in axes:
+            axis.advance(PERIOD)
+        bench.move_to(axes[0].position, axes[1].position)
+    assert bench.plant.insertion == pytest.approx(0.001)
+    assert bench.plant.rotation == pytest.approx(0.3)
+    assert (bench.insertion, bench.rotation) == (0.001, 0.3)
+    tip = bench.tip
+    bench.move_to(0.001, 0.3)
+    np.testing.assert_array_equal(bench.tip, tip)
+
+
+def test_noise_is_keyed_by_seed_and_exposure_and_by_nothing_else() -> None:
+    first, second = make_bench(), make_bench()
+    first.measure_tip(0)
+    np.testing.assert_array_equal(first.measure_tip(5), second.measure_tip(5))
+    assert np.any(first.measure_tip(5) != first.measure_tip(6))
+    errors = np.array([first.measure_tip(n) - first.tip for n in range(200)])
+    assert np.abs(errors).max() <= 1e-3
+    assert np.abs(errors).max(axis=0) == pytest.approx(1e-3, rel=0.1)
+    quiet = make_bench(tip_noise=0.0)
+    np.testing.assert_array_equal(quiet.measure_tip(1), quiet.tip)
+
+
+def test_pace_ticks_on_time_and_does_not_make_up_for_a_long_pause() -> None:
+    pace = Pace(PERIOD, 2.0)
+    assert pace.wait(5.0) == 0.0
+    pace.tick(5.0)
+    assert pace.wait(5.0) == pytest.approx(0.01)
+    ticks = 0
+    for now in np.arange(5.0, 6.0, 0.001):
+        if pace.wait(now) == 0.0:
+            pace.tick(now)
+            ticks += 1
+    assert ticks == pytest.approx(100, abs=1)
+    pace.tick(60.0)
+    assert pace.wait(60.0) > 0.0 or pace.lost_ticks > 5000
+    assert pace.lost_ticks > 5000

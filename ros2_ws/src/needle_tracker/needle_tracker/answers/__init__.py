@@ -1,0 +1,1 @@
+"""One answer for every stereo pair."""

@@ -1,0 +1,142 @@
+"""What the tracker has to say about its health: counters in, diagnostics out."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter, deque
+from typing import Any
+
+from needle_common.diagnostics import Diagnostic, Level
+from needle_tracker.answers.swapped_images import SUSPICION
+from needle_tracker.sources.insertion_history import InsertionHistory
+from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.track import TrackState
+
+TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
+PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
+_RATE_WINDOW = 5.0  # [s]
+_EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
+
+
+@dataclasses.dataclass
+class Health:
+    """Counters of a node's life; times are of the steady clock, as arguments [s].
+
+    Attributes
+    ----------
+    refused : Counter
+        Pairs refused before they were looked at, by reason.
+    rejected : Counter
+        Pairs that gave no believed tip, by reason.
+    swapped : bool
+        Whether left and right images seem to be swapped.
+    """
+
+    refused: Counter[str]
+    rejected: Counter[str]
+    joints_without_insertion: int = 0
+    last_refusal: tuple[float, str] | None = None
+    camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
+    swapped: bool = False
+    _last_image: dict[str, float] = dataclasses.field(default_factory=dict)
+    _first_image: float = 0.0
+    _last_unpaired: float | None = None
+    _unpaired: int = 0
+    _done: deque[tuple[float, float]] = dataclasses.field(
+        default_factory=lambda: deque(maxlen=1000)
+    )
+    _tips: int = 0
+    _single_tips: int = 0
+    _state: TrackState = TrackState.SEARCHING
+    _reason: str = "no images yet"
+
+    def image_came(self, side: str, now: float) -> None:
+        """Note an image of one side."""
+        if not self._last_image:
+            self._first_image = now
+        self._last_image[side] = now
+
+    def pair_refused(self, reason: str, now: float) -> None:
+        """Note a pair that was not looked at."""
+        self.refused[reason] += 1
+        self.last_refusal = (now, reason)
+
+    def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
+        """Note an answered pair, completed at `arrival` and answered at `now`."""
+        self._done.append((now, now - arrival))
+        self._state = measured.state
+        self._reason = measured.reason
+        if measured.tip is None:
+            self.rejected[measured.reason] += 1
+        else:
+            self._tips += 1
+            self._single_tips += bool(measured.reason)
+
+    def note_pairing(self, now: float, matcher: PairMatcher[Any]) -> None:
+        """Note whether images were dropped for want of a partner since the last call."""
+        if matcher.counts.unpaired > self._unpaired:
+            self._unpaired = matcher.counts.unpaired
+            self._last_unpaired = now
+
+    def track(self) -> Diagnostic:
+        """Return the health of the track."""
+        good = self._state in (TrackState.TRACKING, TrackState.ENTRY) and not self._reason
+        message = self._state.value + (f": {self._reason}" if self._reason else "")
+        values = {"state": self._state.value, "reason": self._reason, "tips": str(self._tips)}
+        values["tips of single views"] = str(self._single_tips)
+        values.update({f"no tip: {reason}": str(n) for reason, n in self.rejected.items()})
+        return Diagnostic(Level.OK if good else Level.WARN, message, values)
+
+    def images(self, now: float, matcher: PairMatcher[Any]) -> Diagnostic:
+        """Return the health of the images and their pairing."""
+        counts = matcher.counts
+        recent = [(at, took) for at, took in self._done if now - at <= _RATE_WINDOW]
+        latencies = sorted(took for _, took in recent)
+        values = {
+            "pairs": str(counts.pairs),
+            "rate_hz": f"{len(recent) / _RATE_WINDOW:.1f}",
+            "latency_median_ms": f"{1e3 * latencies[len(latencies) // 2]:.1f}" if recent else "",
+            "latency_max_ms": f"{1e3 * latencies[-1]:.1f}" if recent else "",
+            "left_without_right": str(counts.unpaired_left),
+            "right_without_left": str(counts.unpaired_right),
+            "pairs_refused": str(sum(self.refused.values())),
+        }
+        values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
+        return Diagnostic(*self._images_level(now, matcher), values)
+
+    def joints(self, history: InsertionHistory, silent: bool) -> Diagnostic:
+        """Return the health of the joint states."""
+        values = {
+            "without_insertion_joint": str(self.joints_without_insertion),
+            "not_finite": str(history.refused),
+            "time_ran_backwards": str(history.restarts),
+        }
+        if silent:
+            return Diagnostic(
+                Level.WARN, "no joint state follows the images: insertion unknown", values
+            )
+        if not len(history):
+            return Diagnostic(Level.OK, "no joint states yet", values)
+        return Diagnostic(Level.OK, "insertion known", values)
+
+    def _images_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
+        if self.last_refusal is not None and now - self.last_refusal[0] <= TROUBLE_SHOWN:
+            return Level.ERROR, f"pair refused: {self.last_refusal[1]}"
+        for problem in self.camera_info.values():
+            if problem:
+                return Level.ERROR, problem
+        if self.swapped:
+            return Level.WARN, f"{SUSPICION}; {_EXCHANGE}"
+        return self._pairing_level(now, matcher)
+
+    def _pairing_level(self, now: float, matcher: PairMatcher[Any]) -> tuple[Level, str]:
+        for side, other in OTHER_SIDE.items():
+            last = self._last_image.get(other, self._first_image)
+            if matcher.waiting(side) and now - last > PARTNER_LATE:
+                return Level.WARN, f"{side} images without {other}"
+        if self._last_unpaired is not None and now - self._last_unpaired <= TROUBLE_SHOWN:
+            return Level.WARN, "images without a partner were dropped"
+        if not self._last_image:
+            return Level.WARN, "no images yet"
+        return Level.OK, "pairs complete"

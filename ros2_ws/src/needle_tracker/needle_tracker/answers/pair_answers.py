@@ -1,0 +1,210 @@
+"""Images and joint states in, one answer for every stereo pair out: what the tracker's node does.
+
+An answer depends on what came, in what order, and not on when: but for `joint_timeout`, after which
+a pair no longer waits for the joint state that follows it. Times are steady, and arguments.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.answers.pre_bend import heading_of
+from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.sources.insertion_history import InsertionHistory
+from needle_tracker.sources.pairing import Pair, PairMatcher
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+from needle_tracker.tracking.triangulation import SpatialTip
+
+_NEW_RECORDING = 1_000_000_000  # [ns]: a longer step back in time begins a new recording
+_ROLL_AGE = 5_000_000_000  # [ns]
+_ROLL_SIGMA = 0.6  # a roll known worse than that takes no lean off [rad]
+
+
+@dataclasses.dataclass(frozen=True)
+class Frame:
+    """An image as it came: `pixels` (shared with the message), or what is wrong with it."""
+
+    pixels: NDArray[np.uint8] | None
+    problem: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class RollEstimate:
+    """What the controller last said: stamp [ns], axes of the tip's frame in `rig`, sigma [rad]."""
+
+    stamp: int
+    rotation: NDArray[np.float64]
+    sigma: float
+
+
+@dataclasses.dataclass(frozen=True)
+class AnsweringSettings:
+    """What is told beside the tracker's own settings.
+
+    Attributes
+    ----------
+    pair_tolerance_ns : int
+        Largest difference of the stamps of a pair [ns].
+    joint_timeout : float
+        How long a pair waits for the joint state that follows it [s], steady clock.
+    lean : float
+        Angle between heading and visible end [rad].
+    """
+
+    pair_tolerance_ns: int
+    joint_timeout: float
+    lean: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Answer:
+    """What became of a pair.
+
+    Attributes
+    ----------
+    pair : Pair of Frame
+        The images.
+    arrival : float
+        When the pair was complete [s], steady clock.
+    measured : Measurement
+        What the tracker says.
+    tip : SpatialTip or None
+        The tip to publish, its direction the heading where the roll is known; None: no tip found.
+    refused : str
+        Why the pair was not looked at; empty where it was.
+    """
+
+    pair: Pair[Frame]
+    arrival: float
+    measured: Measurement
+    tip: SpatialTip | None
+    refused: str
+
+
+class PairAnswers:
+    """Pairs images by stamp, joins the insertion at that stamp, answers every pair in order.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        The stereo rig.
+    tracker : TrackerSettings
+        The tracker's settings.
+    settings : AnsweringSettings
+        What else is told.
+    """
+
+    def __init__(
+        self,
+        calibration: StereoCalibration,
+        tracker: TrackerSettings,
+        settings: AnsweringSettings,
+    ) -> None:
+        self.tracker = StereoTracker(calibration, tracker)
+        self.tracker.warm_up()
+        self.swap = SwapWatch(calibration, tracker)
+        self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)
+        self.insertions = InsertionHistory()
+        self.joints_silent = False
+        self._settings = settings
+        self._queue: deque[tuple[float, Pair[Frame]]] = deque()
+        self._last_stamp: int | None = None
+        self._contradictions: dict[str, str] = {}
+        self._roll: RollEstimate | None = None
+        self._T_rig_plane = np.eye(3)
+
+    def add_image(self, side: str, stamp: int, frame: Frame, now: float) -> Iterator[Answer]:
+        """Take an image of one side, exposed at `stamp` [ns]; then as `ready`."""
+        pair = self.matcher.add(side, stamp, frame)
+        if pair is not None:
+            self._queue.append((now, pair))
+        return self.ready(now)
+
+    def add_contradiction(self, side: str, reason: str) -> None:
+        """Refuse all pairs while a side's camera is not the calibrated one; empty: it is."""
+        self._contradictions[side] = reason
+
+    def add_insertion(self, stamp: int, insertion: float, now: float) -> Iterator[Answer]:
+        """Take an insertion [m] sampled at `stamp` [ns]; then as `ready`."""
+        self.joints_silent = False
+        self.insertions.add(stamp, insertion)
+        return self.ready(now)
+
+    def add_plane(self, rotation: NDArray[np.float64]) -> None:
+        """Take the axes of the target plane in `rig`, (3, 3), columns."""
+        self._T_rig_plane = rotation
+
+    def add_roll(self, stamp: int, rotation: NDArray[np.float64], sigma: float) -> None:
+        """Take the estimated axes of the tip's frame in the plane, (3, 3), and its roll's sigma."""
+        self._roll = RollEstimate(stamp, self._T_rig_plane @ rotation, sigma)
+
+    def ready(self, now: float) -> Iterator[Answer]:
+        """Yield the answers, in order, to all pairs whose insertion is settled.
+
+        Each pair is looked at when its answer is asked for: the first need not wait for the rest.
+        """
+        while self._queue:
+            arrival, pair = self._queue[0]
+            if not (self.joints_silent or self.insertions.is_bracketed(pair.stamp)):
+                if now - arrival < self._settings.joint_timeout:
+                    return
+                self.joints_silent = True
+            self._queue.popleft()
+            answer = self._answer(arrival, pair)
+            yield answer
+            # No answer waits for a suspicion.
+            self._suspect(answer)
+
+    def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:
+        refused = self._refusal(pair)
+        left, right = pair.left.pixels, pair.right.pixels
+        if refused or left is None or right is None:
+            measured = self.tracker.skip(refused)
+        else:
+            measured = self.tracker.process(left, right, self.insertions.at(pair.stamp))
+        tip = measured.tip
+        if tip is not None:
+            tip = self._with_heading(tip, pair.stamp)
+        return Answer(pair, arrival, measured, tip, refused)
+
+    def _suspect(self, answer: Answer) -> None:
+        """Look whether the images seem to be swapped."""
+        pair = answer.pair
+        left, right = pair.left.pixels, pair.right.pixels
+        if left is not None and right is not None and not answer.refused:
+            self.swap.see(left, right, self.insertions.at(pair.stamp), answer.measured)
+
+    def _refusal(self, pair: Pair[Frame]) -> str:
+        """Return why a pair cannot be looked at; a long step back in time begins anew."""
+        last = self._last_stamp
+        if last is None or pair.stamp > last:
+            self._last_stamp = pair.stamp
+            problems = (pair.left.problem, pair.right.problem, *self._contradictions.values())
+            return next(filter(None, problems), "")
+        back = last - pair.stamp
+        if back >= _NEW_RECORDING:
+            self.tracker.reset()
+            self._last_stamp = pair.stamp
+        return "time of exposure ran backwards" if back else "time of exposure repeated"
+
+    def _with_heading(self, tip: SpatialTip, stamp: int) -> SpatialTip:
+        """Return the tip with its heading in the visible end's place, where the roll is known."""
+        roll = self._roll
+        if roll is None or abs(stamp - roll.stamp) > _ROLL_AGE or not roll.sigma < _ROLL_SIGMA:
+            return tip
+        heading, covariance = heading_of(
+            tip.direction,
+            tip.direction_covariance,
+            roll.rotation,
+            roll.sigma,
+            self._settings.lean,
+        )
+        return dataclasses.replace(tip, direction=heading, direction_covariance=covariance)

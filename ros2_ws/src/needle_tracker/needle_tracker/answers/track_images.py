@@ -1,0 +1,258 @@
+"""`ros2 run needle_tracker track_images`: the tracker over image files, without a graph."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import math
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from tqdm import tqdm
+
+from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_common.commands.options import CommandParser, number, output_file
+from needle_common.errors import UserError
+from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
+from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import default_settings
+
+DESCRIPTION = """\
+Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
+(numbers count as numbers), or in two videos frame by frame (names are 000000, 000001, ...).
+"""
+EPILOG = """\
+The output is a CSV file, one line for each pair:
+  name            file name (video: number of the frame)
+  valid           1 with a tip, 0 without; then the other fields are empty
+  x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
+  sigma_*_m       its standard deviations
+  pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
+The tip is measured in the images alone; the insertion says where to look and what cannot be.
+Without --insertion the first two pairs that show a needle have no tip: three have to agree.
+
+examples:
+  ros2 run needle_tracker track_images --calibration rig.yaml --left left --right right \\
+      --insertion insertion.csv --output tips.csv
+
+exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
+"""
+COLUMNS = (
+    *("name", "valid", "x_m", "y_m", "z_m"),
+    *("sigma_x_m", "sigma_y_m", "sigma_z_m", "pitch_rad", "yaw_rad"),
+)
+_NAMED = 5  # so many names are shown, the others counted
+_NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
+
+
+@dataclasses.dataclass(frozen=True)
+class TrackedSequence:
+    """What a sequence gave: CSV rows, reasons for missing tips, names that nothing was made of.
+
+    And whether left and right images seem to be swapped.
+    """
+
+    rows: list[list[str]]
+    reasons: Counter[str]
+    unreadable: list[str]
+    without_insertion: int
+    swapped: bool
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `track_images`; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    given = _parser().parse_args(words)
+    output = output_file("--output", given.output)
+    json = output_file("--json", given.json)
+    width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm") * 1e-3
+    calibration = load_calibration(Path(given.calibration))
+    insertions = read_insertions(Path(given.insertion)) if given.insertion else None
+    pairs = open_pairs(Path(given.left), Path(given.right))
+    settings = dataclasses.replace(default_settings(calibration.phantom), needle_width=width)
+    tracker = StereoTracker(calibration, settings)
+    tracker.warm_up()
+    begin = time.perf_counter()
+    tracked = track_sequence(pairs, tracker, calibration, insertions)
+    write_rows(output, tracked.rows)
+    found = sum(row[1] == "1" for row in tracked.rows)
+    result: dict[str, JsonValue] = {
+        "pairs": len(tracked.rows),
+        "tips": found,
+        "unpaired": len(pairs.unpaired),
+        "unreadable": len(tracked.unreadable),
+        "without_insertion": tracked.without_insertion,
+        "wall_s": time.perf_counter() - begin,
+    }
+    print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
+    for reason, count in tracked.reasons.most_common():
+        print(f"  no tip {count:6d} x  {reason}")
+    if tracked.swapped:
+        print(f"warning: {SUSPICION}; exchange --left and --right", file=sys.stderr)
+    _warn("without a partner", pairs.unpaired)
+    _warn("cannot be used", tracked.unreadable)
+    if pairs.cut_off:
+        print(
+            f"warning: {pairs.cut_off} pairs that the videos promise cannot be read",
+            file=sys.stderr,
+        )
+    if insertions is not None and tracked.without_insertion:
+        print(f"warning: {tracked.without_insertion} pairs have no insertion", file=sys.stderr)
+    if json is not None:
+        write_json(json, result)
+    return EXIT_DONE
+
+
+def track_sequence(
+    pairs: PairSequence,
+    tracker: StereoTracker,
+    calibration: StereoCalibration,
+    insertions: Mapping[str, float] | None,
+) -> TrackedSequence:
+    """Run the tracker over a sequence of pairs.
+
+    Parameters
+    ----------
+    pairs : PairSequence
+        The images.
+    tracker : StereoTracker
+        A fresh one.
+    calibration : StereoCalibration
+        The tracker's.
+    insertions : mapping or None
+        Insertion [m] by name (with or without the file's ending), None where not known at all.
+
+    Returns
+    -------
+    TrackedSequence
+        One row for each pair.
+
+    Raises
+    ------
+    UserError
+        The first images that can be read are not of the calibration's size.
+    """
+    rows: list[list[str]] = []
+    reasons: Counter[str] = Counter()
+    unusable: list[str] = []
+    without, last, checked = 0, None, False
+    swap = SwapWatch(calibration, tracker.settings)
+    bar = tqdm(
+        pairs,
+        total=len(pairs.names),
+        unit="pair",
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    )
+    for pair in bar:
+        insertion = None
+        if insertions is not None:
+            insertion = insertions.get(pair.name, insertions.get(Path(pair.name).stem))
+        without += insertion is None
+        if insertion is not None:
+            if last is not None and abs(insertion - last) > _NEW_RUN:
+                tracker.reset()
+            last = insertion
+        problem = pair_problem(pair, calibration)
+        if pair.left is not None and pair.right is not None and not problem:
+            measured = tracker.process(pair.left, pair.right, insertion)
+            swap.see(pair.left, pair.right, insertion, measured)
+            checked = True
+        else:
+            if not checked and pair.left is not None and pair.right is not None:
+                raise UserError(f"{pair.name}: {problem}")
+            measured = tracker.skip(problem.partition(" is ")[0] + " cannot be used")
+            unusable.append(f"{pair.name} ({problem})")
+        row = to_row(pair.name, measured)
+        if row[1] == "0":
+            entry = measured.state is TrackState.ENTRY
+            reasons["in the entry zone" if entry else measured.reason] += 1
+        rows.append(row)
+    return TrackedSequence(rows, reasons, unusable, without, swap.suspected)
+
+
+def pair_problem(pair: NamedPair, calibration: StereoCalibration) -> str:
+    """Return why a pair cannot be looked at; empty where it can."""
+    cameras = (calibration.left, calibration.right)
+    for side, image, camera in zip(SIDES, (pair.left, pair.right), cameras, strict=True):
+        if image is None:
+            return f"{side} image is unreadable or not of 8 bit"
+        if image.shape != (camera.height, camera.width):
+            return (
+                f"{side} image is {image.shape[1]}x{image.shape[0]}, the calibration is for "
+                f"{camera.width}x{camera.height}"
+            )
+    return ""
+
+
+def to_row(name: str, measured: Measurement) -> list[str]:
+    """Return a pair's line of the CSV file; a tip from the stage alone is none."""
+    tip = measured.tip
+    if tip is None or measured.state is TrackState.ENTRY:
+        return [name, "0", *[""] * (len(COLUMNS) - 2)]
+    x, y, z = tip.position.tolist()
+    sigma_x, sigma_y, sigma_z = (math.sqrt(tip.covariance[i, i]) for i in range(3))
+    d_x, d_y, d_z = tip.direction.tolist()
+    pitch, yaw = math.asin(min(max(d_x, -1.0), 1.0)), math.atan2(-d_y, d_z)
+    values = (x, y, z, sigma_x, sigma_y, sigma_z, pitch, yaw)
+    return [name, "1", *(f"{value:.9f}" for value in values)]
+
+
+def write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
+    """Write the CSV file.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            writer.writerows(rows)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _warn(what: str, names: Sequence[str]) -> None:
+    if not names:
+        return
+    shown = ", ".join(names[:_NAMED])
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    count = f"{len(names)} image" + ("s" if len(names) > 1 else "")
+    print(f"warning: {count} {what}: {shown}{more}", file=sys.stderr)
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("track_images", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add("--calibration", required=True, metavar="FILE", help="calibration file of the stereo rig")
+    add("--left", required=True, metavar="DIR", help="folder of the left images, or a video")
+    add("--right", required=True, metavar="DIR", help="folder of the right images, or a video")
+    add("--insertion", metavar="FILE", help="CSV with name,insertion_m")
+    add("--output", required=True, metavar="FILE.csv", help="where the tips go")
+    add(
+        "--needle-width-mm",
+        default="0.7",
+        metavar="W",
+        help="diameter of the needle (default: 0.7)",
+    )
+    add("--json", metavar="FILE", help="write the counts as one flat JSON object")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

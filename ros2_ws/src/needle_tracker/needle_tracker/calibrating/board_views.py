@@ -1,0 +1,128 @@
+"""From images to what both cameras saw of the board."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from needle_common.errors import UserError
+from needle_tracker.calibrating.calibration_session import Session
+from needle_tracker.calibrating.rig_model import BoardView, Corners
+from needle_tracker.optics.calibration import SIDES
+from needle_tracker.sources.image_files import Image, open_pairs
+
+Array = NDArray[np.float64]
+Sizes = dict[str, tuple[int, int]]
+
+
+def board_view(name: str, session: Session, images: dict[str, Image]) -> BoardView:
+    """Return what both cameras saw of the board in one exposure.
+
+    Parameters
+    ----------
+    name : str
+        The exposure's name; the session says by it where the board lay.
+    session : Session
+        Board and places.
+    images : dict of str to ndarray
+        The left and the right image, grey.
+    """
+    seen = []
+    for side in SIDES:
+        numbers, pixels = session.board.find(images[side])
+        seen.append(Corners(session.board.corners[numbers], pixels))
+    return BoardView(name, session.place_of(name), seen[0], seen[1])
+
+
+def views_in_folders(
+    left: Path, right: Path, session: Session, *, all_places: bool = True
+) -> tuple[list[BoardView], Sizes]:
+    """Find the board in all image pairs of two folders.
+
+    Parameters
+    ----------
+    left, right : Path
+        Folders with images of the same names, or two videos (names: the frames' numbers).
+    session : Session
+        Board and places.
+    all_places : bool
+        Whether each of the session's places must have an image.
+
+    Returns
+    -------
+    views : list of BoardView
+        One for each pair, in the order of the names.
+    sizes : dict of str to (int, int)
+        Width and height of each side's images.
+
+    Raises
+    ------
+    UserError
+        Folders, names or files that are wrong, images of different sizes, a place in the session
+        that no image has.
+    """
+    views: list[BoardView] = []
+    sizes: Sizes = {}
+    pairs = open_pairs(left, right)
+    if pairs.unpaired:
+        raise UserError(f"images without a partner ({len(pairs.unpaired)}): {pairs.unpaired[0]}")
+    for pair in tqdm(
+        pairs,
+        desc="finding the board",
+        total=len(pairs.names),
+        unit="pair",
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    ):
+        images = {}
+        for side, folder, image in (("left", left, pair.left), ("right", right, pair.right)):
+            if image is None:
+                raise UserError(f"cannot read {folder / pair.name}: not an image in 8 bit")
+            size = (image.shape[1], image.shape[0])
+            if sizes.setdefault(side, size) != size:
+                raise UserError(
+                    f"{folder / pair.name} is {size[0]}x{size[1]}, the {side} images before it "
+                    f"are {sizes[side][0]}x{sizes[side][1]}"
+                )
+            images[side] = image
+        views.append(board_view(Path(pair.name).stem, session, images))
+    used = [view.place for view in views]
+    for name, place in session.places.items():
+        if all_places and not any(place is one for one in used):
+            raise UserError(f"the session's places.{name} has no image in {left}")
+    return views, sizes
+
+
+def nothing_seen(view: BoardView) -> bool:
+    """Return whether neither camera saw the board."""
+    return not np.any([len(view.corners(side).points) for side in SIDES])
+
+
+def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) -> BoardView:
+    """Return what both cameras saw of a board that stood still, the mean of several exposures.
+
+    Parameters
+    ----------
+    name : str
+        The view's name; the session says by it where the board lay.
+    session : Session
+        Board and places.
+    pairs : list of dict of str to ndarray
+        Left and right images.
+    """
+    seen = []
+    for side in SIDES:
+        found: dict[int, list[Array]] = {}
+        for images in pairs:
+            for number, pixel in zip(*session.board.find(images[side]), strict=True):
+                found.setdefault(int(number), []).append(pixel)
+        # A corner that only some exposures show is at the border of what can be seen.
+        kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
+        pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
+        seen.append(Corners(session.board.corners[kept], pixels))
+    return BoardView(name, session.place_of(name), seen[0], seen[1])

@@ -1,0 +1,218 @@
+"""`ros2 run needle_tracker calibrate_stereo`: images of a ChArUco board to a calibration file."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
+from needle_common.commands.options import CommandParser
+from needle_common.errors import UserError
+from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
+from needle_tracker.calibrating.calibration_doubts import doubts, misfits, square_error
+from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
+from needle_tracker.calibrating.calibration_file import save_calibration
+from needle_tracker.calibrating.calibration_session import load_session
+from needle_tracker.calibrating.charuco import CharucoBoard, write_board
+from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
+from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.optics.calibration import SIDES
+
+_DESCRIPTION = """\
+Calibrate the stereo rig from images of a ChArUco board.
+
+LEFT and RIGHT hold the images of each camera, paired by file name. The session file says what the
+board is and where it lay:
+
+  board: {columns: 12, rows: 9, square: 0.010, marker: 0.0075, dictionary: DICT_5X5_100}
+  phantom: {surface_height: 0.0175, refractive_index: 1.33}      # kept where not determined
+  places:                                                        # by file name, * and ? allowed
+    surface_near: {origin: [0.0185, -0.045, 0.0025]}
+    surface_far: {origin: [0.0185, -0.045, 0.0125]}
+    under_wedge: {origin: [-0.0125, -0.045, 0.004], columns: [0.2079, 0, 0.9781],
+                  under_surface: true, sigma: 2.0e-5}
+
+All in metres, in the frame `rig` (x up, z along the insertion, origin at the needle's entry point).
+`origin` is the outer corner of the pattern's first square: the top left one as printed, with the
+first marker beside it. `columns` is the direction in which the columns count (the print's left to
+right; default [0, 0, 1], along the insertion), `rows` that of the rows (top to bottom; default
+[0, 1, 0]). So a board flat on the surface lies print up, its first corner nearest to the entry and
+at the smallest y, its x = surface height + thickness of the board. It defines `rig`; laid there
+twice, a measured way apart, it tells whether the squares have the size that is said.
+
+An image whose name has no place is a board held freely in air: at least 6, better 20, tilted by 15
+to 45 deg in all directions. Boards under the surface, of known place and at different depths (a
+wedge), tell refractive index and surface height; `sigma` is how well the place is known.
+"""
+_SCALE_TOLD = 0.1  # [%]
+_EPILOG = """\
+writes: FILE.yaml, FILE.rig.png (cameras, surface, boards), FILE.residuals.png
+
+examples:
+  ros2 run needle_tracker calibrate_stereo --board board.pdf
+  ros2 run needle_tracker calibrate_stereo --left L --right R --session S.yaml --output rig.yaml
+
+exit codes: 0 done; 1 calibrated and written, but tips are not expected within --goal-mm, or places
+and squares contradict each other; 2 bad input or a set of views that cannot determine the rig
+(nothing written); 130 interrupted
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    return run_command(lambda: calibrate_stereo(sys.argv[1:] if arguments is None else arguments))
+
+
+def calibrate_stereo(arguments: Sequence[str]) -> int:
+    """Calibrate as the command line says, print and write the result."""
+    options = _parser().parse_args(arguments)
+    if options.board is not None:
+        board = CharucoBoard() if options.session is None else load_session(options.session).board
+        write_board(board, options.board)
+        print(f"{options.board}: print at 100 %, then measure the squares")
+        return EXIT_DONE
+    for name in ("left", "right", "session", "output"):
+        if getattr(options, name) is None:
+            raise UserError(f"--{name} is missing; see --help")
+    if not (math.isfinite(options.goal_mm) and options.goal_mm > 0.0):
+        raise UserError(f"--goal-mm {options.goal_mm} is not above 0")
+    if not options.output.parent.is_dir():
+        raise UserError(f"--output {options.output}: {options.output.parent} is not a folder")
+    session = load_session(options.session)
+    views, sizes = views_in_folders(options.left, options.right, session)
+    empty = [view.name for view in views if nothing_seen(view) and view.place is None]
+    if all(nothing_seen(view) for view in views):
+        raise UserError(
+            f"none of {len(views)} image pairs shows the session's board ({session.board}): is it "
+            "another one?"
+        )
+    if empty:
+        print(f"left out, no board found: {', '.join(empty)}")
+    result = calibrate([view for view in views if view.name not in empty], sizes, session.phantom)
+    size = square_error(result)
+    problems = doubts(result, size)
+    text = "\n".join(
+        [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    )
+    print(text)
+    save_calibration(options.output, result.calibration, text.splitlines())
+    save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
+    save_figure(residual_figure(result), options.output.with_suffix(".residuals.png"))
+    if options.json is not None:
+        write_json(
+            options.json,
+            figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None},
+        )
+    print(f"written: {options.output}")
+    good = not problems and 1e3 * result.tip_error_p95 <= options.goal_mm
+    return EXIT_DONE if good else EXIT_MISSED
+
+
+def view_set(view: BoardView) -> str:
+    """Return which set a view is of: free, surface (known place in air) or under."""
+    if view.place is None:
+        return "free"
+    return "under" if view.under_surface else "surface"
+
+
+def reprojection_by_set(result: RigCalibration) -> dict[tuple[str, str], float]:
+    """Return the reprojection error by camera and set of views, rms [px]; only sets there are."""
+    errors = {}
+    sets = [view_set(view) for view in result.model.views]
+    for side in SIDES:
+        of_corner = np.array(sets)[result.model.view_of[side]]
+        for name in ("free", "surface", "under"):
+            chosen = result.residuals(side)[of_corner == name]
+            if len(chosen):
+                errors[side, name] = float(np.sqrt(np.mean(np.sum(chosen**2, axis=-1))))
+    return errors
+
+
+def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) -> str:
+    """Return a calibration as a person reads it."""
+    sets = [view_set(view) for view in result.model.views]
+    counts = ", ".join(f"{sets.count(name)} {name}" for name in ("free", "surface", "under"))
+    lines = [
+        f"views: {counts}; corners: {len(result.model.pixels['left'])} left, "
+        f"{len(result.model.pixels['right'])} right, each to {result.fit.corner_sigma_px:.3f} px"
+    ]
+    lines += [
+        f"reprojection error, {side} camera, {name} boards: {error:.3f} px rms"
+        for (side, name), error in reprojection_by_set(result).items()
+    ]
+    lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
+    for name, found in result.parameters.items():
+        scale, unit = (1e3, " mm") if name == "surface_height" else (1.0, "")
+        value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
+        if not found.kept:
+            lines.append(f"{name}: {value:.5g}{unit} +- {sigma:.2g}{unit}")
+        elif math.isfinite(sigma):
+            lines.append(
+                f"{name}: NOT DETERMINED by these views (+- {sigma:.2g}{unit}), kept at the given "
+                f"{given:g}{unit}"
+            )
+        else:
+            lines.append(f"{name}: not asked of these views, kept at the given {given:g}{unit}")
+    error, sigma = (100.0 * value for value in size)
+    if sigma < _SCALE_TOLD:
+        lines.append(f"size of the squares: {error:+.2f} +- {sigma:.2f} % beside the session's")
+    else:
+        lines.append(
+            "size of the squares: not told by these views (a board laid on the surface twice, "
+            "10 mm or more apart, tells it); tips are wrong by as much as it is"
+        )
+    error_mm = 1e3 * result.tip_error_p95
+    verdict = "within" if error_mm <= goal_mm else "NOT within"
+    lines.append(
+        f"expected error of a tip in the phantom from what was determined, 95 %: {error_mm:.3f} mm "
+        f"({verdict} {goal_mm:g} mm)"
+    )
+    if result.parameters["refractive_index"].kept or result.parameters["surface_height"].kept:
+        lines.append(
+            "an error of a given value comes on top: about 0.14 mm for 0.01 of the index, 0.31 mm "
+            "for 1 mm of the surface"
+        )
+    return "\n".join(lines)
+
+
+def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
+    """Return a calibration's figures, flat, for --json."""
+    values: dict[str, JsonValue] = {
+        "views": len(result.model.views),
+        "corner_sigma_px": result.fit.corner_sigma_px,
+        "tip_error_p95_mm": 1e3 * result.tip_error_p95,
+        "goal_mm": goal_mm,
+    }
+    for (side, name), error in reprojection_by_set(result).items():
+        values[f"reprojection_{side}_{name}_px"] = error
+    for name, found in result.parameters.items():
+        key, scale = name.replace(".", "_"), 1.0
+        if name == "surface_height":
+            key, scale = "surface_height_mm", 1e3
+        elif name.split(".")[-1] in ("fx", "fy", "cx", "cy"):
+            key += "_px"
+        values[key] = scale * found.value
+        values[f"sigma_{key}"] = scale * found.sigma
+        values[f"determined_{name.replace('.', '_')}"] = not found.kept
+    return values
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("calibrate_stereo", _DESCRIPTION, _EPILOG)
+    add = parser.add_argument
+    add("--left", type=Path, metavar="DIR", help="images of the left camera")
+    add("--right", type=Path, metavar="DIR", help="images of the right camera, of the same names")
+    add("--session", type=Path, metavar="FILE", help="board, phantom and places (YAML)")
+    add("--output", type=Path, metavar="FILE.yaml", help="the calibration file to write")
+    add("--goal-mm", type=float, default=0.06, metavar="MM", help="wanted tip error (0.06)")
+    add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
+    add("--board", type=Path, metavar="FILE.pdf|.png", help="write a board to print and end")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,254 @@
+"""Finds the silent errors of a calibration by a target of known place.
+
+A camera that was touched, another refractive index, a lower surface: both rays still meet, and the
+tip is somewhere else. The target's corners do not come out where they are, and the pattern in which
+they miss says why.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_common.errors import UserError
+from needle_tracker.calibrating.calibration_start import LEAST_CORNERS
+from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
+from needle_tracker.calibrating.rig_model import (
+    LENS,
+    PHANTOM,
+    SHARED_PARAMETERS,
+    BoardView,
+    RigModel,
+    camera_slice,
+    shared_names,
+)
+from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
+from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
+from needle_tracker.optics.camera_model import optical_rays
+
+Array = NDArray[np.float64]
+
+CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
+CAUSES = (*CAMERAS, *PHANTOM)
+LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
+LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
+EXPLAINED_PX = 1.0  # a larger misfit, and the causes found explain nothing
+NOTHING_SHOWN = 1.0  # an unseen error of tips from which on a target shows nothing at all [m]
+TURN_LIMIT = np.deg2rad(0.01)  # a camera turned by more was touched, whatever it does to tips
+
+
+@dataclasses.dataclass(frozen=True)
+class Deviation:
+    """One thing that is not as the calibration says.
+
+    Attributes
+    ----------
+    cause : str
+        One of `CAUSES`.
+    size, sigma : float
+        Truth minus calibration, and its standard deviation [rad, m or -]; a camera's is the
+        angle of its turn, not negative.
+    tip_error : float
+        What it does to tips in the phantom, 95 % [m].
+    """
+
+    cause: str
+    size: float
+    sigma: float
+    tip_error: float
+
+
+@dataclasses.dataclass(frozen=True)
+class CheckResult:
+    """What a target says about a calibration.
+
+    Attributes
+    ----------
+    deviations : list of Deviation
+        What was found, the most telling first.
+    tip_error : float
+        What all of it together does to tips in the phantom, 95 % [m]; NaN where the causes do not
+        explain what is seen.
+    unseen_tip_error : float
+        What errors this target could not show, 95 % [m].
+    corner_sigma_px : float
+        What the corners miss by when everything is fitted [px].
+    reprojection_px : float
+        What they miss by with the calibration as it is, rms [px].
+    problems : list of str
+        Why the calibration is not shown to be good; empty where it is.
+    """
+
+    deviations: list[Deviation]
+    tip_error: float
+    unseen_tip_error: float
+    corner_sigma_px: float
+    reprojection_px: float
+    problems: list[str]
+
+    @property
+    def ok(self) -> bool:
+        """Whether the calibration is shown to be good."""
+        return not self.problems
+
+
+def check(calibration: StereoCalibration, views: list[BoardView], limit: float) -> CheckResult:
+    """Compare a calibration with what is seen of a target.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        What is to be checked.
+    views : list of BoardView
+        The target, at known places (or held freely in air).
+    limit : float
+        Largest error of tips in the phantom that is accepted, 95 % [m].
+
+    Returns
+    -------
+    CheckResult
+        What was found, and whether it is good enough.
+
+    Raises
+    ------
+    UserError
+        A target that one camera does not see, or none of known place.
+    """
+    for view in views:
+        for side in SIDES:
+            if len(view.corners(side).points) < LEAST_CORNERS:
+                raise UserError(
+                    f"{view.name}: the {side} camera sees {len(view.corners(side).points)} corners "
+                    f"of the target, {LEAST_CORNERS} are needed"
+                )
+    boards = np.stack([_board(calibration, view) for view in views])
+    model = RigModel(calibration, views, boards)
+    everything = _fit(model, list(CAUSES), None)
+    sigma = everything.corner_sigma_px
+    misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
+    covariance = everything.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
+    unseen = tip_error_p95(calibration, covariance)
+    asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
+    reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
+    if not misfit <= EXPLAINED_PX:
+        problem = (
+            f"corners miss by {misfit:.1f} px whatever turned camera, index or surface is assumed: "
+            "another target or place than the session says, left and right exchanged, or other "
+            "cameras"
+        )
+        return CheckResult([], np.nan, unseen, sigma, reprojection, [problem])
+    found = _causes(model, sigma)
+    best = _fit(model, found, sigma)
+    deviations = [_deviation(model, best, cause) for cause in found]
+    shift = _p95(calibration, model.calibration(best.parameters))
+    problems = []
+    if misfit > LARGEST_MISFIT_PX:
+        problems.append(
+            f"corners miss by {misfit:.2f} px in a way that no turned camera, index or surface "
+            "explains: another lens setting, or a target that is not flat or not where it is said"
+        )
+    if shift > limit:
+        problems.append(f"tips are off by {1e3 * shift:.2f} mm (95 %), allowed {1e3 * limit:g}")
+    problems += [
+        f"the {d.cause.split('_')[0]} camera was turned (or moved)"
+        for d in deviations
+        if d.cause in CAMERAS and d.size - 3.0 * d.sigma > TURN_LIMIT
+    ]
+    if unseen > limit:
+        problems.append(
+            "this target cannot show errors of tips"
+            + (f" below {1e3 * unseen:.2f} mm" if unseen < NOTHING_SHOWN else "")
+            + ": lay it at known places on and under the surface, tilted"
+        )
+    return CheckResult(deviations, shift, unseen, sigma, reprojection, problems)
+
+
+def _noise_px(views: list[BoardView]) -> float:
+    """Return a corner's noise, whatever the calibration: what a smooth map leaves [px].
+
+    A polynomial of degree 4 in the board's coordinates follows perspective, lens and refraction to
+    a few thousandths of a pixel.
+    """
+    total, spare = 0.0, 0
+    for view in views:
+        for side in SIDES:
+            seen = view.corners(side)
+            degree = 4 if len(seen.points) >= 40 else 2
+            flat = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
+            x, y = (flat / np.abs(flat).max()).T
+            terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+            basis = np.stack(terms, axis=-1)
+            rest = seen.pixels - basis @ np.linalg.lstsq(basis, seen.pixels, rcond=None)[0]
+            total += float(np.sum(rest**2))
+            spare += 2 * max(len(seen.points) - basis.shape[1], 0)
+    return float(np.sqrt(total / spare)) if spare else 0.0
+
+
+def _causes(model: RigModel, sigma: float) -> list[str]:
+    """Return the fewest causes that explain what is seen, the most telling first."""
+    found: list[str] = []
+    cost = _fit(model, found, sigma).cost
+    while len(found) < len(CAUSES):
+        costs = {c: _fit(model, [*found, c], sigma).cost for c in CAUSES if c not in found}
+        best = min(costs, key=lambda cause: costs[cause])
+        if 2.0 * (cost - costs[best]) < LEAST_IMPROVEMENT:
+            break
+        found.append(best)
+        cost = costs[best]
+    return found
+
+
+def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
+    free = board_parameters_free(model)
+    for cause in causes:
+        free[_columns(cause)] = True
+    return fit(model, model.start, free, sigma)
+
+
+def _columns(cause: str) -> list[int]:
+    """Return where a cause's parameters are: a camera's rotation, or one of the phantom's."""
+    if cause in CAMERAS:
+        start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
+        return [start, start + 1, start + 2]
+    return [shared_names().index(cause)]
+
+
+def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
+    columns = _columns(cause)
+    change = (best.parameters - model.start)[columns]
+    size = float(change[0])
+    sigma = float(best.sigma[columns[0]])
+    alone = model.start.copy()
+    alone[columns] = best.parameters[columns]
+    if cause in CAMERAS:
+        size = float(np.linalg.norm(change))
+        towards = change / max(size, 1e-12)
+        sigma = float(np.sqrt(towards @ best.covariance[np.ix_(columns, columns)] @ towards))
+    error = _p95(model.calibration(model.start), model.calibration(alone))
+    return Deviation(cause, size, sigma, error)
+
+
+def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
+    return float(np.percentile(np.linalg.norm(tip_shifts(assumed, true), axis=-1), 95.0))
+
+
+def _board(calibration: StereoCalibration, view: BoardView) -> Array:
+    """Return T_rig_board: as given, or as the left camera sees a board in air."""
+    if view.place is not None:
+        return view.place.T_rig_board
+    return np.asarray(np.linalg.inv(calibration.left.T_optical_rig) @ _seen(calibration.left, view))
+
+
+def _seen(camera: Camera, view: BoardView) -> Array:
+    rays = optical_rays(camera, view.left.pixels)
+    flat = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
+    _, rotation, translation = cv2.solvePnP(
+        view.left.points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
+    )
+    pose = np.eye(4)
+    pose[:3, :3] = cv2.Rodrigues(np.asarray(rotation).reshape(3))[0]
+    pose[:3, 3] = np.asarray(translation).reshape(3)
+    return pose

@@ -1,0 +1,136 @@
+"""Whether the boards of a calibration contradict each other.
+
+A wrong size of the squares or a wrong place hardly shows in the reprojection errors: cameras, index
+and surface give way until the corners fit, and every tip is wrong by as much. It shows in how they
+had to give way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.calibrating.rig_calibration import RigCalibration
+from needle_tracker.calibrating.rig_fit import (
+    LEAST_CORNER_SIGMA_PX,
+    outlier_weights,
+    place_deviations,
+    place_rows,
+)
+from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, BoardView
+from needle_tracker.optics.calibration import SIDES
+
+Array = NDArray[np.float64]
+
+LARGEST_PULL = 4.0  # standard deviations of a place: no noise does that
+LARGEST_SCALE_ERROR = 1e-3  # of the squares: 0.13 mm at the tip
+_LEAST_SHARE = 1e-9  # of what the size does to corners: rounding, where all of it is absorbed
+_TRANSLATION = np.arange(3, 6)  # of a board's six parameters
+
+
+def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
+    """Return in words what of the session cannot be right; empty where all goes together.
+
+    Parameters
+    ----------
+    result : RigCalibration
+        The calibration.
+    size : (float, float)
+        Its `square_error`.
+    """
+    found = [text for view, text in misfits(result) if view.place is not None]
+    error, sigma = size
+    if abs(error) > max(LARGEST_SCALE_ERROR, LARGEST_PULL * sigma):
+        found.append(
+            f"the squares come out {100 * abs(error):.2f} +- {100 * sigma:.2f} % "
+            f"{'larger' if error > 0.0 else 'smaller'} than the session says (tips are wrong by as "
+            "much): measure them again, and the places in air"
+        )
+    for name, distance, pull in place_deviations(result.model, result.fit):
+        if pull > LARGEST_PULL:
+            found.append(
+                f"{name} comes out {1e3 * distance:.2f} mm ({pull:.0f} standard deviations) from "
+                "where the session says"
+            )
+    return found
+
+
+def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
+    """Return the views whose corners miss by far more than the others', and that in words.
+
+    Parameters
+    ----------
+    result : RigCalibration
+        The calibration.
+    """
+    errors = [
+        (view, side, result.reprojection_rms_px(side, number))
+        for number, view in enumerate(result.model.views)
+        for side in SIDES
+    ]
+    typical = float(np.median([error for _, _, error in errors]))
+    return [
+        (
+            view,
+            f"{view.name}, {side} camera: {error:.2f} px rms, the others {typical:.2f}: does its "
+            "place hold, was the board flat?",
+        )
+        for view, side, error in errors
+        if error > 2.0 * typical + 0.05
+    ]
+
+
+def square_error(result: RigCalibration) -> tuple[float, float]:
+    """Return by which share the squares are larger than said, and the standard deviation.
+
+    One Gauss-Newton step of the size as a further parameter of the fit, all others free to follow.
+    It is told by the boards of known place: those held freely would only be nearer or farther.
+
+    Parameters
+    ----------
+    result : RigCalibration
+        The calibration.
+
+    Returns
+    -------
+    error, sigma : float
+        True size over the given one, less 1; infinite sigma where no two places tell it.
+    """
+    model, fitted = result.model, result.fit
+    columns = SHARED_PARAMETERS + np.arange(len(fitted.parameters) - SHARED_PARAMETERS)
+    of_boards = np.zeros(len(fitted.parameters), dtype=bool)
+    of_boards[columns.reshape(-1, 6)[:, _TRANSLATION].ravel()] = True
+    by_translation = model.jacobian(fitted.parameters, of_boards).reshape(
+        len(fitted.residuals), -1, 3
+    )
+    # A larger square moves each corner away from the board's origin.
+    moves = np.concatenate([_corners_in_rig(result, side) for side in SIDES])
+    boards = np.concatenate([model.view_of[side] for side in SIDES])
+    rows = np.arange(len(fitted.residuals))
+    of_row = np.repeat(np.arange(len(boards)), 2)
+    by_size = np.sum(by_translation[rows, boards[of_row]] * moves[of_row], axis=-1)
+
+    sigma_px = max(fitted.corner_sigma_px, LEAST_CORNER_SIGMA_PX)
+    whitened = fitted.residuals / sigma_px
+    roots = np.sqrt(outlier_weights(whitened)) / sigma_px
+    others = model.jacobian(fitted.parameters, fitted.free) * roots[:, None]
+    held = place_rows(model, fitted.free)
+    lengths = np.maximum(np.linalg.norm(others, axis=0), 1e-12)
+    matrix = np.concatenate([others, held]) / lengths
+    target = np.concatenate([by_size * roots, np.zeros(len(held))])
+    alone = (target - matrix @ np.linalg.lstsq(matrix, target, rcond=1e-13)[0])[: len(roots)]
+    information = float(alone @ alone)
+    if information <= _LEAST_SHARE * float(target @ target):
+        return 0.0, np.inf
+    return -float(alone @ (roots * fitted.residuals)) / information, information**-0.5
+
+
+def _corners_in_rig(result: RigCalibration, side: str) -> Array:
+    """Return each corner's way from its board's origin, in `rig` [m], shape (n, 3)."""
+    poses = result.model.board_poses(result.fit.parameters)
+    return np.concatenate(
+        [
+            view.corners(side).points @ pose[:3, :3].T
+            for view, pose in zip(result.model.views, poses, strict=True)
+        ]
+    )

@@ -1,0 +1,134 @@
+"""Pictures of a calibration: the rig with its boards, and what the corners miss by."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from needle_common.errors import UserError
+from needle_tracker.calibrating.rig_calibration import RigCalibration
+from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.optics.calibration import SIDES, Camera
+from needle_tracker.optics.camera_model import optical_rays
+
+Array = NDArray[np.float64]
+
+_COLOURS = {"left": "#1668b0", "right": "#d1701b"}
+_MM = 1e3
+
+
+def rig_figure(result: RigCalibration) -> Figure:
+    """Return the rig from the side and along the needle: cameras, surface, boards, frustums."""
+    figure = Figure(figsize=(9.0, 8.5), layout="constrained")
+    FigureCanvasAgg(figure)
+    calibration = result.calibration
+    height = calibration.phantom.surface_height
+    planes = ((2, "z (insertion) [mm]"), (1, "y [mm]"))
+    for number, (axis, axis_label) in enumerate(planes):
+        axes = figure.add_subplot(1, 2, number + 1)
+        # The legend names each thing once.
+        named = number == 1
+        axes.axhline(_MM * height, color="#2e9d55", label="surface" if named else None)
+        axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)" if named else None)
+        for i, view in enumerate(result.model.views):
+            outline = _outline(result, i)
+            axes.plot(_MM * outline[:, axis], _MM * outline[:, 0], **_style(view))
+        for side in SIDES:
+            camera = calibration.left if side == "left" else calibration.right
+            label = f"{side} camera" if named else None
+            axes.plot(
+                _MM * camera.centre[axis], _MM * camera.centre[0], "o",
+                color=_COLOURS[side], label=label,
+            )  # fmt: skip
+            _draw_frustum(axes, camera, height, axis, _COLOURS[side])
+        axes.set_aspect("equal")
+        axes.set_xlabel(axis_label)
+        axes.set_ylabel("x (up) [mm]")
+        axes.grid(color="#e4e6ea")
+    axes.plot([], [], color="#9aa0a8", label="board held freely")
+    axes.plot([], [], color="#1b1b1b", label="board of known place in air")
+    axes.plot([], [], color="#b03060", label="board under the surface")
+    figure.legend(loc="outside lower center", ncols=4, fontsize=8)
+    figure.suptitle("The rig as calibrated")
+    return figure
+
+
+def residual_figure(result: RigCalibration) -> Figure:
+    """Return each camera's residuals over the image (enlarged) and the error of every view."""
+    figure = Figure(figsize=(11.0, 8.5))
+    FigureCanvasAgg(figure)
+    enlarged = 20.0 / max(result.fit.corner_sigma_px, 1e-3)
+    for number, side in enumerate(SIDES):
+        camera = result.calibration.left if side == "left" else result.calibration.right
+        pixels, errors = result.model.pixels[side], result.residuals(side)
+        axes = figure.add_axes((0.06 + 0.49 * number, 0.53, 0.43, 0.43))
+        axes.quiver(
+            pixels[:, 0], pixels[:, 1], errors[:, 0], errors[:, 1],
+            angles="xy", scale_units="xy", scale=1.0 / enlarged,
+            width=1e-3, color=_COLOURS[side],
+        )  # fmt: skip
+        axes.set(xlim=(0, camera.width), ylim=(camera.height, 0), aspect="equal")
+        axes.set_title(
+            f"{side}: {result.reprojection_rms_px(side):.3f} px rms (arrows {enlarged:.0f} times "
+            "as long)"
+        )
+        axes.set(xlabel="u [px]", ylabel="v [px]" if number == 0 else "")
+    axes = figure.add_axes((0.08, 0.14, 0.88, 0.30))
+    places = np.arange(len(result.model.views))
+    for side, offset in zip(SIDES, (-0.2, 0.2), strict=True):
+        errors = np.array([result.reprojection_rms_px(side, int(i)) for i in places])
+        axes.bar(places + offset, errors, 0.4, color=_COLOURS[side], label=side)
+    axes.set_xticks(places, [view.name for view in result.model.views], rotation=90, fontsize=7)
+    axes.set_ylabel("reprojection error, rms [px]")
+    axes.legend()
+    return figure
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        figure.savefig(path, dpi=130)
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _outline(result: RigCalibration, view: int) -> Array:
+    points = np.concatenate([result.model.views[view].corners(side).points for side in SIDES])
+    low, high = points.min(axis=0), points.max(axis=0)
+    ring = np.array([low, [high[0], low[1], 0], high, [low[0], high[1], 0], low])
+    pose = result.model.board_poses(result.fit.parameters)[view]
+    return np.asarray(ring @ pose[:3, :3].T + pose[:3, 3])
+
+
+def _style(view: BoardView) -> dict[str, Any]:
+    if view.place is None:
+        return {"color": "#9aa0a8", "linewidth": 0.8}
+    return {"color": "#b03060" if view.under_surface else "#1b1b1b", "linewidth": 2.0}
+
+
+def _draw_frustum(axes: Any, camera: Camera, surface_height: float, axis: int, colour: str) -> None:
+    centre = camera.centre
+    corners = np.array(
+        [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float
+    )
+    rays = optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
+    above = centre[0] - surface_height
+    # Down to the surface; a camera that looks level has no such end.
+    lengths = np.minimum(above / np.maximum(-rays[:, 0], 1e-9), 2.0 * above)
+    ends = centre + lengths[:, None] * rays
+    for end in ends:
+        axes.plot(
+            _MM * np.array([centre[axis], end[axis]]), _MM * np.array([centre[0], end[0]]),
+            color=colour, linewidth=0.8,
+        )  # fmt: skip

@@ -1,0 +1,225 @@
+"""What a calibration is made with: the board, and the places where it was laid."""
+
+from __future__ import annotations
+
+import dataclasses
+import fnmatch
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from needle_common.errors import OutOfBoundsError, UserError
+from needle_tracker.calibrating.charuco import CharucoBoard
+from needle_tracker.optics.calibration import Phantom, yaml_problem
+
+Array = NDArray[np.float64]
+
+_LEAST_SINE = math.cos(math.radians(5.0))
+_PLACE_KEYS = ("origin", "columns", "rows", "under_surface", "sigma")
+_BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary")
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """Where a board lay.
+
+    Attributes
+    ----------
+    T_rig_board : ndarray, shape (4, 4)
+        Takes points of the board's frame to `rig` [m].
+    under_surface : bool
+        Whether it was seen through the phantom's surface.
+    sigma : float
+        Standard deviation of the place's coordinates [m]; 0: exact, it defines `rig`.
+    """
+
+    T_rig_board: Array
+    under_surface: bool = False
+    sigma: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Session:
+    """Board, given phantom and known places.
+
+    Attributes
+    ----------
+    board : CharucoBoard
+        The board of all images.
+    phantom : Phantom
+        The surface height and refractive index to keep where the images do not tell them.
+    places : dict of str to Place
+        By file name without ending; `*` and `?` as in a shell.
+    """
+
+    board: CharucoBoard
+    phantom: Phantom
+    places: dict[str, Place]
+
+    def place_of(self, name: str) -> Place | None:
+        """Return where the board of an image lay; None where it was held freely.
+
+        Parameters
+        ----------
+        name : str
+            The image's file name.
+        """
+        stem = Path(name).stem
+        if stem in self.places:
+            return self.places[stem]
+        for pattern, place in self.places.items():
+            if fnmatch.fnmatchcase(stem, pattern):
+                return place
+        return None
+
+
+def load_session(path: Path) -> Session:
+    """Read and check a session file.
+
+    Parameters
+    ----------
+    path : Path
+        YAML: `board`, `phantom`, `places` (docs/calibration.md).
+
+    Returns
+    -------
+    Session
+        What it says.
+
+    Raises
+    ------
+    UserError
+        Unreadable, not YAML, an unknown key, or a value missing or out of bounds.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "not a text file"
+        raise UserError(f"cannot read session {path}: {reason}") from error
+    except yaml.YAMLError as error:
+        raise UserError(f"session {path} is not YAML: {yaml_problem(error)}") from error
+    try:
+        return parse_session(content)
+    except UserError as error:
+        raise UserError(f"session {path}: {error}") from error
+
+
+def parse_session(content: Any) -> Session:
+    """Check the content of a session file, as `yaml.safe_load` returns it.
+
+    Parameters
+    ----------
+    content : mapping
+        The file's content.
+
+    Returns
+    -------
+    Session
+        What it says.
+
+    Raises
+    ------
+    UserError
+        An unknown key, or a value missing or out of bounds.
+    """
+    top = _mapping(content, "the file", ("board", "phantom", "places"))
+    given = _mapping(top.get("phantom"), "phantom", ("surface_height", "refractive_index"))
+    height = _number(given, ("phantom", "surface_height"), (-1.0, 1.0), "m")
+    index = _number(given, ("phantom", "refractive_index"), (1.0, 3.0), "-")
+    content = top.get("places") or {}
+    if not isinstance(content, dict):
+        raise UserError(f"places = {content!r} is not a mapping of file names")
+    board = _board(top.get("board"))
+    places = {str(name): _place(value, f"places.{name}") for name, value in content.items()}
+    for name, place in places.items():
+        _check_side(f"places.{name}", place, board, height)
+    return Session(board, Phantom(height, index), places)
+
+
+def _check_side(name: str, place: Place, board: CharucoBoard, height: float) -> None:
+    """Refuse a board that is not wholly on the side of the surface that is said."""
+    T = place.T_rig_board  # noqa: N806
+    above = (board.corners @ T[:3, :3].T + T[:3, 3])[:, 0] - height
+    if place.under_surface and float(above.max()) >= 0.0:
+        raise UserError(
+            f"{name} is under_surface, but reaches {1e3 * above.max():.1f} mm above the surface"
+        )
+    if not place.under_surface and float(above.min()) < -1e-3:
+        raise UserError(
+            f"{name} reaches {-1e3 * above.min():.1f} mm below the surface: under_surface: true?"
+        )
+
+
+def _board(content: Any) -> CharucoBoard:
+    board = _mapping(content, "board", _BOARD_KEYS)
+    counts = []
+    for key in ("columns", "rows"):
+        if not isinstance(board.get(key), int) or isinstance(board.get(key), bool):
+            raise UserError(f"board.{key} = {board.get(key)!r} is not a whole number")
+        counts.append(board[key])
+    sides = [_number(board, ("board", key), (1e-4, 1.0), "m") for key in ("square", "marker")]
+    return CharucoBoard(counts[0], counts[1], sides[0], sides[1], str(board.get("dictionary")))
+
+
+def _place(content: Any, name: str) -> Place:
+    place = _mapping(content, name, _PLACE_KEYS)
+    origin = _vector(place, name, "origin", None)
+    along = _vector(place, name, "columns", [0.0, 0.0, 1.0])
+    across = _vector(place, name, "rows", [0.0, 1.0, 0.0])
+    under = place.get("under_surface", False)
+    if not isinstance(under, bool):
+        raise UserError(f"{name}.under_surface = {under!r} is not true or false")
+    sigma = 0.0
+    if "sigma" in place:
+        sigma = _number(place, (name, "sigma"), (0.0, 0.01), "m")
+    x, y = along / np.linalg.norm(along), across / np.linalg.norm(across)
+    if float(np.linalg.norm(np.cross(x, y))) < _LEAST_SINE:
+        raise UserError(f"{name}: columns {along} and rows {across} are not at right angles")
+    y = y - x * float(x @ y)
+    transform = np.eye(4)
+    transform[:3, :3] = np.stack([x, y / np.linalg.norm(y), np.zeros(3)], axis=-1)
+    transform[:3, 2] = np.cross(transform[:3, 0], transform[:3, 1])
+    transform[:3, 3] = origin
+    if transform[0, 2] >= 0.0:
+        raise UserError(f"{name}: with these columns and rows the board's print faces downwards")
+    return Place(transform, under, sigma)
+
+
+def _mapping(content: Any, name: str, keys: tuple[str, ...]) -> dict[str, Any]:
+    if not isinstance(content, dict):
+        raise UserError(f"{name} is missing or not a mapping")
+    for key in content:
+        if key not in keys:
+            raise UserError(f"{name} has an unknown key {key!r} (known: {', '.join(keys)})")
+    return content
+
+
+def _number(
+    content: dict[str, Any], where: tuple[str, str], bounds: tuple[float, float], unit: str
+) -> float:
+    name, key = where
+    value = content.get(key)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        raise UserError(f"{name}.{key} = {value!r} is not a finite number")
+    if not bounds[0] <= value <= bounds[1]:
+        raise OutOfBoundsError(f"{name}.{key}", value, *bounds, unit)
+    return float(value)
+
+
+def _vector(content: dict[str, Any], name: str, key: str, default: list[float] | None) -> Array:
+    value = content.get(key, default)
+    numbers = [
+        item
+        for item in (value if isinstance(value, list) else [])
+        if isinstance(item, (int, float)) and not isinstance(item, bool) and math.isfinite(item)
+    ]
+    if not isinstance(value, list) or len(value) != 3 or len(numbers) != 3:
+        raise UserError(f"{name}.{key} = {value!r} is not three finite numbers")
+    vector = np.array(numbers, dtype=np.float64)
+    if key != "origin" and not float(np.linalg.norm(vector)) > 1e-6:
+        raise UserError(f"{name}.{key} = {value!r} has no direction")
+    return vector

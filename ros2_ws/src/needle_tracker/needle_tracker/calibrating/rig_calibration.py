@@ -1,0 +1,193 @@
+"""Calibration of the whole rig: bundle adjustment that invents nothing.
+
+What the views do not determine well enough is kept at its given value, and said.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_common.errors import UserError
+from needle_tracker.calibrating.calibration_start import check_views, first_calibration
+from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
+from needle_tracker.calibrating.rig_model import (
+    CAMERA_PARAMETERS,
+    LENS,
+    SHARED_PARAMETERS,
+    BoardView,
+    RigModel,
+    shared_names,
+)
+from needle_tracker.calibrating.tip_error import tip_error_p95
+from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, Phantom, StereoCalibration
+
+Array = NDArray[np.float64]
+
+# A standard deviation above these, and the parameter is kept at its given value: about 0.04 mm of
+# depth for the phantom's, about a pixel at the image's corner for the lens's (f = 16 mm).
+LIMITS = {
+    "refractive_index": 0.003,
+    "surface_height": 0.15e-3,
+    "k1": 0.05,
+    "k2": 1.0,
+    "p1": 0.003,
+    "p2": 0.003,
+}
+_FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
+
+
+@dataclasses.dataclass(frozen=True)
+class Determined:
+    """What became of one parameter: `sigma` is what the views gave, `value` what is used."""
+
+    value: float
+    sigma: float
+    given: float
+    kept: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class RigCalibration:
+    """A calibrated rig.
+
+    Attributes
+    ----------
+    calibration : StereoCalibration
+        The result.
+    fit : RigFit
+        Parameters, covariance, residuals.
+    model : RigModel
+        What was fitted.
+    parameters : dict of str to Determined
+        By name: `left.fx` ... `right.k3`, `refractive_index`, `surface_height`.
+    tip_error_p95 : float
+        Expected 95 % error of a tip in the phantom from this calibration alone [m].
+    """
+
+    calibration: StereoCalibration
+    fit: RigFit
+    model: RigModel
+    parameters: dict[str, Determined]
+    tip_error_p95: float
+
+    def reprojection_rms_px(self, side: str, view: int | None = None) -> float:
+        """Return the reprojection error of a camera, over all views or one [px].
+
+        Parameters
+        ----------
+        side : str
+            "left" or "right".
+        view : int, optional
+            Number of the view.
+        """
+        errors = self.residuals(side)
+        if view is not None:
+            errors = errors[self.model.view_of[side] == view]
+        return float(np.sqrt(np.mean(np.sum(errors**2, axis=-1)))) if len(errors) else np.nan
+
+    def residuals(self, side: str) -> Array:
+        """Return seen minus fitted corners of one camera, shape (n, 2) [px]."""
+        count = 2 * len(self.model.pixels["left"])
+        part = self.fit.residuals[:count] if side == "left" else self.fit.residuals[count:]
+        return part.reshape(-1, 2)
+
+
+def calibrate(
+    views: list[BoardView], sizes: dict[str, tuple[int, int]], phantom: Phantom
+) -> RigCalibration:
+    """Calibrate the rig from views of a board.
+
+    Parameters
+    ----------
+    views : list of BoardView
+        Held freely in air, on the surface, under it.
+    sizes : dict of str to (int, int)
+        Width and height of each side's images [px].
+    phantom : Phantom
+        The given surface height and refractive index, kept where the views do not tell them.
+
+    Returns
+    -------
+    RigCalibration
+        The calibration and how well it is determined.
+
+    Raises
+    ------
+    UserError
+        A set of views that does not determine the cameras.
+    """
+    check_views(views)
+    start, boards = first_calibration(views, sizes, phantom)
+    model = RigModel(start, views, boards)
+    names = shared_names()
+    given = _given_values(model.start, phantom)
+    free = board_parameters_free(model)
+    free[:SHARED_PARAMETERS] = True
+    for side in SIDES:
+        free[names.index(f"{side}.k3")] = False
+    if not any(view.under_surface for view in views):
+        free[CAMERA_PARAMETERS:SHARED_PARAMETERS] = False
+    sigmas = dict.fromkeys(names, np.inf)
+    parameters = model.start
+    while True:
+        result = fit(model, parameters, free)
+        fitted = dict(zip(names, result.sigma[:SHARED_PARAMETERS], strict=True))
+        sigmas.update({name: fitted[name] for i, name in enumerate(names) if free[i]})
+        worst = _least_determined(names, result)
+        if worst is None:
+            break
+        parameters = result.parameters.copy()
+        parameters[worst] = given[worst]
+        free[worst] = False
+    _check_cameras(names, result, sizes)
+    calibration = model.calibration(result.parameters)
+    if np.linalg.norm(calibration.left.centre - calibration.right.centre) < LEAST_BASELINE:
+        raise UserError("both cameras come out in one place: are left and right the same images?")
+    determined = {
+        name: Determined(
+            value=float(result.parameters[i]),
+            sigma=float(sigmas[name]),
+            given=float(given[i]),
+            kept=not bool(free[i]),
+        )
+        for i, name in enumerate(names)
+        if name.split(".")[-1] in LENS or i >= CAMERA_PARAMETERS
+    }
+    shared = result.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
+    return RigCalibration(
+        calibration, result, model, determined, tip_error_p95(calibration, covariance=shared)
+    )
+
+
+def _given_values(start: Array, phantom: Phantom) -> Array:
+    given = np.zeros(SHARED_PARAMETERS)
+    for i, name in enumerate(shared_names()):
+        if name.split(".")[-1] in ("fx", "fy", "cx", "cy"):
+            given[i] = start[i]
+    given[CAMERA_PARAMETERS:] = (phantom.refractive_index, phantom.surface_height)
+    return given
+
+
+def _least_determined(names: list[str], result: RigFit) -> int | None:
+    """Return the free parameter that is farthest above its limit, None where there is none."""
+    worst, ratio = None, 1.0
+    for i, name in enumerate(names):
+        limit = LIMITS.get(name.split(".")[-1])
+        if limit is not None and result.free[i] and result.sigma[i] / limit > ratio:
+            worst, ratio = i, float(result.sigma[i] / limit)
+    return worst
+
+
+def _check_cameras(names: list[str], result: RigFit, sizes: dict[str, tuple[int, int]]) -> None:
+    for side in SIDES:
+        for name in ("fx", "fy", "cx", "cy"):
+            i = names.index(f"{side}.{name}")
+            scale = result.parameters[i] if name[0] == "f" else float(sizes[side][0])
+            if not result.sigma[i] <= _FOCAL_LIMIT * abs(scale):
+                raise UserError(
+                    f"{side} camera: {name} is determined to +-{result.sigma[i]:.0f} px only "
+                    f"({result.parameters[i]:.0f} px): more views, tilted by 30 to 45 deg"
+                )

@@ -1,0 +1,238 @@
+"""Least squares on the rig model: robust, with what the data did and did not determine."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, RigModel
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LEAST_CORNER_SIGMA_PX = 0.02
+_OUTLIER = 3.0  # in standard deviations: beyond, a residual counts linearly
+_LEAST_EIGENVALUE = 1e-14
+_ITERATIONS = 40
+_LEAST_CHANGE = 1e-4  # of the cost: parameters then stand still within 1 % of their sigma
+_LARGEST_DAMPING = 1e6
+
+
+@dataclasses.dataclass(frozen=True)
+class RigFit:
+    """A fitted rig.
+
+    Attributes
+    ----------
+    parameters : ndarray, shape (p,)
+        The whole vector, fixed ones included.
+    free : ndarray of bool, shape (p,)
+        Which were fitted.
+    covariance : ndarray, shape (p, p)
+        Of the parameters; 0 for fixed ones.
+    residuals : ndarray, shape (2 * corners,)
+        Seen minus fitted [px].
+    corner_sigma_px : float
+        Standard deviation of a corner's coordinate that the residuals show [px].
+    cost : float
+        Half the sum of squares of residuals and priors over their standard deviations.
+    """
+
+    parameters: Array
+    free: Mask
+    covariance: Array
+    residuals: Array
+    corner_sigma_px: float
+    cost: float
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations of the parameters, 0 for fixed ones, shape (p,)."""
+        return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+
+
+def board_parameters_free(model: RigModel) -> Mask:
+    """Return which boards' parameters are unknown: all but those of exactly known places."""
+    free = np.zeros(len(model.start), dtype=bool)
+    for number, view in enumerate(model.views):
+        if view.place is None or view.place.sigma > 0.0:
+            first = SHARED_PARAMETERS + 6 * number
+            free[first : first + 6] = True
+    return free
+
+
+def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None = None) -> RigFit:
+    """Fit the free parameters to what was seen.
+
+    Boards of known place are held to it by its standard deviation.
+
+    Parameters
+    ----------
+    model : RigModel
+        With the views.
+    start : ndarray, shape (p,)
+        Where to start.
+    free : ndarray of bool, shape (p,)
+        What to fit.
+    corner_sigma_px : float, optional
+        Standard deviation of a corner's coordinate [px]; by default from the residuals.
+
+    Returns
+    -------
+    RigFit
+        The fit.
+    """
+    start = np.array(start)
+    known = corner_sigma_px is not None
+    sigma = corner_sigma_px if corner_sigma_px is not None else 0.3
+    place_rows, place_sigma = _place_priors(model, free)
+    passes = 1 if known else 2
+    for _ in range(passes):
+        parameters, normal, cost = _minimise(model, start, free, sigma, (place_rows, place_sigma))
+        residuals = model.residuals(parameters)
+        spare = residuals.size - int(np.count_nonzero(free)) + len(place_rows)
+        seen = _spread(residuals) * float(np.sqrt(residuals.size / max(spare, 1)))
+        start = parameters
+        if not known:
+            sigma = max(seen, LEAST_CORNER_SIGMA_PX)
+    covariance = np.zeros((len(start), len(start)))
+    covariance[np.ix_(free, free)] = _inverse_normal(normal)
+    return RigFit(parameters, free.copy(), covariance, residuals, sigma if known else seen, cost)
+
+
+def outlier_weights(whitened: Array) -> Array:
+    """Return how much each residual counts, by its size in standard deviations (soft L1)."""
+    return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
+
+
+def place_rows(model: RigModel, free: Mask) -> Array:
+    """Return the rows that known places add to the whitened Jacobian, shape (6 * places, free)."""
+    rows, sigmas = _place_priors(model, free)
+    result = np.zeros((len(rows), int(np.count_nonzero(free))))
+    result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
+    return result
+
+
+def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, float]]:
+    """Return how far boards came out from their places, where those have a standard deviation.
+
+    Parameters
+    ----------
+    model : RigModel
+        What was fitted.
+    result : RigFit
+        Its fit.
+
+    Returns
+    -------
+    list of (str, float, float)
+        Name of the view; distance of the board's middle from where it should be [m]; the largest
+        of its six parameters in standard deviations.
+    """
+    rows, sigmas = _place_priors(model, result.free)
+    numbers = (rows.reshape(-1, 6)[:, 0] - SHARED_PARAMETERS) // 6
+    poses = model.board_poses(result.parameters)
+    deviations = []
+    for number, pulls in zip(
+        numbers.tolist(), (result.parameters[rows] / sigmas).reshape(-1, 6), strict=True
+    ):
+        view = model.views[number]
+        assert view.place is not None
+        middle = np.append(view.left.points.mean(axis=0), 1.0)
+        away = (poses[number] - view.place.T_rig_board) @ middle
+        deviations.append((view.name, float(np.linalg.norm(away)), float(np.abs(pulls).max())))
+    return deviations
+
+
+def _minimise(
+    model: RigModel, start: Array, free: Mask, sigma: float, priors: tuple[NDArray[np.intp], Array]
+) -> tuple[Array, Array, float]:
+    """Return parameters, normal matrix at them, and cost.
+
+    Levenberg-Marquardt on the normal equations, each row weighted down where it is an outlier
+    (soft L1). scipy's `least_squares` takes a singular value decomposition of the whole Jacobian
+    (8,000 x 150) in every step, and a minute instead of seconds.
+    """
+    rows, place_sigma = priors
+    prior_columns = np.searchsorted(np.flatnonzero(free), rows)
+
+    def cost_of(parameters: Array) -> tuple[float, Array]:
+        pixels = np.nan_to_num(model.residuals(parameters) / sigma, nan=1e4)
+        prior = parameters[rows] / place_sigma
+        robust = 2.0 * _OUTLIER**2 * (np.sqrt(1.0 + (pixels / _OUTLIER) ** 2) - 1.0)
+        return float(0.5 * (robust.sum() + prior @ prior)), pixels
+
+    parameters, damping = start.copy(), 1e-6
+    cost, pixels = cost_of(parameters)
+    normal = np.zeros((0, 0))
+    for _ in range(_ITERATIONS):
+        weights = outlier_weights(pixels)
+        slopes = np.nan_to_num(model.jacobian(parameters, free) / sigma)
+        weighted = slopes * weights[:, None]
+        normal, gradient = weighted.T @ slopes, weighted.T @ pixels
+        normal[prior_columns, prior_columns] += 1.0 / place_sigma**2
+        gradient[prior_columns] += parameters[rows] / place_sigma**2
+        better = False
+        while not better and damping < _LARGEST_DAMPING:
+            trial = parameters.copy()
+            trial[free] -= _solve(normal, gradient, damping)
+            trial_cost, trial_pixels = cost_of(trial)
+            better = trial_cost <= cost
+            damping = damping * 0.1 if better else damping * 10.0
+        if not better:
+            break
+        change = cost - trial_cost
+        parameters, cost, pixels = trial, trial_cost, trial_pixels
+        if change <= _LEAST_CHANGE:
+            break
+    return parameters, normal, cost
+
+
+def _solve(normal: Array, gradient: Array, damping: float) -> Array:
+    """Return the damped step, columns scaled to length 1."""
+    if not len(gradient):
+        return gradient
+    scale = _scale(normal)
+    scaled = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
+    return np.asarray(np.linalg.lstsq(scaled, gradient / scale, rcond=1e-15)[0] / scale)
+
+
+def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
+    """Return the board parameters that a known place holds, and how tightly [rad or m]."""
+    rows: list[int] = []
+    sigmas: list[float] = []
+    for number, view in enumerate(model.views):
+        if view.place is None or view.place.sigma <= 0.0:
+            continue
+        first = SHARED_PARAMETERS + 6 * number
+        if not free[first]:
+            continue
+        # The place is known by coordinates of its edges: so well is its rotation known.
+        reach = max(float(np.ptp(view.left.points[:, :2], axis=0).max()), 1e-3)
+        rows += range(first, first + 6)
+        sigmas += [view.place.sigma * 2.0 / reach] * 3 + [view.place.sigma] * 3
+    return np.array(rows, dtype=np.intp), np.array(sigmas)
+
+
+def _spread(residuals: Array) -> float:
+    """Return the standard deviation of residuals, outliers left out."""
+    if not residuals.size:
+        return 0.0
+    rough = 1.4826 * float(np.median(np.abs(residuals)))
+    kept = residuals[np.abs(residuals) <= 4.0 * rough]
+    return float(np.sqrt(np.mean(kept**2))) if kept.size else rough
+
+
+def _inverse_normal(normal: Array) -> Array:
+    """Return the inverse, with huge but finite variances for what is not determined."""
+    scale = _scale(normal)
+    values, vectors = np.linalg.eigh(normal / np.outer(scale, scale))
+    values = np.maximum(values, _LEAST_EIGENVALUE)
+    inverse = (vectors / values) @ vectors.T
+    return np.asarray(inverse / np.outer(scale, scale))
+
+
+def _scale(normal: Array) -> Array:
+    return np.maximum(np.sqrt(np.diag(normal)), 1e-12)

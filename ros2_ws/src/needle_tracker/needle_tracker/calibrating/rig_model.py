@@ -1,0 +1,205 @@
+"""The whole rig as one function: from cameras, surface and boards to every corner's pixel.
+
+What calibration and its check have in common. Parameters are one vector:
+
+    left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
+    refractive index, surface height; for each view of the board: rotation (3), translation (3).
+
+Rotations and translations are increments on the transforms that the model starts from. A camera
+turns about its own centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
+first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from needle_tracker.calibrating.calibration_session import Place
+from needle_tracker.optics.calibration import SIDES, Camera, Phantom, StereoCalibration
+from needle_tracker.optics.camera_model import project_optical
+from needle_tracker.optics.refraction import RefractedCamera
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
+PHANTOM = ("refractive_index", "surface_height")
+_CAMERA = len(LENS) + len(POSE)
+CAMERA_PARAMETERS = 2 * _CAMERA
+SHARED_PARAMETERS = CAMERA_PARAMETERS + len(PHANTOM)
+# Central differences; the model is smooth, so that these are good to 1e-6 relative.
+_STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5}
+
+
+@dataclasses.dataclass(frozen=True)
+class Corners:
+    """The board's corners that one camera saw: in the board's frame [m] (n, 3), pixels (n, 2)."""
+
+    points: Array
+    pixels: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class BoardView:
+    """One exposure of the board by both cameras; `place` is None where it was held freely."""
+
+    name: str
+    place: Place | None
+    left: Corners
+    right: Corners
+
+    def corners(self, side: str) -> Corners:
+        """Return what the camera of one side saw."""
+        return self.left if side == "left" else self.right
+
+    @property
+    def under_surface(self) -> bool:
+        """Whether the board was seen through the phantom's surface."""
+        return self.place is not None and self.place.under_surface
+
+
+def camera_slice(side: str) -> slice:
+    """Return where a camera's parameters are in the vector."""
+    start = SIDES.index(side) * _CAMERA
+    return slice(start, start + _CAMERA)
+
+
+def shared_names() -> list[str]:
+    """Return the names of the parameters that all views share, `left.fx` and so on."""
+    return [f"{side}.{name}" for side in SIDES for name in LENS + POSE] + list(PHANTOM)
+
+
+class RigModel:
+    """Projection of all views, and its derivatives.
+
+    Parameters
+    ----------
+    start : StereoCalibration
+        Cameras and phantom that the parameters start from.
+    views : list of BoardView
+        What was seen.
+    boards : ndarray, shape (len(views), 4, 4)
+        T_rig_board of each view that the parameters start from.
+    """
+
+    def __init__(self, start: StereoCalibration, views: list[BoardView], boards: Array) -> None:
+        self.views = views
+        self._start = {"left": start.left, "right": start.right}
+        self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
+        self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
+        self.pixels = {s: _join([v.corners(s).pixels for v in views], 2) for s in SIDES}
+        self.view_of = {
+            s: np.repeat(np.arange(len(views)), [len(v.corners(s).points) for v in views])
+            for s in SIDES
+        }
+        under = np.array([view.under_surface for view in views], dtype=bool)
+        self._under = {s: under[self.view_of[s]] for s in SIDES}
+        self.start = np.zeros(SHARED_PARAMETERS + 6 * len(views))
+        for side in SIDES:
+            camera = self._start[side]
+            matrix = camera.camera_matrix
+            lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *camera.distortion]
+            self.start[camera_slice(side)][: len(LENS)] = lens
+        phantom = start.phantom
+        self.start[CAMERA_PARAMETERS:SHARED_PARAMETERS] = (
+            phantom.refractive_index,
+            phantom.surface_height,
+        )
+        letters = [name.split(".")[-1][0] for name in shared_names()] + list("rrrttt") * len(views)
+        self._steps = np.array([_STEPS[letter] for letter in letters])
+
+    def calibration(self, parameters: Array) -> StereoCalibration:
+        """Return the calibration that a parameter vector stands for."""
+        index, height = parameters[CAMERA_PARAMETERS:SHARED_PARAMETERS]
+        left, right = (self._camera(parameters, side) for side in SIDES)
+        return StereoCalibration(Phantom(float(height), float(index)), left, right)
+
+    def board_poses(self, parameters: Array) -> Array:
+        """Return T_rig_board of each view, shape (views, 4, 4)."""
+        steps = parameters[SHARED_PARAMETERS:].reshape(-1, 6)
+        return np.stack([moved(b, s) for b, s in zip(self._boards, steps, strict=True)])
+
+    def residuals(self, parameters: Array) -> Array:
+        """Return seen minus expected pixels, left then right, shape (2 * corners,) [px]."""
+        seen = [(self.pixels[s] - self.project(parameters, s)).ravel() for s in SIDES]
+        return np.concatenate(seen)
+
+    def project(self, parameters: Array, side: str) -> Array:
+        """Return where one camera should see its corners, shape (n, 2) [px]."""
+        boards = self.board_poses(parameters)[self.view_of[side]]
+        points = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side]) + boards[:, :3, 3]
+        camera = self._camera(parameters, side)
+        transform, under = camera.T_optical_rig, self._under[side]
+        pixels = project_optical(camera, points @ transform[:3, :3].T + transform[:3, 3])
+        if np.any(under):
+            index, height = parameters[CAMERA_PARAMETERS:SHARED_PARAMETERS]
+            phantom = Phantom(float(height), float(index))
+            pixels[under] = RefractedCamera(camera, phantom).project(points[under])
+        return pixels
+
+    def jacobian(self, parameters: Array, free: Mask) -> Array:
+        """Return d(residuals)/d(free parameters), shape (2 * corners, free).
+
+        Parameters
+        ----------
+        parameters : ndarray, shape (p,)
+            Where.
+        free : ndarray of bool, shape (p,)
+            Which parameters.
+        """
+        count = {side: 2 * len(self.pixels[side]) for side in SIDES}
+        result = np.zeros((sum(count.values()), len(parameters)))
+        for side in SIDES:
+            first = 0 if side == "left" else count["left"]
+            rows = slice(first, first + count[side])
+            own = camera_slice(side)
+            shared = [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, SHARED_PARAMETERS)]
+            for column in shared:
+                if free[column]:
+                    result[rows, column] = -self._slope(parameters, side, [column]).ravel()
+            # One board's pose moves that board's corners only: all boards at once.
+            boards = self.view_of[side]
+            for k in range(6):
+                columns = np.arange(SHARED_PARAMETERS + k, len(parameters), 6)
+                if not np.any(free[columns]):
+                    continue
+                slope = self._slope(parameters, side, list(columns))
+                lines = first + 2 * np.arange(len(boards))
+                for axis in range(2):
+                    result[lines + axis, columns[boards]] = -slope[:, axis]
+        return result[:, free]
+
+    def _slope(self, parameters: Array, side: str, columns: list[int]) -> Array:
+        step = np.zeros_like(parameters)
+        step[columns] = self._steps[columns]
+        width = 2.0 * self._steps[columns[0]]
+        above, below = (self.project(parameters + s * step, side) for s in (1.0, -1.0))
+        return np.asarray((above - below) / width)
+
+    def _camera(self, parameters: Array, side: str) -> Camera:
+        start, own = self._start[side], parameters[camera_slice(side)]
+        fx, fy, cx, cy = own[:4]
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        # Turned about its own centre, then shifted.
+        step = np.eye(4)
+        step[:3, :3] = Rotation.from_rotvec(own[len(LENS) : len(LENS) + 3]).as_matrix()
+        step[:3, 3] = own[len(LENS) + 3 :]
+        transform = step @ start.T_optical_rig
+        return Camera(start.width, start.height, matrix, own[4:9].copy(), transform)
+
+
+def moved(transform: Array, step: Array) -> Array:
+    """Return [exp(step[:3]) R | t + step[3:]] for a transform [R | t], shape (4, 4)."""
+    result = np.array(transform)
+    result[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ transform[:3, :3]
+    result[:3, 3] = transform[:3, 3] + step[3:]
+    return result
+
+
+def _join(arrays: list[Array], width: int) -> Array:
+    return np.concatenate([np.zeros((0, width)), *arrays])

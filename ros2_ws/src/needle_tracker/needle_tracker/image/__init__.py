@@ -1,0 +1,1 @@
+"""The needle in one image: paths, shaft, end."""

@@ -1,0 +1,374 @@
+"""Find what may be the needle in one image: paths outwards from the entry, and where they end.
+
+A centre-surround filter turns a thin line into a ridge. Dynamic programming over the polar search
+grid finds the paths with the largest sum of (ridge - threshold): evidence adds up along the needle
+and is used up beyond its end, so that the maximum is at the tip, short gaps are bridged, and
+nothing that is not joined to the entry is followed. Several paths are returned, each in a direction
+of its own: which one is the needle, two views decide together.
+"""
+
+# Compiled functions take plain numbers, one by one.
+# ruff: noqa: PLR0912, PLR0917
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_common.compiled import compiled, inlined
+from needle_tracker.image.search_grid import SearchGrid
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+Ridge = NDArray[np.float32]
+Rows = NDArray[np.int64]
+
+_SLOPE = 1.0  # largest sideways step along a path, per step outwards (45 deg from the radius)
+_IMPOSSIBLE = np.float32(-1e6)
+_CUT_ROWS = 6
+_STRENGTH = 0.3  # a clear line counts for more than a faint one
+_SHADOW_SHARE, _WHOLE = 0.65, 0.7
+_NOISE_PITCH = 5
+_OWN_ROWS = 24  # near its end a path has its cells for itself, ...
+_OWN_WIDTH = 0.7e-3  # ... so far to either side [m]
+
+
+@dataclasses.dataclass(frozen=True)
+class DetectionSettings:
+    """How a needle looks.
+
+    Attributes
+    ----------
+    bright : bool or None
+        Whether the needle is brighter than what is around it; None where that is not known.
+    needle_width_px : float
+        Its width in the image.
+    min_contrast : float
+        Least contrast that counts [grey levels].
+    noise_factor : float
+        Ridge threshold in standard deviations of the ridge image's noise.
+    min_length : float
+        Shortest visible path that counts [m].
+    min_coverage : float
+        Least share of a path that looks like a needle.
+    """
+
+    bright: bool | None = None
+    needle_width_px: float = 4.6
+    min_contrast: float = 10.0
+    noise_factor: float = 5.0
+    min_length: float = 2.0e-3
+    min_coverage: float = 0.5
+
+
+@dataclasses.dataclass(frozen=True)
+class Path:
+    """A path in one image, from the entry's side to where it may end.
+
+    Attributes
+    ----------
+    rows, columns : ndarray of int, shape (n,)
+        Cells of the search grid.
+    pixels : ndarray, shape (n, 2)
+        The same in the image, good to about one cell [px].
+    contrast : float
+        Median ridge along the path [grey levels].
+    bright : bool
+        Whether it is brighter than what is around it.
+    coverage : float
+        Share of it that looks like a needle.
+    evidence : float
+        Sum along it, in units of the threshold.
+    """
+
+    rows: Rows
+    columns: Rows
+    pixels: Array
+    contrast: float
+    bright: bool = False
+    coverage: float = 1.0
+    evidence: float = 0.0
+
+
+def cut_path(path: Path, grid: SearchGrid, length: float) -> Path:
+    """Return the part of a path up to a length from the entry [m], measured in the plane x = 0."""
+    count = max(_cells_within(grid.distances, grid.angles, path.rows, path.columns, length), 2)
+    return dataclasses.replace(
+        path,
+        rows=path.rows[:count],
+        columns=path.columns[:count],
+        pixels=path.pixels[:count],
+    )
+
+
+@compiled
+def _cells_within(distances: Array, angles: Array, rows: Rows, columns: Rows, length: float) -> int:
+    """Return how many cells of a path are no farther than a length along it."""
+    run = before = y = z = 0.0
+    # Over a few rows at once: cells make steps.
+    for first in range(0, len(rows), _CUT_ROWS):
+        distance, angle = distances[rows[first]], angles[columns[first]]
+        to_y, to_z = distance * math.sin(angle), distance * math.cos(angle)
+        before, run = run, run + math.hypot(to_y - y, to_z - z)
+        y, z = to_y, to_z
+        if run >= length:
+            share = (length - before) / (run - before)
+            return first - _CUT_ROWS + math.ceil(share * _CUT_ROWS)
+    last = (len(rows) - 1) // _CUT_ROWS * _CUT_ROWS
+    for i in range(last + 1, len(rows)):
+        if run + distances[rows[i]] - distances[rows[last]] >= length:
+            return i
+    return len(rows)
+
+
+def distinct(paths: list[Path]) -> list[Path]:
+    """Return the paths without those that end where one before them does, the same way."""
+    kept: list[Path] = []
+    for path in paths:
+        if not any(_alike(path, other) for other in kept):
+            kept.append(path)
+    return kept
+
+
+def without_shadows(paths: list[Path]) -> list[Path]:
+    """Return the paths without those that are much fainter than another one as whole as they are.
+
+    A needle's shadow takes a share of the light only; the needle itself stands out more.
+    """
+    return [
+        path
+        for path in paths
+        if not any(
+            path.contrast < _SHADOW_SHARE * other.contrast
+            and path.bright is other.bright
+            and other.coverage >= max(_WHOLE, path.coverage - 0.1)
+            for other in paths
+        )
+    ]
+
+
+def _alike(one: Path, other: Path) -> bool:
+    return (
+        one.bright is other.bright
+        and len(one.rows) > _CUT_ROWS < len(other.rows)
+        and abs(len(one.rows) - len(other.rows)) <= 1
+        and bool(np.abs(one.columns[-_CUT_ROWS:-1:2] - other.columns[-_CUT_ROWS:-1:2]).max() <= 1)
+    )
+
+
+def find_paths(
+    image: Image,
+    grid: SearchGrid,
+    settings: DetectionSettings,
+    *,
+    ends: tuple[int, int] | None = None,
+    count: int = 3,
+) -> list[Path]:
+    """Return paths that may be the needle.
+
+    Parameters
+    ----------
+    image : ndarray of uint8, shape (height, width)
+        The camera's image.
+    grid : SearchGrid
+        The camera's grid.
+    settings : DetectionSettings
+        How the needle looks.
+    ends : pair of int, optional
+        First and last row in which a path may end; any by default.
+    count : int
+        Most paths for either polarity.
+
+    Returns
+    -------
+    list of Path
+        Those with the most evidence first; empty where nothing looks like a needle.
+    """
+    first_end, last_end = (0, len(grid.distances) - 1) if ends is None else ends
+    last_end = min(last_end, len(grid.distances) - 1)
+    first_end = max(min(first_end, last_end), 1)
+    rows = last_end + 1
+    reachable = grid.reachable[:rows]
+    if rows < 2 or not reachable.any():
+        return []
+    ridge, noise = _sampled_ridge(image, grid, rows, settings)
+    # The filter passes about half of a line's contrast.
+    threshold = max(settings.noise_factor * noise, 0.5 * settings.min_contrast)
+    steps = np.maximum(
+        1, np.ceil(_SLOPE * grid.row_pitch / (grid.distances[:rows] * grid.angle_pitch))
+    ).astype(np.int64)
+    widths = np.ceil(_OWN_WIDTH / (grid.distances[:rows] * grid.angle_pitch)).astype(np.int64)
+    least = max(int(settings.min_length / grid.row_pitch), 2)
+    found = []
+    for bright in (False, True) if settings.bright is None else (settings.bright,):
+        sign = np.float32(1.0 if bright else -1.0)
+        cells, lengths, sums = _best_paths(
+            ridge, reachable, steps, widths, sign, np.float32(threshold), first_end, count
+        )
+        for path_columns, end_row, evidence in zip(cells, lengths, sums, strict=True):
+            if end_row + 1 < least:
+                continue
+            path_rows = np.arange(end_row + 1)
+            columns = path_columns[: end_row + 1]
+            coverage, contrast = _appearance(ridge, columns, sign, np.float32(threshold))
+            if coverage < settings.min_coverage or contrast < threshold:
+                continue
+            pixels = grid.pixels[path_rows, columns].astype(np.float64)
+            found.append(
+                Path(path_rows, columns, pixels, contrast, bright, coverage, float(evidence))
+            )
+    return sorted(found, key=lambda path: -path.evidence)
+
+
+def _sampled_ridge(
+    image: Image, grid: SearchGrid, rows: int, s: DetectionSettings
+) -> tuple[Ridge, float]:
+    """Return what is brighter than its surroundings, on the grid's cells, and its noise."""
+    x0, y0, x1, y1 = grid.bounds(rows, 8.0 * s.needle_width_px, image.shape)
+    half_size = ((x1 - x0) // 2, (y1 - y0) // 2)
+    cut = image[y0 : y0 + 2 * half_size[1], x0 : x0 + 2 * half_size[0]]
+    half = cv2.resize(cut, half_size, interpolation=cv2.INTER_AREA).astype(np.float32)
+    near = cv2.GaussianBlur(half, (0, 0), max(0.2 * s.needle_width_px, 0.5))
+    size = 2 * round(1.4 * s.needle_width_px) + 1
+    ridge = np.subtract(near, cv2.blur(half, (size, size)), out=near)
+    # Pixel centres: the half-size pixel i covers the pixels 2 i and 2 i + 1.
+    sampled = _sampled(ridge, grid.pixels[:rows], grid.reachable[:rows], x0 + 0.5, y0 + 0.5)
+    return sampled, _noise(ridge)
+
+
+@compiled
+def _sampled(
+    ridge: Ridge, pixels: NDArray[np.float32], reachable: NDArray[np.bool_], x0: float, y0: float
+) -> Ridge:
+    rows, columns = reachable.shape
+    height, width = ridge.shape
+    values = np.zeros((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if not reachable[i, j]:
+                continue
+            x = min(max(0.5 * (pixels[i, j, 0] - x0), 0.0), width - 1.001)
+            y = min(max(0.5 * (pixels[i, j, 1] - y0), 0.0), height - 1.001)
+            column, row = int(x), int(y)
+            a, b = x - column, y - row
+            above = (1.0 - a) * ridge[row, column] + a * ridge[row, column + 1]
+            below = (1.0 - a) * ridge[row + 1, column] + a * ridge[row + 1, column + 1]
+            values[i, j] = (1.0 - b) * above + b * below
+    return values
+
+
+@compiled
+def _noise(ridge: Ridge) -> float:
+    """Return a standard deviation that lines and spots do not spoil."""
+    sample = ridge[::_NOISE_PITCH, ::_NOISE_PITCH].copy().reshape(-1)
+    return 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
+
+
+@compiled
+def _appearance(
+    ridge: Ridge, columns: Rows, sign: np.float32, threshold: np.float32
+) -> tuple[float, float]:
+    """Return which share of a path looks like a needle, and its median contrast."""
+    values = np.empty(len(columns), np.float32)
+    over = 0
+    for i in range(len(columns)):
+        values[i] = sign * ridge[i, columns[i]]
+        over += values[i] > threshold
+    return over / len(columns), float(np.median(values))
+
+
+@compiled
+def _accumulate(evidence: Ridge, steps: Rows, total: Ridge, first: int) -> None:
+    """Fill `total` from a row on with the largest sums of evidence of paths to each cell."""
+    rows, columns = evidence.shape
+    widest = columns + 2 * steps.max()
+    one, other = np.empty(widest, np.float32), np.empty(widest, np.float32)
+    for i in range(first, rows):
+        if i == 0:
+            total[i] = evidence[i]
+            continue
+        # The largest of two spans is that of one twice as long; each written to a place of its
+        # own, so that many cells are done at once.
+        step, span = steps[i], 1
+        length = columns + 2 * step
+        one[:step] = _IMPOSSIBLE
+        one[step : step + columns] = total[i - 1]
+        one[step + columns : length] = _IMPOSSIBLE
+        while 2 * span <= 2 * step + 1:
+            length -= span
+            _larger(one, one[span:], other[:length])
+            one, other = other, one
+            span *= 2
+        _larger(one, one[2 * step + 1 - span :], total[i])
+        total[i] += evidence[i]
+
+
+@inlined
+def _larger(some: Ridge, others: Ridge, result: Ridge) -> None:
+    for j in range(len(result)):
+        result[j] = max(some[j], others[j])
+
+
+@compiled
+def _best_paths(
+    ridge: Ridge,
+    reachable: NDArray[np.bool_],
+    steps: Rows,
+    widths: Rows,
+    sign: np.float32,
+    threshold: np.float32,
+    first_end: int,
+    count: int,
+) -> tuple[Rows, Rows, Array]:
+    """Return columns (count, rows), end rows and sums of the paths with the most evidence.
+
+    A path starts in the first row, ends in `first_end` or later and moves at most `steps[row]`
+    columns sideways from a row to the next. What one path has used near its end is worth nothing
+    to the next: where two lines cross, both are followed.
+    """
+    rows, columns = ridge.shape
+    evidence = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            value = -threshold
+            if reachable[i, j]:
+                over = sign * ridge[i, j] - threshold
+                value = min(max(over, -threshold), 2.0 * threshold)
+                value += _STRENGTH * min(max(over - 2.0 * threshold, 0.0), 8.0 * threshold)
+            evidence[i, j] = value
+    total = np.empty((rows, columns), np.float32)
+    _accumulate(evidence, steps, total, 0)
+    fresh = max(first_end - _OWN_ROWS, 1)
+    cells = np.zeros((count, rows), np.int64)
+    lengths = np.zeros(count, np.int64)
+    sums = np.zeros(count)
+    for n in range(count):
+        if n:
+            _accumulate(evidence, steps, total, fresh)
+        end, column, largest = 0, 0, np.float32(0.0)
+        for i in range(first_end, rows):
+            for j in range(columns):
+                if total[i, j] > largest:
+                    end, column, largest = i, j, total[i, j]
+        if not largest > 0.0:
+            break
+        sums[n] = largest / threshold
+        lengths[n] = end
+        cells[n, end] = column
+        for i in range(end, 0, -1):
+            # Of equals the straightest: a flat stretch must not pull the path to one side.
+            chosen, best = column, total[i - 1, column]
+            for away in range(1, steps[i] + 1):
+                for k in (column - away, column + away):
+                    if 0 <= k < columns and total[i - 1, k] > best:
+                        chosen, best = k, total[i - 1, k]
+            column = chosen
+            cells[n, i - 1] = column
+        for i in range(fresh, end + 1):
+            place = cells[n, i]
+            evidence[i, max(place - widths[i], 0) : place + widths[i] + 1] = -threshold
+    return cells, lengths, sums

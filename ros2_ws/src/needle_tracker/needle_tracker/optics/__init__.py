@@ -1,0 +1,1 @@
+"""Cameras that look through the phantom's flat surface."""

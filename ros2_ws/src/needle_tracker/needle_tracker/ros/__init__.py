@@ -1,0 +1,1 @@
+"""The tracker's and the cameras' ROS side."""

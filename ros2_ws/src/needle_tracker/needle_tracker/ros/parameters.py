@@ -1,0 +1,206 @@
+"""The parameters of stereo_tracker."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_common.errors import UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_tracker.answers.pair_answers import AnsweringSettings
+from needle_tracker.image.search_grid import Reach
+from needle_tracker.optics.calibration import Phantom
+from needle_tracker.tracking.gates import GateSettings
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoTrackerParameters:
+    """Parameters of the node; all are fixed at start, so that a run is of one piece."""
+
+    calibration_file: str = fixed_parameter(
+        "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
+    )
+    reliable_images: bool = fixed_parameter(
+        True, "-", "Take images reliably, for simulation; false: best effort, for hardware."
+    )
+    pair_tolerance: float = fixed_parameter(
+        0.0,
+        "s",
+        "Largest difference of the stamps of a left and a right image of one pair.",
+        0.0,
+        0.1,
+    )
+    joint_timeout: float = fixed_parameter(
+        1.0,
+        "s",
+        "How long a pair waits for the joint state that follows it (steady clock).",
+        0.0,
+        60.0,
+    )
+    wait_for_recorder: bool = fixed_parameter(
+        False,
+        "-",
+        "Take images only when a node named recorder listens to what is found, and "
+        "those who publish joints and estimates know this node.",
+    )
+    needle_width: float = fixed_parameter(0.7e-3, "m", "Diameter of the needle.", 0.2e-3, 3e-3)
+    needle_polarity: str = fixed_parameter(
+        "auto",
+        "-",
+        "Whether the needle is darker or brighter than what is around it; auto: found.",
+        choices=("auto", "dark", "bright"),
+    )
+    min_contrast: float = fixed_parameter(
+        10.0, "-", "Least contrast of the needle that counts [grey levels].", 1.0, 255.0
+    )
+    noise_factor: float = fixed_parameter(
+        5.0, "-", "Detection threshold in standard deviations of the images' noise.", 1.0, 50.0
+    )
+    entry_zone: float = fixed_parameter(
+        4.5e-3,
+        "m",
+        "Insertion below which the tip is taken from the insertion, not looked for.",
+        0.0,
+        0.05,
+    )
+    hole_clearance: float = fixed_parameter(
+        2.0e-3, "m", "Radius about the entry point that is not looked at (hole, rim).", 0.5e-3, 0.02
+    )
+    hole_tolerance: float = fixed_parameter(
+        0.5e-3, "m", "How far from the entry point the needle may pass.", 0.01e-3, 5e-3
+    )
+    entry_angle: float = fixed_parameter(
+        0.1745, "rad", "Largest angle of the needle to rig's z at the entry.", 0.0, 0.7
+    )
+    max_curvature: float = fixed_parameter(
+        9.0, "1/m", "Largest curvature of the needle's path.", 0.1, 50.0
+    )
+    max_insertion: float = fixed_parameter(
+        0.15, "m", "Longest insertion; nothing is looked for farther from the entry.", 0.01, 1.0
+    )
+    tip_lean: float = fixed_parameter(
+        0.21,
+        "rad",
+        "Largest angle between the visible end and the needle's path (pre-bend).",
+        0.0,
+        0.8,
+    )
+    lean: float = fixed_parameter(
+        0.0977,
+        "rad",
+        "Angle between heading and visible end; taken off with heading_from_estimate.",
+        0.0,
+        0.7,
+    )
+    heading_from_estimate: bool = fixed_parameter(
+        False, "-", "Publish the heading (lean taken off) where needle/estimate knows the roll."
+    )
+    annotated_rate: float = fixed_parameter(
+        2.0,
+        "Hz",
+        "Most annotated images per second, while someone subscribes; 0: none.",
+        0.0,
+        100.0,
+    )
+    insertion_margin: float = fixed_parameter(
+        2.0e-3,
+        "m",
+        "Tolerance between the tip's distance from the entry and the insertion.",
+        0.1e-3,
+        0.05,
+    )
+    step_margin: float = fixed_parameter(
+        1.0e-3,
+        "m",
+        "Tolerance of the tip against where the last tip and the insertion have it.",
+        0.1e-3,
+        0.05,
+    )
+    free_step: float = fixed_parameter(
+        5.0e-3,
+        "m",
+        "Largest move of the tip per pair where the insertion is not known.",
+        0.1e-3,
+        0.1,
+    )
+    max_disagreement: float = fixed_parameter(
+        1.5e-3,
+        "m",
+        "Largest disagreement of the cameras about the end along the needle.",
+        0.05e-3,
+        0.05,
+    )
+    confirm_pairs: int = fixed_parameter(
+        3, "-", "Pairs in a row that must agree, where the insertion is not known.", 1, 100
+    )
+    lost_after: int = fixed_parameter(
+        10, "-", "Pairs in a row without a tip after which the track is lost.", 1, 1000
+    )
+    forget_after: int = fixed_parameter(
+        30,
+        "-",
+        "Pairs in a row without a tip after which the last place no longer counts.",
+        1,
+        10000,
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields, and what holds between them."""
+        check_fields(self)
+        if self.hole_clearance >= self.max_insertion:
+            raise UserError(
+                f"hole_clearance = {self.hole_clearance:g} m is not below "
+                f"max_insertion = {self.max_insertion:g} m"
+            )
+        if self.lost_after > self.forget_after:
+            raise UserError(
+                f"lost_after = {self.lost_after} is above forget_after = {self.forget_after}"
+            )
+
+    def answering_settings(self) -> AnsweringSettings:
+        """Return how pairs are made and answered."""
+        return AnsweringSettings(
+            pair_tolerance_ns=round(self.pair_tolerance * 1e9),
+            joint_timeout=self.joint_timeout,
+            lean=self.lean,
+        )
+
+    def tracker_settings(self, phantom: Phantom) -> TrackerSettings:
+        """Return the settings of the tracker behind the node.
+
+        Parameters
+        ----------
+        phantom : Phantom
+            From the calibration.
+
+        Returns
+        -------
+        TrackerSettings
+            As the parameters say.
+        """
+        gates = GateSettings(
+            reach=Reach(
+                self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
+            ),
+            surface_height=phantom.surface_height,
+            least_distance=self.hole_clearance + 1.5e-3,
+            tip_lean=self.tip_lean,
+            insertion_margin=self.insertion_margin,
+            step_margin=self.step_margin,
+            free_step=self.free_step,
+            max_disagreement=self.max_disagreement,
+            max_miss_px=1.0,
+            max_depth_sigma=0.5e-3,
+            confirm_pairs=self.confirm_pairs,
+            lost_after=self.lost_after,
+            forget_after=self.forget_after,
+        )
+        return TrackerSettings(
+            gates=gates,
+            needle_width=self.needle_width,
+            bright=None if self.needle_polarity == "auto" else self.needle_polarity == "bright",
+            min_contrast=self.min_contrast,
+            noise_factor=self.noise_factor,
+            entry_zone=self.entry_zone,
+            hole_clearance=self.hole_clearance,
+        )

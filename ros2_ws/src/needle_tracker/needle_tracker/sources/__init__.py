@@ -1,0 +1,1 @@
+"""Where images and joint states come from, and which belong together."""

@@ -1,0 +1,1 @@
+"""The needle found, followed and believed, in both views."""

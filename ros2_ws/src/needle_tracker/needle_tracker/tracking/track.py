@@ -1,0 +1,386 @@
+"""Whether a measured tip is believed: the gates, the prediction, and the track's state.
+
+Nothing here looks at images: measured tips and insertions come in as arguments, decisions go out as
+data.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_tracker.tracking.gates import UNCERTAIN, GateSettings, refusal
+from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.triangulation import SpatialTip
+
+Array = NDArray[np.float64]
+
+TOO_FAR = "too far from the last tip"
+SURPRISING = "too far from the prediction"
+_HEADING_TOLERANCE = 0.12  # [rad]
+_HIDDEN_PER_LOST = 4
+_CERTAIN = 0.5e-3  # [m]
+# A needle that both views showed so often lies where it was seen; that is not soon forgotten.
+_ESTABLISHED, _PATIENCE = 10, 5
+_SURE = 2  # both views must have shown its end so often, or once beyond doubt, to be sure of it
+_NEAR_ENTRY = 10e-3  # up to here the entry says where it is [m]
+_PITCH = 0.5e-3  # of the places that the tip has passed [m]
+# The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
+_BESIDE = 2.0e-3
+_CONFIRM_KNOWN = 2
+_CONFIRM_MISSES = 2  # so many pairs may lie between
+_EXPECTED, _NO_SURPRISE = 4.0, 9.0  # squared, over its covariance
+_NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
+_ABOUT = 1.5e-3  # what is known worse bears nothing out (one sigma) [m]
+_LARGEST_SURPRISE = 25.0  # squared, over its covariance
+
+
+class TrackState(enum.Enum):
+    """What the tracker knows about the needle."""
+
+    SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
+    CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
+    TRACKING = "TRACKING"
+    LOST = "LOST"  # was tracked and is not seen; found again only where it can have got to
+    ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
+
+
+@dataclasses.dataclass(frozen=True)
+class Anchor:
+    """The last believed tip, or where it should be now.
+
+    Attributes
+    ----------
+    motion : TipMotion
+        Position and heading.
+    insertion : float or None
+        Of that moment [m].
+    ahead : float
+        How far this is ahead of what was seen last [m].
+    known : bool
+        Whether that follows from the insertion.
+    unseen : float
+        How far the needle went since both views showed it [m].
+    """
+
+    motion: TipMotion
+    insertion: float | None
+    ahead: float = 0.0
+    known: bool = False
+    unseen: float = 0.0
+
+
+class Track:
+    """State of the track, advanced once per image pair.
+
+    Parameters
+    ----------
+    settings : GateSettings
+        The bounds.
+    """
+
+    def __init__(self, settings: GateSettings) -> None:
+        self._settings = settings
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.state = TrackState.SEARCHING
+        self.anchor: Anchor | None = None
+        self._misses = 0
+        self._hidden = 0
+        self._rival: Anchor | None = None
+        self._next_rival: Anchor | None = None
+        self._rivals = self._next_rivals = 0
+        self._agreeing = 0
+        self._sights = 0
+        self._is_sure = False
+        self._passed: list[tuple[float, Array]] = []
+
+    def enter(self) -> None:
+        """Note that the needle is in the entry zone, where it cannot be seen."""
+        self.reset()
+        self.state = TrackState.ENTRY
+
+    def predict(self, insertion: float | None) -> Anchor | None:
+        """Return where the tip should be now, None where there is no idea.
+
+        Parameters
+        ----------
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+
+        Returns
+        -------
+        Anchor or None
+            The last believed tip, moved on along its direction by the insertion since.
+        """
+        anchor = self.anchor
+        if anchor is None:
+            return None
+        ahead, known = 0.0, False
+        if insertion is not None and anchor.insertion is not None:
+            ahead, known = insertion - anchor.insertion, True
+        motion = anchor.motion.advanced(ahead, self._settings.reach.curvature, anchor.unseen)
+        return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
+
+    def keep_up(self, predicted: Anchor, motion: TipMotion) -> None:
+        """Take what one view alone says of a needle that is not believed for the moment.
+
+        Parameters
+        ----------
+        predicted : Anchor
+            From `predict`.
+        motion : TipMotion
+            The same with that taken in.
+        """
+        self.anchor = Anchor(motion, predicted.insertion, unseen=predicted.unseen)
+
+    def judge(self, tip: SpatialTip, insertion: float | None) -> str | None:
+        """Return why a measured tip is not believed, None where it passes all gates.
+
+        While the needle is followed, what is judged is what would be believed: the tip merged with
+        its prediction. What one view says alone is then enough if the prediction says the rest.
+        """
+        predicted = self.predict(insertion)
+        following = predicted is not None and predicted.known and self.state is TrackState.TRACKING
+        merged = predicted.motion.merged(tip) if predicted is not None and following else tip
+        reason = refusal(merged, insertion, self._settings)
+        if reason == UNCERTAIN and refusal(tip, insertion, self._settings) is None:
+            # Only the two together are: they contradict each other.
+            merged, reason = tip, SURPRISING
+        if predicted is None or reason not in (None, SURPRISING):
+            return reason
+        miss = float(np.linalg.norm(merged.position - predicted.motion.position))
+        if miss > self.tolerance(predicted):
+            return TOO_FAR
+        if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
+            return SURPRISING
+        return reason
+
+    def accept(
+        self,
+        tip: SpatialTip,
+        insertion: float | None,
+        *,
+        anew: bool = False,
+        certain: bool = True,
+        seen: bool = True,
+    ) -> SpatialTip | None:
+        """Take a tip that passed `judge`.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            As measured.
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+        anew : bool
+            Whether what was known before was wrong.
+        certain : bool
+            Whether one such tip is enough to begin with, if the insertion is known.
+        seen : bool
+            Whether both views show the end.
+
+        Returns
+        -------
+        SpatialTip or None
+            What is believed, None where nothing is yet. While the needle is followed the tip is
+            merged with its prediction, so that a view that something spoils counts less; in clear
+            images it is so much better than its prediction that this hardly moves it.
+        """
+        predicted = self.predict(insertion)
+        if self.state is not TrackState.TRACKING:
+            self._agreeing = self._agreeing + 1 if self.state is TrackState.CONFIRMING else 1
+            wanted = self._settings.confirm_pairs
+            if insertion is not None:
+                wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
+            confirmed = self._agreeing >= wanted
+            self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
+        self._misses = self._hidden = self._rivals = self._next_rivals = 0
+        self._rival = self._next_rival = None
+        if anew and (predicted is None or not self._is_on_way(tip, predicted)):
+            self._sights, self._is_sure, self._passed = 0, False, []
+        self._sights += seen
+        self._is_sure = self._is_sure or certain or self._sights >= _SURE
+        motion = TipMotion.start(tip)
+        if predicted is not None and predicted.known and not anew:
+            motion = predicted.motion.updated(tip)
+            tip = predicted.motion.merged(tip)
+        self.anchor = Anchor(motion, insertion)
+        if insertion is not None:
+            self._passed = [p for p in self._passed if p[0] < insertion - _PITCH]
+            self._passed.append((insertion, motion.position))
+        return tip if self.state is TrackState.TRACKING else None
+
+    def _is_on_way(self, tip: SpatialTip, predicted: Anchor) -> bool:
+        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
+        return miss <= max(self.tolerance(predicted), _BESIDE)
+
+    @property
+    def has_begun(self) -> bool:
+        """Whether there was a believed tip."""
+        return self.state in (TrackState.TRACKING, TrackState.LOST)
+
+    @property
+    def is_established(self) -> bool:
+        """Whether the needle was seen well so often that it cannot be elsewhere."""
+        return self.anchor is not None and self._sights >= _ESTABLISHED
+
+    @property
+    def is_unbroken(self) -> bool:
+        """Whether the pair before had a believed tip."""
+        return self._misses == 0 and self._hidden == 0
+
+    def way(self, insertion: float | None) -> tuple[Array, Array] | None:
+        """Return where the needle passes, as far as its tip was seen on its way.
+
+        Parameters
+        ----------
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+
+        Returns
+        -------
+        points : ndarray, shape (n, 3)
+            Outwards, the predicted tip last, in `rig` [m].
+        half_widths : ndarray, shape (n,)
+            How far beside them the needle may be [m].
+        """
+        predicted = self.predict(insertion)
+        if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
+            return None
+        assert insertion is not None
+        passed = [position for length, position in self._passed if length < insertion - _PITCH]
+        points = np.array([*passed, predicted.motion.position])
+        half_widths = np.full(len(points), _BESIDE)
+        half_widths[-1] = max(self.tolerance(predicted), _BESIDE)
+        return points, half_widths
+
+    def is_certain(self, insertion: float | None) -> bool:
+        """Return whether the tip's place is known so well that half a sight of it is enough."""
+        predicted = self.predict(insertion)
+        if predicted is None or not predicted.known or self.state is TrackState.CONFIRMING:
+            return False
+        assert insertion is not None
+        if not self._is_sure and insertion > _NEAR_ENTRY:
+            return False
+        return predicted.motion.sigma < _CERTAIN
+
+    def fits(self, tip: SpatialTip, insertion: float | None, *, on_way: bool) -> bool:
+        """Return whether a tip is where it must be, by a prediction that is certain."""
+        if not (on_way or self.is_certain(insertion)):
+            return False
+        return _is_about(tip, self.predict(insertion), _NEAR, _NO_SURPRISE)
+
+    def expects(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Return whether a tip is where it is most likely, and that is known about."""
+        predicted = self.predict(insertion)
+        if predicted is None or predicted.motion.sigma > _ABOUT:
+            return False
+        return _is_about(tip, predicted, _FAR, _EXPECTED)
+
+    def surprise(self, tip: SpatialTip, insertion: float | None) -> float:
+        """Return how far a tip is from its prediction, squared, over the covariance of both."""
+        predicted = self.predict(insertion)
+        return math.inf if predicted is None else predicted.motion.surprise(tip)
+
+    def is_excluded(self, tip: SpatialTip, insertion: float | None) -> bool:
+        """Return whether a needle that was seen so well before cannot have got to a tip."""
+        predicted = self.predict(insertion)
+        if predicted is None or not self.is_established:
+            return False
+        miss = float(np.linalg.norm(tip.position - predicted.motion.position))
+        return miss > _FAR and predicted.motion.surprise(tip) > _NO_SURPRISE
+
+    def contest(self, tip: SpatialTip, insertion: float | None, wanted: int) -> bool:
+        """Note a tip that the track does not bear out; return whether it has won.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            One that passed all other gates, its whole shaft included.
+        insertion : float or None
+            Length of needle in the phantom at the exposure [m].
+        wanted : int
+            How many in a row win.
+
+        Returns
+        -------
+        bool
+            Whether enough such tips in a row agree: then the track was wrong.
+        """
+        rival = self._rival
+        agrees = False
+        if rival is not None and insertion is not None and rival.insertion is not None:
+            ahead = insertion - rival.insertion
+            motion = rival.motion.advanced(ahead, self._settings.reach.curvature)
+            miss = float(np.linalg.norm(tip.position - motion.position))
+            agrees = miss <= self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
+        # Of what one pair shows several may agree with the pair before: that is one sight of it.
+        count = self._rivals + 1 if agrees else 1
+        if count > self._next_rivals:
+            self._next_rival = Anchor(TipMotion.start(tip), insertion)
+            self._next_rivals = count
+        return count >= wanted
+
+    def _pass_rival_on(self) -> None:
+        """Keep this pair's rival for the next: rivals win in a row, or not at all."""
+        self._rival, self._rivals = self._next_rival, self._next_rivals
+        self._next_rival, self._next_rivals = None, 0
+
+    def miss(self) -> None:
+        """Note a pair without a believed tip."""
+        settings = self._settings
+        self._pass_rival_on()
+        self._misses += 1
+        if self.state is TrackState.TRACKING:
+            if self._misses >= settings.lost_after:
+                self.state = TrackState.LOST
+        elif self.state is not TrackState.LOST and not self._may_confirm_yet():
+            rival = self._rival, self._rivals
+            self.reset()
+            self._rival, self._rivals = rival
+        patience = _PATIENCE if self.is_established else 1
+        if self.state is TrackState.LOST and self._misses >= patience * settings.forget_after:
+            self.reset()
+
+    def _may_confirm_yet(self) -> bool:
+        """Return whether a first tip may still be confirmed, though pairs without one came."""
+        known = self.anchor is not None and self.anchor.insertion is not None
+        confirming = self.state is TrackState.CONFIRMING
+        return confirming and known and self._misses <= _CONFIRM_MISSES
+
+    def hide(self) -> None:
+        """Note a pair that shows the shaft where it should be, but its end in neither view."""
+        self._hidden += 1
+        self._pass_rival_on()
+        if self._hidden > _HIDDEN_PER_LOST * self._settings.lost_after:
+            self.miss()
+
+    def tolerance(self, predicted: Anchor) -> float:
+        """Return how far a tip may be from where `predict` has it [m].
+
+        The needle goes the stage's way, bending at most by its largest curvature, and its heading
+        is known to a few degrees.
+        """
+        settings = self._settings
+        if not predicted.known:
+            return settings.free_step * (self._misses + self._hidden + 1)
+        way = predicted.unseen
+        bend = 0.5 * settings.reach.curvature * way * way
+        return settings.step_margin + _HEADING_TOLERANCE * way + bend
+
+
+def _is_about(tip: SpatialTip, predicted: Anchor | None, miss: float, surprise: float) -> bool:
+    """Return whether a tip is nearer to its prediction than both [m, squared over covariance]."""
+    if predicted is None or not predicted.known:
+        return False
+    if predicted.motion.direction_surprise(tip) > _NO_SURPRISE:
+        return False
+    off = float(np.linalg.norm(tip.position - predicted.motion.position))
+    return off < miss and predicted.motion.surprise(tip) < surprise

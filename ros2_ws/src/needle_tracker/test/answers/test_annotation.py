@@ -1,0 +1,55 @@
+"""The picture for a person."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from needle_tracker.answers.annotation import annotate, describe
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.ros.conversions import to_image
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+
+
+def test_tip_region_and_state_are_drawn_where_they_are(
+    calibration: StereoCalibration,
+    settings: TrackerSettings,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    left, right = draw_pair(make_arc(0.05, 5.0, 1.0))
+    for _ in range(2):
+        measured = tracker.process(left, right, 0.05)
+    assert measured.regions[0] is not None
+    picture = annotate(left, right, measured)
+    assert picture.dtype == np.uint8
+    assert picture.shape[1] == 1024 + 4
+    coloured = np.ptp(picture[:384].astype(int), axis=2) > 60
+    tips = measured.image_tips
+    for side, tip in enumerate(tips):
+        assert tip is not None
+        v, u = np.nonzero(coloured[:, side * 514 : side * 514 + 512])
+        middle = np.array([u.mean(), v.mean()])
+        assert np.linalg.norm(middle - tip.point / 2) < 20.0
+    assert describe(measured).startswith("TRACKING: x ")
+    assert picture[390:].any()
+
+
+def test_without_a_tip_the_reason_is_given(
+    calibration: StereoCalibration, settings: TrackerSettings
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    dark = np.zeros((768, 1024), np.uint8)
+    measured = tracker.process(dark, dark, 0.05)
+    assert describe(measured) == "SEARCHING: left image is black"
+    picture = annotate(dark, dark, measured)
+    assert not np.ptp(picture[:384].astype(int), axis=2).any()
+
+
+def test_the_picture_has_the_frame_of_its_first_view() -> None:
+    message = to_image(np.zeros((2, 4, 3), np.uint8), 5)
+    assert message.header.frame_id == "left_camera_optical"
+    assert message.header.stamp.nanosec == 5

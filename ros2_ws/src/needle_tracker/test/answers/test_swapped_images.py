@@ -1,0 +1,115 @@
+"""Swapped images are suspected, and nothing else is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.scenarios import find_scenario
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_tracker.answers.pair_answers import AnsweringSettings, Frame, PairAnswers
+from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import default_settings
+
+Pair = tuple[float, np.ndarray, np.ndarray]
+
+
+def pairs(path: Path, scenario: str, seed: int, last_mm: int = 40) -> Iterator[Pair]:
+    renderer = StereoRenderer(load_stereo_rig(path), seed, scenario=find_scenario(scenario))
+    plant = NeedlePlant(initial_pose(math.radians(1.0 + seed), 0.5 * seed), curvature=8.2)
+    for mm in range(1, last_mm + 1):
+        plant.advance(1e-3, 0.06)
+        if mm >= 4:
+            pose = np.asarray(plant.T_rig_tip)
+            yield 1e-3 * mm, *renderer.render(pose, plant.centreline(5e-4), mm)
+
+
+class Looks:
+    """A tracker and what suspects beside it."""
+
+    def __init__(self, calibration: StereoCalibration) -> None:
+        settings = default_settings(calibration.phantom)
+        self.tracker = StereoTracker(calibration, settings)
+        self.watch = SwapWatch(calibration, settings)
+        self.ever = False
+
+    def see(self, left: np.ndarray, right: np.ndarray, insertion: float | None) -> Measurement:
+        measured = self.tracker.process(left, right, insertion)
+        self.watch.see(left, right, insertion, measured)
+        self.ever = self.ever or self.watch.suspected
+        return measured
+
+
+@pytest.fixture
+def looks(calibration: StereoCalibration) -> Looks:
+    return Looks(calibration)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("scenario", ["clean", "clutter", "defocus"])
+def test_swapped_images_are_suspected(
+    looks: Looks, calibration_path: Path, scenario: str, known: bool
+) -> None:
+    for insertion, left, right in pairs(calibration_path, scenario, 1):
+        looks.see(right, left, insertion if known else None)
+    assert looks.watch.suspected
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize(
+    "scenario", ["clean", "clutter", "heavy_clutter", "occlusion", "absent", "defocus"]
+)
+def test_images_as_they_should_be_are_not(
+    looks: Looks, calibration_path: Path, scenario: str, known: bool
+) -> None:
+    for insertion, left, right in pairs(calibration_path, scenario, 2, 60):
+        looks.see(left, right, insertion if known else None)
+    assert not looks.ever
+
+
+def test_images_without_anything_are_not(looks: Looks, calibration: StereoCalibration) -> None:
+    shape = (calibration.left.height, calibration.left.width)
+    random = np.random.default_rng(1)
+    for _ in range(40):
+        left, right = random.integers(100, 140, (2, *shape), dtype=np.uint8)
+        looks.see(left, right, 0.05)
+    assert not looks.ever
+
+
+def test_it_is_over_when_the_cameras_are_exchanged(looks: Looks, calibration_path: Path) -> None:
+    for insertion, left, right in pairs(calibration_path, "clean", 1, 60):
+        if insertion < 0.03:
+            looks.see(right, left, insertion)
+        else:
+            assert looks.ever
+            measured = looks.see(left, right, insertion)
+    assert measured.tip is not None
+    assert not looks.watch.suspected
+
+
+def test_the_answers_stay_as_they_are(
+    calibration: StereoCalibration, calibration_path: Path
+) -> None:
+    settings = default_settings(calibration.phantom)
+    alone = StereoTracker(calibration, settings)
+    answers = PairAnswers(calibration, settings, AnsweringSettings(0, 0.2, 0.0))
+    for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):
+        answered = [
+            *answers.add_insertion(k, insertion, 0.0),
+            *answers.add_image("left", k, Frame(right), 0.0),
+            *answers.add_image("right", k, Frame(left), 0.0),
+        ]
+        [answer] = answered
+        measured = alone.process(right, left, insertion)
+        assert (answer.measured.state, answer.measured.reason) == (measured.state, measured.reason)
+        assert (answer.tip is None) == (measured.tip is None)
+    assert answers.swap.suspected

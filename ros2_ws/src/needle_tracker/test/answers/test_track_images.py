@@ -1,0 +1,210 @@
+"""track_images on files drawn by the tests: what comes out, and what is refused in one line."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from needle_tracker.answers.track_images import COLUMNS, main
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.ros.parameters import StereoTrackerParameters
+from needle_tracker.tracking.tracker_settings import default_settings
+
+Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
+Drawn = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
+LENGTHS_MM = (3, 50, 51, 52, 53)
+
+
+@pytest.fixture(scope="module")
+def drawn(draw_pair: Drawer, make_arc: Callable[..., np.ndarray]) -> Drawn:
+    """Return (tip, left, right) for each length."""
+    found = []
+    for mm in LENGTHS_MM:
+        path = make_arc(1e-3 * mm, 5.0, 1.0)
+        found.append((path[-1], *draw_pair(path, seed=mm)))
+    return found
+
+
+@pytest.fixture
+def folder(tmp_path: Path, drawn: Drawn) -> Path:
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+    lines = ["name,insertion_m"]
+    for mm, (_, left, right) in zip(LENGTHS_MM, drawn, strict=True):
+        cv2.imwrite(str(tmp_path / "left" / f"image_{mm}.png"), left)
+        cv2.imwrite(str(tmp_path / "right" / f"image_{mm}.png"), right)
+        lines.append(f"image_{mm}.png,{1e-3 * mm}")
+    (tmp_path / "insertion.csv").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def track(folder: Path, calibration_path: Path, *more: str) -> tuple[int, list[dict[str, str]]]:
+    output = folder / "tips.csv"
+    output.unlink(missing_ok=True)
+    arguments = ["--calibration", str(calibration_path), "--output", str(output)]
+    if "--left" not in more:
+        arguments += ["--left", str(folder / "left"), "--right", str(folder / "right")]
+    code = main([*arguments, *more])
+    if not output.exists():
+        return code, []
+    with output.open(newline="") as file:
+        reader = csv.DictReader(file)
+        rows = list(reader)
+        assert reader.fieldnames == list(COLUMNS)
+    return code, rows
+
+
+def test_the_defaults_are_the_nodes(calibration: StereoCalibration) -> None:
+    phantom = calibration.phantom
+    assert default_settings(phantom) == StereoTrackerParameters().tracker_settings(phantom)
+
+
+def test_swapped_folders_are_suspected(
+    tmp_path: Path,
+    calibration_path: Path,
+    draw_pair: Drawer,
+    make_arc: Callable[..., np.ndarray],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    lines = ["name,insertion_m"]
+    for side in ("left", "right"):
+        (tmp_path / side).mkdir()
+    for mm in range(50, 65):
+        for side, image in zip(
+            ("right", "left"), draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), strict=True
+        ):
+            cv2.imwrite(str(tmp_path / side / f"{mm}.png"), image)
+        lines.append(f"{mm}.png,{1e-3 * mm}")
+    (tmp_path / "insertion.csv").write_text("\n".join(lines) + "\n")
+    code, rows = track(tmp_path, calibration_path, "--insertion", str(tmp_path / "insertion.csv"))
+    assert code == 0
+    assert {row["valid"] for row in rows} == {"0"}
+    said = capsys.readouterr().err
+    assert "seem to be swapped" in said
+    assert "exchange --left and --right" in said
+
+
+def test_every_pair_has_its_line(folder: Path, calibration_path: Path, drawn: Drawn) -> None:
+    code, rows = track(folder, calibration_path, "--insertion", str(folder / "insertion.csv"))
+    assert code == 0
+    assert [row["name"] for row in rows] == [f"image_{mm}.png" for mm in LENGTHS_MM]
+    # 3 mm: known from the stage alone, which is no measurement.
+    assert [row["valid"] for row in rows] == ["0", "1", "1", "1", "1"]
+    assert all(not value for key, value in rows[0].items() if key not in ("name", "valid"))
+    for row, (tip, _, _) in zip(rows[1:], drawn[1:], strict=True):
+        seen = np.array([float(row[f"{axis}_m"]) for axis in "xyz"])
+        assert np.linalg.norm(seen - tip) < 0.25e-3
+        assert all(0.0 < float(row[f"sigma_{axis}_m"]) < 0.5e-3 for axis in "xyz")
+        assert abs(float(row["pitch_rad"])) < 0.3
+        assert abs(float(row["yaw_rad"])) < 0.3
+
+
+def test_without_insertion_three_must_agree(folder: Path, calibration_path: Path) -> None:
+    (folder / "left" / "image_3.png").unlink()
+    code, rows = track(folder, calibration_path)
+    assert code == 0
+    assert [row["valid"] for row in rows] == ["0", "0", "1", "1"]
+
+
+def test_bad_files_are_named_and_counted(
+    folder: Path, calibration_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (folder / "left" / "image_51.png").write_bytes(b"no image")
+    (folder / "left" / "image_52.png").write_bytes(b"")
+    cv2.imwrite(str(folder / "right" / "image_53.png"), np.full((480, 640), 90, np.uint8))
+    cv2.imwrite(str(folder / "right" / "image_54.png"), np.full((480, 640), 90, np.uint8))
+    insertion = ("--insertion", str(folder / "insertion.csv"), "--json", str(folder / "o.json"))
+    code, rows = track(folder, calibration_path, *insertion)
+    assert code == 0
+    assert [row["valid"] for row in rows] == ["0", "1", "0", "0", "0"]
+    said = capsys.readouterr().err
+    for name in ("right image_54.png", "image_51.png (left", "image_52.png (left"):
+        assert name in said
+    assert "image_53.png (right image is 640x480" in said
+    counts = json.loads((folder / "o.json").read_text())
+    assert (counts["pairs"], counts["tips"]) == (5, 1)
+    assert (counts["unpaired"], counts["unreadable"]) == (1, 3)
+
+
+def test_videos_serve_too(folder: Path, calibration_path: Path, drawn: Drawn) -> None:
+    for side in (1, 2):
+        # Without loss; a codec that every OpenCV has.
+        code = cv2.VideoWriter.fourcc(*"FFV1")
+        video = cv2.VideoWriter(str(folder / f"{side}.avi"), code, 10.0, (1024, 768), False)
+        for images in drawn[side:]:
+            video.write(images[side])
+        video.release()
+    (folder / "by_number.csv").write_text("name,insertion_m\n000000,0.051\n")
+    code, rows = track(
+        folder,
+        calibration_path,
+        *("--left", str(folder / "1.avi"), "--right", str(folder / "1.avi")),
+    )
+    assert code == 0
+    assert [row["name"] for row in rows] == [f"{number:06d}" for number in range(4)]
+    assert {row["valid"] for row in rows} == {"0"}  # one camera twice: no depth
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        (["--calibration", "nothing.yaml"], "nothing.yaml"),
+        (["--insertion", "nothing.csv"], "nothing.csv"),
+        (["--left", "nowhere", "--right", "nowhere"], "nowhere"),
+        (["--needle-width-mm", "seven"], "seven"),
+        (["--unknown"], "--unknown"),
+    ],
+)
+def test_what_is_missing_is_one_line(
+    folder: Path,
+    calibration_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    arguments: list[str],
+    named: str,
+) -> None:
+    code, rows = track(folder, calibration_path, *arguments)
+    said = capsys.readouterr().err
+    assert code == 2
+    assert not rows
+    assert said.count("\n") == 1
+    assert named in said
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("name,insertion\na,1\n", "insertion_m"),
+        ("name,insertion_m\na,far\n", "line 2"),
+        ("name,insertion_m\na,nan\n", "line 2"),
+        ("name,insertion_m\na,0.1\na,0.2\n", "line 3"),
+        ("", "name"),
+    ],
+)
+def test_a_bad_insertion_file_is_refused(
+    folder: Path,
+    calibration_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    named: str,
+) -> None:
+    (folder / "bad.csv").write_text(text)
+    code, _ = track(folder, calibration_path, "--insertion", str(folder / "bad.csv"))
+    assert code == 2
+    assert named in capsys.readouterr().err
+
+
+def test_a_calibration_for_another_resolution_is_refused(
+    folder: Path, calibration_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = calibration_path.read_text().replace("image_width: 1024", "image_width: 1280")
+    other = folder / "other.yaml"
+    other.write_text(text)
+    code, _ = track(folder, other)
+    assert code == 2
+    assert "1280x768" in capsys.readouterr().err

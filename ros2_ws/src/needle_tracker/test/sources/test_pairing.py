@@ -1,0 +1,82 @@
+"""Pairs by stamp, and the insertion between joint states."""
+
+from __future__ import annotations
+
+import math
+
+from needle_tracker.sources.insertion_history import InsertionHistory
+from needle_tracker.sources.pairing import PairMatcher
+
+
+def test_equal_stamps_pair_in_any_order_of_arrival() -> None:
+    matcher: PairMatcher[str] = PairMatcher(0)
+    assert matcher.add("left", 10, "l10") is None
+    assert matcher.add("left", 20, "l20") is None
+    pair = matcher.add("right", 10, "r10")
+    assert pair is not None
+    assert (pair.stamp, pair.left, pair.right) == (10, "l10", "r10")
+    pair = matcher.add("right", 20, "r20")
+    assert pair is not None
+    assert (pair.stamp, pair.left, pair.right) == (20, "l20", "r20")
+    assert (matcher.counts.pairs, matcher.counts.unpaired) == (2, 0)
+
+
+def test_latest_is_never_paired_with_latest() -> None:
+    matcher: PairMatcher[str] = PairMatcher(0)
+    assert matcher.add("left", 10, "l10") is None
+    assert matcher.add("right", 20, "r20") is None
+    assert matcher.add("left", 21, "l21") is None
+    assert matcher.counts.pairs == 0
+
+
+def test_an_image_passed_over_is_dropped_and_counted() -> None:
+    matcher: PairMatcher[str] = PairMatcher(0)
+    matcher.add("left", 10, "l10")
+    matcher.add("left", 20, "l20")
+    assert matcher.add("right", 20, "r20") is not None
+    assert matcher.counts.unpaired_left == 1
+    assert matcher.add("right", 10, "r10") is None
+
+
+def test_one_camera_alone_does_not_pile_up() -> None:
+    matcher: PairMatcher[str] = PairMatcher(0)
+    for stamp in range(100):
+        assert matcher.add("right", stamp, "r") is None
+    assert len(matcher.waiting("right")) == 3
+    assert matcher.counts.unpaired_right == 97
+
+
+def test_tolerance_is_kept_and_the_nearest_wins() -> None:
+    matcher: PairMatcher[str] = PairMatcher(5)
+    matcher.add("left", 100, "l100")
+    assert matcher.add("right", 106, "r106") is None
+    pair = matcher.add("left", 104, "l104")
+    assert pair is not None
+    assert (pair.stamp, pair.left, pair.right) == (104, "l104", "r106")
+    assert matcher.counts.unpaired_left == 1
+
+
+def test_insertion_is_interpolated_at_the_exposure() -> None:
+    history = InsertionHistory()
+    assert not history.is_bracketed(0)
+    history.add(100, 0.010)
+    assert not history.is_bracketed(101)
+    assert history.at(101) is None
+    history.add(200, 0.020)
+    assert history.is_bracketed(150)
+    assert math.isclose(history.at(130) or 0.0, 0.013)
+    assert history.at(200) == 0.020
+    assert history.at(100) == 0.010
+    assert history.at(99) is None
+
+
+def test_bad_and_backward_samples_are_counted() -> None:
+    history = InsertionHistory()
+    history.add(100, 0.01)
+    history.add(110, math.nan)
+    assert (history.refused, history.is_bracketed(105)) == (1, False)
+    history.add(50, 0.002)
+    assert history.restarts == 1
+    assert history.at(100) is None
+    history.add(50, 0.003)
+    assert history.at(50) == 0.003

@@ -1,0 +1,415 @@
+"""How much must be seen of a tip that was found without a prediction, and where it is sought."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from needle_tracker.image.corridor import within_corridor
+from needle_tracker.image.search_grid import make_search_grid
+from needle_tracker.image.tip_fit import ImageTip, hidden
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracking import acquisition
+from needle_tracker.tracking.evidence import (
+    UsualVisibility,
+    is_half_sound,
+    is_sound,
+    shows_lines,
+    sights_against,
+    sights_for,
+    sights_of_excluded,
+)
+from needle_tracker.tracking.measurement import Measurement, judged
+from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+from needle_tracker.tracking.triangulation import SpatialTip
+
+Views = tuple[RefractedCamera, RefractedCamera]
+GOOD = ImageTip(np.zeros(2), np.array([1.0, 0.0]), 0.05, 0.15, 0.005, 100.0, 0.6)
+POOR = dataclasses.replace(GOOD, sigma_across=0.7)
+AHEAD = np.array([0.0, 0.0, 1.0])
+
+
+def tip(x: float = 0.0, z: float = 0.05, sigma: float = 0.03e-3) -> SpatialTip:
+    covariance = sigma**2 * np.eye(3)
+    return SpatialTip(np.array([x, 0.0, z]), covariance, AHEAD, 1e-4 * np.eye(3), 0.0, 0.0)
+
+
+def established(settings: TrackerSettings) -> Track:
+    """Return a track that both views showed for 20 mm, to an insertion of 60 mm."""
+    track = Track(settings.gates)
+    for z in np.arange(0.040, 0.0601, 0.001):
+        track.accept(tip(z=float(z)), float(z))
+    return track
+
+
+@pytest.mark.parametrize("state", [TrackState.TRACKING, TrackState.LOST])
+def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> None:
+    assert sights_against(state, (GOOD, GOOD), alike=True, on_way=True) > 1
+    unlike = sights_against(state, (GOOD, GOOD), alike=False, on_way=True)
+    assert unlike == (0 if state is TrackState.TRACKING else 3)
+    long = dataclasses.replace(GOOD, sigma_along=2.5)
+    assert sights_against(state, (long, GOOD), alike=True, on_way=True) > 1
+    longer = dataclasses.replace(GOOD, sigma_along=3.5)
+    for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (longer, GOOD), (GOOD, None)):
+        assert sights_against(state, found, alike=True, on_way=True) == 0
+
+
+def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
+    lost = TrackState.LOST
+    waiting = functools.partial(sights_for, possible=True, guided=False)
+    assert waiting(lost, (GOOD, GOOD), alike=True, near=True) == 0
+    assert waiting(lost, (GOOD, GOOD), alike=True, near=False) == 2
+    assert waiting(lost, (GOOD, GOOD), alike=False, near=True) == 3
+    assert waiting(lost, (POOR, GOOD), alike=True, near=True) == 3
+    # A line without an end is the shaft's or any other's.
+    assert waiting(lost, (GOOD, hidden(GOOD)), alike=True, near=False) is None
+    assert waiting(lost, (GOOD, hidden(GOOD)), alike=True, near=True) == 2
+
+
+def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
+    waiting = functools.partial(sights_for, alike=False, near=True, guided=False)
+    for state in (TrackState.TRACKING, TrackState.CONFIRMING):
+        assert waiting(state, (GOOD, GOOD), possible=True) == 0
+        assert waiting(state, (GOOD, GOOD), possible=False) == 2
+
+
+@pytest.mark.parametrize("plainer", [1.0, 1.6])
+def test_a_tip_too_plain_for_the_needle_is_not_believed_at_once(
+    settings: TrackerSettings, calibration: StereoCalibration, views: Views, plainer: float
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    tracker.track.__dict__.update(established(settings).__dict__)
+    tracker._acquisition._usual.see((GOOD, GOOD))
+    ends: list[ImageTip] = []
+    for view in views:
+        along = view.jacobian(tip().position) @ AHEAD
+        end = dataclasses.replace(GOOD, point=view.project(np.array([0.0, 0.0, 0.072])))
+        end = dataclasses.replace(end, direction=along / np.linalg.norm(along))
+        ends.append(dataclasses.replace(end, visibility=plainer * GOOD.visibility))
+    found = (ends[0], ends[1])
+    measured = judged(views, tracker.track, found, 0.072)
+    assert measured.tip is not None
+    assert not tracker.track.fits(measured.tip, 0.072, on_way=False)
+    wanted = tracker._acquisition._sights_wanted(measured, found, 0.072, on_way=False)
+    assert wanted == (0 if plainer == 1.0 else 2)
+
+
+def test_what_begins_at_the_entry_is_no_needle_that_has_begun(
+    settings: TrackerSettings, calibration: StereoCalibration
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    young = tip(z=0.01)
+    measured = Measurement(young, TrackState.SEARCHING, "", (GOOD, GOOD))
+    assert tracker._acquisition._begins_at_entry(measured, 0.01)
+    # Disturbed, and plainer in one view than in the other.
+    disturbed = dataclasses.replace(GOOD, sigma_across=0.4)
+    for plainer, believed in ((1.3, True), (1.7, False)):
+        other = dataclasses.replace(GOOD, visibility=plainer * GOOD.visibility)
+        for found in ((disturbed, other), (other, disturbed)):
+            unlike = dataclasses.replace(measured, image_tips=found)
+            assert tracker._acquisition._begins_at_entry(unlike, 0.01) is believed
+    assert tracker.track.accept(young, 0.01) is not None
+    assert not tracker._acquisition._begins_at_entry(measured, 0.01)
+
+
+@pytest.mark.parametrize("plainer", [0.8, 1.3])
+def test_a_line_that_is_unlike_and_disturbed_may_be_half_another_s(plainer: float) -> None:
+    """Half a shadow's where it is fainter than the needle, half a cable's where it is plainer."""
+    usual = UsualVisibility()
+    unlike = dataclasses.replace(GOOD, visibility=plainer * GOOD.visibility)
+    mixed = dataclasses.replace(unlike, sigma_across=0.4)
+    assert usual.unmixed((mixed, GOOD)) == (mixed, GOOD)
+    usual.see((GOOD, GOOD))
+    disturbed = dataclasses.replace(GOOD, sigma_across=0.4)
+    assert usual.unmixed((unlike, disturbed)) == (unlike, disturbed)
+    for shown in (usual.unmixed, usual.doubted):
+        left, right = shown((mixed, GOOD))
+        assert left.sigma_across == pytest.approx(math.hypot(0.4, 2.0))
+        assert right == GOOD
+
+
+def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
+    found = (GOOD, dataclasses.replace(GOOD, sigma_across=0.4, sigma_along=3.0))
+    waiting = functools.partial(sights_for, alike=True, possible=True, near=False)
+    for state in (TrackState.TRACKING, TrackState.LOST):
+        assert waiting(state, found, guided=True) == 2
+        assert waiting(state, found, guided=False) != 2
+
+
+def test_an_established_track_is_wrong_where_a_plain_needle_is_seen_elsewhere() -> None:
+    plain = dataclasses.replace(GOOD, sigma_across=0.1)
+    wanted = functools.partial(sights_of_excluded, alike=True)
+    assert wanted(TrackState.LOST, (plain, plain)) == 4
+    assert wanted(TrackState.TRACKING, (plain, plain)) is None
+    for other in (dataclasses.replace(GOOD, sigma_across=0.2), hidden(plain), None):
+        assert wanted(TrackState.LOST, (plain, other)) is None
+    assert sights_of_excluded(TrackState.LOST, (plain, plain), alike=False) is None
+
+
+def test_a_needle_that_was_mistaken_is_found_where_it_is(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    """Something else was followed for 13 mm; the needle is plain to see, but far from it."""
+    tracker = StereoTracker(calibration, settings)
+    for mm in range(40, 53):
+        assert tracker.process(*draw_pair(make_arc(mm * 1e-3, 6.0, 1.0)), mm * 1e-3).tip is not None
+    covered = np.full((768, 1024), 90, np.uint8)
+    for mm in range(53, 57):
+        tracker.process(covered, covered, mm * 1e-3)
+    assert tracker.track.state is TrackState.LOST
+    found: list[bool] = []
+    for mm in range(57, 62):
+        path = make_arc(mm * 1e-3, 6.0, -1.0)
+        assert tracker.track.is_excluded(
+            dataclasses.replace(tip(), position=path[-1]), mm * 1e-3
+        ) is (not any(found))
+        measured = tracker.process(*draw_pair(path), mm * 1e-3)
+        found.append(measured.tip is not None)
+        if measured.tip is not None:
+            assert np.linalg.norm(measured.tip.position - path[-1]) < 0.2e-3
+    assert found == [False, False, False, True, True]
+
+
+def test_a_tip_that_points_elsewhere_is_not_the_one_that_is_waited_for(
+    settings: TrackerSettings,
+) -> None:
+    track = established(settings)
+    here = tip(z=0.061)
+    assert track.expects(here, 0.061)
+    assert track.fits(here, 0.061, on_way=True)
+    for angle, goes_on in ((0.1, True), (0.7, False)):
+        direction = np.array([math.sin(angle), 0.0, math.cos(angle)])
+        turned = dataclasses.replace(here, direction=direction)
+        assert track.expects(turned, 0.061) is goes_on
+        assert track.fits(turned, 0.061, on_way=True) is goes_on
+
+
+def test_what_lies_over_the_needle_is_not_like_it() -> None:
+    usual = UsualVisibility()
+    assert usual.is_like((GOOD, GOOD))
+    usual.see((GOOD, GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, visibility=0.5), GOOD))
+    assert not usual.is_like((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+    for _ in range(30):
+        usual.see((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+    assert usual.is_like((dataclasses.replace(GOOD, visibility=0.95), GOOD))
+
+
+def test_where_the_needle_must_be_light_on_it_is_allowed_and_something_over_it_is_not() -> None:
+    usual = UsualVisibility()
+    usual.see((GOOD, GOOD))
+
+    def allowed(share: float, sigma: float) -> bool:
+        other = dataclasses.replace(GOOD, visibility=share * GOOD.visibility, sigma_across=sigma)
+        assert usual.allows((other, GOOD)) is usual.allows((GOOD, other))
+        return usual.allows((other, GOOD))
+
+    assert allowed(0.5, 0.05)
+    assert allowed(0.5, 0.5)
+    assert not allowed(0.3, 0.05)
+    # Plainer, only if nothing disturbs its line.
+    assert allowed(1.35, 0.05)
+    assert not allowed(1.35, 0.5)
+    assert not allowed(1.5, 0.05)
+
+
+def test_a_line_is_enough_of_a_sight_to_bear_out_what_is_known() -> None:
+    assert shows_lines((GOOD, hidden(POOR)))
+    assert not shows_lines((GOOD, dataclasses.replace(GOOD, sigma_across=0.9)))
+    assert not shows_lines((GOOD, None))
+
+
+def test_a_tip_just_where_it_is_expected_is_told_from_one_beside(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert track.expects(tip(z=0.061), 0.061)
+    assert not track.expects(tip(x=1e-3, z=0.061), 0.061)
+    # After some way out of sight the same place is no surprise; in the end nothing is.
+    assert track.expects(tip(x=1e-3, z=0.072), 0.072)
+    assert not track.expects(tip(x=4e-3, z=0.075), 0.075)
+    assert track.surprise(tip(x=1e-3, z=0.1), 0.1) < 1.0
+    assert not track.expects(tip(x=1e-3, z=0.1), 0.1)
+    assert track.surprise(tip(x=1e-3, z=0.061), 0.061) > track.surprise(tip(z=0.061), 0.061)
+    assert not track.expects(tip(), None)
+    assert track.fits(tip(z=0.061), 0.061, on_way=True)
+    assert not track.fits(tip(z=0.06), None, on_way=True)
+    assert Track(settings.gates).surprise(tip(), 0.05) == math.inf
+
+
+def test_how_much_light_there_is_says_nothing() -> None:
+    dim = dataclasses.replace(GOOD, contrast=GOOD.contrast / 4.0)
+    usual = UsualVisibility()
+    usual.see((GOOD, GOOD))
+    assert usual.is_like((dim, GOOD))
+    assert is_sound((dim, GOOD), 0.3, 2.0)
+    shadow = dataclasses.replace(GOOD, visibility=GOOD.visibility / 2.5)
+    assert not usual.is_like((shadow, GOOD))
+    assert not is_sound((shadow, GOOD), 0.3, 2.0)
+
+
+def test_what_is_unlike_the_needle_hardly_says_where_it_is() -> None:
+    usual = UsualVisibility()
+    unlike = dataclasses.replace(GOOD, visibility=0.95)
+    assert usual.doubted((unlike, GOOD)) == (unlike, GOOD)
+    usual.see((GOOD, GOOD))
+    assert usual.doubted((GOOD, GOOD)) == (GOOD, GOOD)
+    left, right = usual.doubted((unlike, GOOD))
+    assert left.sigma_across > 20.0 * GOOD.sigma_across
+    assert left.sigma_along == GOOD.sigma_along
+    assert right == GOOD
+
+
+def test_one_end_and_the_other_view_s_line_are_half_a_sight() -> None:
+    line = hidden(GOOD)
+    assert is_half_sound((GOOD, line))
+    assert is_half_sound((line, GOOD))
+    assert not is_half_sound((line, line))
+    assert not is_half_sound((GOOD, dataclasses.replace(line, sigma_across=0.9)))
+    assert not is_half_sound((GOOD, dataclasses.replace(line, visibility=0.25)))
+    assert not is_half_sound((GOOD, None))
+
+
+def test_what_one_pair_shows_twice_counts_once(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert [track.contest(tip(x=2e-3, z=0.06), 0.061, 2) for _ in range(4)] == [False] * 4
+    track.miss()
+    assert track.contest(tip(x=2e-3, z=0.061), 0.062, 2)
+
+
+def test_rivals_win_in_a_row_or_not_at_all(settings: TrackerSettings) -> None:
+    track = established(settings)
+    track.contest(tip(x=2e-3, z=0.06), 0.061, 2)
+    track.miss()
+    track.miss()
+    assert not track.contest(tip(x=2e-3, z=0.062), 0.063, 2)
+
+
+def test_a_needle_seen_well_cannot_be_elsewhere(settings: TrackerSettings) -> None:
+    track = established(settings)
+    assert track.is_established
+    assert track.is_excluded(tip(x=-8e-3, z=0.0605), 0.061)
+    assert not track.is_excluded(tip(x=0.5e-3, z=0.061), 0.061)
+    for _ in range(settings.gates.forget_after + 5):
+        track.miss()
+    assert track.anchor is not None
+    fresh = Track(settings.gates)
+    fresh.accept(tip(), 0.05)
+    assert not fresh.is_excluded(tip(x=-8e-3, z=0.0505), 0.051)
+
+
+def test_a_needle_drawn_back_leaves_its_way(settings: TrackerSettings) -> None:
+    track = established(settings)
+    way = track.way(0.0505)
+    assert way is not None
+    assert way[0][:, 2].max() == pytest.approx(0.0505, abs=1e-4)
+    assert np.all(np.diff(way[0][:, 2]) > 0.0)
+
+
+def test_the_corridor_keeps_the_needle_and_drops_what_is_beside_it(
+    views: Views, settings: TrackerSettings, make_arc: Callable[..., np.ndarray]
+) -> None:
+    path = make_arc(0.09, 7.0, -0.8)
+    way, half_widths = path[30::4], np.full(len(path[30::4]), 2e-3)
+    for view in views:
+        grid = make_search_grid(view, settings.gates.reach, first_distance=2e-3)
+        narrowed = within_corridor(grid, view, way, half_widths)
+        assert np.count_nonzero(narrowed.reachable) < 0.5 * np.count_nonzero(grid.reachable)
+        for offset, kept in ((0.0, True), (1.5e-3, True), (-1.5e-3, True), (5e-3, False)):
+            for point in view.project(way + np.array([0.0, offset, 0.0])):
+                near = np.linalg.norm(narrowed.pixels - point, axis=-1)
+                row, column = np.unravel_index(int(np.argmin(near)), near.shape)
+                assert narrowed.reachable[row, column] == kept
+
+
+def test_found_again_beside_another_line(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+) -> None:
+    """Both cameras blocked for 12 mm; then a second line, as long and as dark, is there, too."""
+    tracker = StereoTracker(calibration, settings)
+    for insertion in np.arange(0.040, 0.0521, 0.001):
+        pair = draw_pair(make_arc(float(insertion), 4.0, 1.0))
+        assert tracker.process(*pair, float(insertion)).tip is not None
+    dark = np.full_like(pair[0], 30)
+    for insertion in np.arange(0.053, 0.0641, 0.001):
+        assert tracker.process(dark, dark, float(insertion)).tip is None
+    found = []
+    for insertion in (0.065, 0.066, 0.067):
+        needle = make_arc(insertion, 4.0, 1.0)
+        other = make_arc(insertion, 3.0, 2.5, math.radians(-6.0))
+        left, right = (
+            np.minimum(a, b) for a, b in zip(draw_pair(needle), draw_pair(other), strict=True)
+        )
+        measured = tracker.process(left, right, insertion)
+        if measured.tip is not None:
+            found.append(np.linalg.norm(measured.tip.position - needle[-1]))
+    assert len(found) == 3
+    assert max(found) < 0.3e-3
+
+
+@pytest.mark.parametrize("spoilt", [0, 1])
+@pytest.mark.parametrize("trouble", ["shorter", "fainter"])
+def test_found_again_at_once_where_it_is_waited_for(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+    spoilt: int,
+    trouble: str,
+) -> None:
+    """Both cameras blocked for 12 mm; then one view shows less of the needle, or less clearly."""
+    tracker = StereoTracker(calibration, settings)
+    for insertion in np.arange(0.040, 0.0521, 0.001):
+        pair = list(draw_pair(make_arc(float(insertion), 4.0, 1.0)))
+        assert tracker.process(pair[0], pair[1], float(insertion)).tip is not None
+    dark = np.full_like(pair[0], 90)
+    for insertion in np.arange(0.053, 0.0641, 0.001):
+        assert tracker.process(dark, dark, float(insertion)).tip is None
+    needle = make_arc(0.065, 4.0, 1.0)
+    pair = list(draw_pair(needle))
+    if trouble == "shorter":
+        pair[spoilt] = draw_pair(make_arc(0.0632, 4.0, 1.0))[spoilt]
+    else:
+        background = float(np.median(pair[spoilt]))
+        faint = background + 0.6 * (pair[spoilt].astype(float) - background)
+        pair[spoilt] = faint.round().astype(np.uint8)
+    found = tracker.process(pair[0], pair[1], 0.065).tip
+    assert found is not None
+    assert np.linalg.norm(found.position - needle[-1]) < 0.4e-3
+
+
+@pytest.mark.parametrize(
+    ("insertion", "bow", "found"), [(0.012, 4.5e-3, True), (0.06, 11e-3, False)]
+)
+def test_how_long_a_short_shaft_is_its_ends_say(
+    settings: TrackerSettings,
+    calibration: StereoCalibration,
+    draw_pair: Callable[..., tuple[np.ndarray, np.ndarray]],
+    make_arc: Callable[..., np.ndarray],
+    monkeypatch: pytest.MonkeyPatch,
+    insertion: float,
+    bow: float,
+    found: bool,
+) -> None:
+    """The coarse path wanders by millimetres; both ends are seen well."""
+    path = make_arc(insertion, 4.0, 1.0)
+    points = path[:: len(path) // 8]
+    aside = bow * np.sin(np.linspace(0.0, np.pi, len(points)))
+    wandering = points + np.outer(aside, [1.0, 0.0, 0.0])
+    monkeypatch.setattr(acquisition, "shaft_points", lambda *_: wandering)
+    tracker = StereoTracker(calibration, settings)
+    measured = tracker.process(*draw_pair(path), insertion)
+    assert (measured.tip is not None) is found
+    assert found or measured.reason == "the shaft's length is not the insertion"

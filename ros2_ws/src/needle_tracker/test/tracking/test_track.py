@@ -1,0 +1,191 @@
+"""The gates and the states, without any image."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from needle_tracker.image.search_grid import Reach
+from needle_tracker.tracking.gates import GateSettings, refusal, tip_at_entry
+from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.tracker_settings import TrackerSettings
+from needle_tracker.tracking.triangulation import SpatialTip
+
+
+@pytest.fixture
+def gates(settings: TrackerSettings) -> GateSettings:
+    return settings.gates
+
+
+def tip(x: float = 0.0, y: float = 0.0, z: float = 0.05) -> SpatialTip:
+    return SpatialTip(
+        np.array([x, y, z]),
+        np.diag([1e-9] * 3),
+        np.array([0.0, 0.0, 1.0]),
+        np.diag([1e-4, 1e-4, 0.0]),
+        1e-5,
+        0.01,
+    )
+
+
+@pytest.mark.parametrize("curvature", [2.0, 5.0, 9.0])
+@pytest.mark.parametrize("length", [0.01, 0.06, 0.14])
+@pytest.mark.parametrize("angle", [-0.15, 0.0, 0.1])
+def test_every_reachable_arc_passes(
+    gates: GateSettings,
+    make_arc: Callable[..., np.ndarray],
+    curvature: float,
+    length: float,
+    angle: float,
+) -> None:
+    for roll in np.linspace(-3.0, 0.0, 5):
+        end = make_arc(length, curvature, roll, angle)[-1]
+        if end[0] < gates.surface_height:
+            assert refusal(tip(*end), length, gates) is None
+            assert refusal(tip(*end), None, gates) is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "insertion", "reason"),
+    [
+        ({"disagreement": 3e-3}, None, "along the needle"),
+        ({"disagreement_across": 5.0}, None, "across the needle"),
+        ({"covariance": np.eye(3) * 1e-4}, None, "uncertain"),
+        ({"position": np.array([0.02, 0.0, 0.08])}, None, "above the surface"),
+        ({"position": np.array([0.0, 0.0, 0.002])}, None, "too close to the entry"),
+        ({"position": np.array([0.0, 0.0, 0.3])}, None, "longest insertion"),
+        ({"position": np.array([0.0, 0.05, 0.03])}, None, "reachable cone"),
+        ({"position": np.array([0.0, 0.0, -0.05])}, None, "reachable cone"),
+        ({"direction": np.array([0.0, 0.0, -1.0])}, None, "direction"),
+        ({}, 0.04, "farther than the insertion"),
+        ({}, 0.06, "short of the insertion"),
+    ],
+)
+def test_each_gate_refuses_by_name(
+    gates: GateSettings, changes: dict[str, object], insertion: float | None, reason: str
+) -> None:
+    changed = dataclasses.replace(tip(), **changes)  # type: ignore[arg-type]
+    assert reason in str(refusal(changed, insertion, gates))
+    assert refusal(tip(), 0.05, gates) is None
+
+
+def test_shortest_chord_is_an_arcs() -> None:
+    reach = Reach(8.2, 0.1, 1e-3, 0.15)
+    radius, length = 1 / 8.2, 0.12
+    end = np.array([math.sin(length / radius), 1 - math.cos(length / radius)]) * radius
+    assert reach.shortest_chord(length) == pytest.approx(np.linalg.norm(end))
+
+
+def test_with_the_insertion_known_one_tip_confirms(gates: GateSettings) -> None:
+    track = Track(gates)
+    states = [track.state]
+    assert track.accept(tip(), 0.05) is not None
+    states.append(track.state)
+    assert states == [TrackState.SEARCHING, TrackState.TRACKING]
+    prediction = track.predict(0.051)
+    assert prediction is not None
+    np.testing.assert_allclose(prediction.motion.position, [0.0, 0.0, 0.051])
+
+
+def test_without_it_several_must_agree(gates: GateSettings) -> None:
+    track = Track(gates)
+    assert [track.accept(tip(), None) is not None for _ in range(3)] == [False, False, True]
+    track.reset()
+    assert track.accept(tip(), None) is None
+    states = [track.state]
+    track.miss()
+    states.append(track.state)
+    assert states == [TrackState.CONFIRMING, TrackState.SEARCHING]
+    assert track.anchor is None
+
+
+@pytest.mark.parametrize(("missed", "confirmed"), [(2, True), (3, False)])
+def test_what_is_seen_twice_within_a_few_pairs_is_confirmed(
+    gates: GateSettings, missed: int, confirmed: bool
+) -> None:
+    track = Track(gates)
+    assert track.accept(tip(), 0.05, certain=False) is None
+    for _ in range(missed):
+        track.miss()
+    later = track.accept(tip(z=0.0505), 0.0505, certain=False)
+    assert (later is not None) is confirmed
+
+
+@pytest.mark.parametrize(("sights", "certain"), [(0, False), (1, False), (2, True)])
+def test_a_track_that_no_two_views_showed_is_not_certain(
+    gates: GateSettings, sights: int, certain: bool
+) -> None:
+    track = Track(gates)
+    for i in range(4):
+        track.accept(tip(z=0.05 + 1e-3 * i), 0.05 + 1e-3 * i, certain=False, seen=i < sights)
+    assert track.is_certain(0.054) is certain
+    plain = Track(gates)
+    plain.accept(tip(), 0.05)
+    assert plain.is_certain(0.05)
+
+
+def test_a_needle_kept_up_with_stays_uncertain_by_its_way(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(z=0.05), 0.05)
+    for insertion in (0.052, 0.054, 0.056):
+        predicted = track.predict(insertion)
+        assert predicted is not None
+        track.keep_up(predicted, predicted.motion)
+    kept = track.predict(0.057)
+    assert kept is not None
+    assert kept.ahead == pytest.approx(1e-3)
+    other = Track(gates)
+    other.accept(tip(z=0.05), 0.05)
+    left_alone = other.predict(0.057)
+    assert left_alone is not None
+    assert track.tolerance(kept) == pytest.approx(other.tolerance(left_alone))
+
+
+def test_a_tip_too_far_from_the_last_is_refused(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(z=0.05), 0.05)
+    assert track.judge(tip(z=0.051), 0.051) is None
+    assert track.judge(tip(x=-0.004, z=0.0505), 0.051) == "too far from the last tip"
+
+
+def test_lost_is_said_and_ends_where_the_needle_can_be(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(z=0.05), 0.05)
+    states = []
+    for _ in range(3):
+        track.miss()
+        states.append(track.state)
+    assert states == [TrackState.TRACKING, TrackState.TRACKING, TrackState.LOST]
+    assert track.judge(tip(y=-0.006, z=0.0495), 0.0505) == "too far from the last tip"
+    assert track.judge(tip(z=0.052), 0.052) is None
+    track.accept(tip(z=0.052), 0.052)
+    assert track.state is TrackState.TRACKING
+
+
+def test_long_lost_is_forgotten(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(), 0.05)
+    for _ in range(gates.forget_after):
+        track.miss()
+    assert track.state is TrackState.SEARCHING
+    assert track.judge(tip(y=0.006, z=0.0495), 0.05) is None
+
+
+def test_entry_starts_afresh(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(), 0.05)
+    track.enter()
+    assert track.state is TrackState.ENTRY
+    assert track.anchor is None
+
+
+def test_the_entry_covariance_covers_the_heading(make_arc: Callable[..., np.ndarray]) -> None:
+    guess = tip_at_entry(4e-3, 0.5e-3, math.radians(10))
+    for roll in (0.0, 1.0, 2.0):
+        for pitch in (-0.17, 0.0, 0.17):
+            error = make_arc(4e-3, 8.2, roll, pitch)[-1] - guess.position
+            assert error @ np.linalg.solve(guess.covariance, error) < 3.0

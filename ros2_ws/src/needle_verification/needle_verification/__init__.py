@@ -1,0 +1,1 @@
+"""What the rig's software must be able to show; no rig needs it."""

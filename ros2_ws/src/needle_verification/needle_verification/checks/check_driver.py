@@ -1,0 +1,301 @@
+"""Step D: the device driver on emulated drives: exact, repeatable, never an unbounded motion."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from needle_common.commands.cli import EXIT_DONE
+from needle_common.errors import UserError
+from needle_verification.checking import Check, Finding, Run, Workbench, payloads
+
+STEPS = 10_000
+MOMENTS = 50
+SAME_TOPICS = (
+    "/joint_states",
+    "/sim/drive_positions",
+    "/device/joint_trajectory",
+    "/device/result",
+    "/sim/tip_pose",
+)
+SHORT = ("--level", "drive", "--depth-mm", "40")
+# What the memory of both processes may grow by in 9,000 steps [MB]: less than a byte a cycle.
+MEMORY_SLACK = 2.0
+# Where a motor was when a node was killed is known from what was heard last, 50 times a second [s].
+SAMPLING = 0.04
+
+
+@dataclasses.dataclass(frozen=True)
+class Bound:
+    """How long a motion may go on at its speed after a fault, docs/safety.md.
+
+    Attributes
+    ----------
+    time : float
+        [s].
+    way : float
+        What comes on top, ramps included [mm].
+    """
+
+    time: float
+    way: float = 0.05
+
+
+# A drive ends at the last set-point by itself: at most the one sent and the one under way.
+_BY_ITSELF = Bound(0.04, 0.005)
+# The other drive gets no set-point more once one has left a SYNC unanswered.
+_SILENT = Bound(0.08)
+_TOLD = Bound(0.02 + 0.05)
+BOUNDS = {
+    "cut_bus": _BY_ITSELF,
+    "unplug": _BY_ITSELF,
+    "kill_driver": Bound(0.04 + SAMPLING, 0.005),
+    "reboot": _SILENT,
+    "hang": _SILENT,
+    "emcy": _TOLD,
+}
+NUISANCES = {
+    "points": "trajectories of 1,000,000 points",
+    "name": "holds with a name of 1 MB",
+    "parameters": "set_parameters with 20,000 names",
+    "flood": "10,000 messages/s on each topic that the driver hears",
+}
+# The drives' watchdog, and the copy of a message of 56 MB [s].
+DRIVES_WAIT, LONGEST_COPY = 0.1, 0.5
+# How long every node is fuzzed [s], and what each may grow by [MB].
+FUZZ, FUZZ_GROWTH = 900, 50.0
+# A rotation that does not follow is noticed when it is so far off [rad]; then come the patience of
+# the drive, a cycle and a ramp [s].
+_FOLLOWING = 0.1
+_NOTICED = 0.17
+
+
+def many_steps(_: Workbench, count: int = STEPS) -> Iterator[Finding]:
+    """Add up random steps to the count, lose no message, take no more memory."""
+    (seen,) = _trials("steps", count)
+    off = [seen["final_off_insertion_counts"], seen["final_off_rotation_counts"]]
+    yield Finding(
+        "steps_position",
+        f"{count:,} random steps: the motors' place against the sum of commands",
+        "within one count",
+        f"{off[0]:+.2f} counts in insertion, {off[1]:+.2f} in rotation, after "
+        f"{seen['retractions']} retractions",
+        max(map(abs, off)) <= 1.0,
+    )
+    lost = seen["ticks"] - min(seen["joint_states_of_ticks"], seen["drive_positions"])
+    yield Finding(
+        "steps_messages",
+        f"{count:,} random steps: results, joint_states and positions of each cycle",
+        "every one, all steps succeeded",
+        f"{seen['results']} results, {seen['not_succeeded']} not succeeded"
+        f"{''.join(f' ({text})' for text in seen['not_succeeded_for'])}; {lost} of "
+        f"{seen['ticks']} cycles without joints or positions",
+        seen["results"] == count and seen["not_succeeded"] == 0 and lost == 0,
+    )
+    yield Finding(
+        "steps_memory",
+        "memory of driver and drives, from a tenth of the steps to the end",
+        f"at most {MEMORY_SLACK:g} MB more",
+        f"{seen['memory_growth_MB']:+.2f} MB",
+        seen["memory_growth_MB"] <= MEMORY_SLACK,
+    )
+
+
+def drive_level(bench: Workbench) -> Iterator[Finding]:
+    """Converge with the real driver on emulated drives."""
+    run = bench.run("drive", "--level", "drive")
+    summary = run.summary
+    r1 = summary.get("r1_final_mm")
+    yield Finding(
+        "drive_converged",
+        "scripts/simulate --level drive: exit code, |r1| at 120 mm, processes left",
+        "0, at most 1 mm, none",
+        f"{run.code}, {math.nan if r1 is None else r1:.2f} mm, {len(run.left_over)}; "
+        f"{summary.get('steps_per_s', math.nan):.1f} steps/s",
+        run.code == EXIT_DONE and r1 is not None and abs(r1) <= 1.0 and not run.left_over,
+    )
+
+
+def same_joints(bench: Workbench) -> Iterator[Finding]:
+    """Repeat a run's joint positions with its seed."""
+    one, again = (bench.run(f"drive_{name}", *SHORT, "--seed", "5") for name in ("one", "again"))
+    ours, theirs = _told(one), _told(again)
+    differ = [topic for topic in SAME_TOPICS if ours[topic] != theirs[topic] or not ours[topic]]
+    yield Finding(
+        "drive_same_seed",
+        f"level drive, one seed twice: {', '.join(SAME_TOPICS)}",
+        "the same, bit for bit",
+        f"different: {', '.join(differ)}" if differ else "the same",
+        not differ,
+    )
+
+
+def _told(run: Run) -> dict[str, list[bytes]]:
+    """Return what was said, each thing once: joints are repeated while time stands still."""
+    return {
+        topic: [data for data, _ in itertools.groupby(messages)]
+        for topic, messages in payloads(run.bag, SAME_TOPICS).items()
+    }
+
+
+def faults(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
+    """End every motion within its bound, whatever breaks, and go on only when told."""
+    for kind in (*BOUNDS, "stall"):
+        yield from judge(kind, _trials("faults", moments, kind))
+
+
+def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
+    """End every motion within its bound when a node of the graph is killed."""
+    # Nominal 2 mm/s: the step under way ends, and at most one more was ordered already.
+    ways = {"plane_controller": 2.0, "stereo_tracker": 2.0, "operator": 2.0 * (0.25 + 0.07)}
+    for kind, way in ways.items():
+        outcomes = _trials("kills", moments, kind)
+        longest = max(float(outcome["distance_mm"]) for outcome in outcomes)
+        allowed = way + 2.0 * SAMPLING
+        moved = max(float(outcome["moved_by_itself_mm"]) for outcome in outcomes)
+        yield Finding(
+            f"killed_{kind}",
+            f"kill -9 of {kind} at {len(outcomes)} moments: way afterwards, then by itself",
+            f"at most {allowed:.2f} mm, then nothing; steering goes on when put right",
+            f"at most {longest:.2f} mm, then {moved:.4f} mm",
+            longest <= allowed and moved == 0.0 and len(outcomes) == moments,
+        )
+
+
+def two_rigs(_: Workbench, starts: int = MOMENTS) -> Iterator[Finding]:
+    """Move nothing real when a simulation is started beside it, in any order."""
+    outcomes = _trials("two_rigs", starts)
+    moved = [
+        one["order"] for one in outcomes if one["moved_mm"] or one["turned_rad"] or one["enabled"]
+    ]
+    unnamed = [one for one in outcomes if not one["named"]]
+    yield Finding(
+        "two_rigs",
+        f"a real driver beside a simulation in one domain, {len(outcomes)} starts in any order",
+        "the real one is never enabled and never moves; who gives way names the other",
+        f"enabled or moved in {len(moved)}{''.join(f' ({order})' for order in moved)}, "
+        f"nobody named in {len(unnamed)}",
+        len(outcomes) == starts and not moved and not unnamed,
+    )
+
+
+def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
+    """Hold up neither cycle nor emergency stop by anything that others send."""
+    for outcome in _trials("nuisances", seconds, *NUISANCES):
+        kind, longest = outcome["nuisance"], float(outcome["longest_cycle_s"])
+        heard = float(outcome["estop_heard_s"])
+        # What copying the longest message takes is what is left; no more than this one is seen.
+        bound = LONGEST_COPY if kind == "points" else DRIVES_WAIT
+        yield Finding(
+            f"nuisance_{kind}",
+            f"{NUISANCES[kind]}, a step under way: longest cycle; emergency stop heard after",
+            f"at most {bound:g} s each",
+            f"{longest:.3f} s, {heard:.3f} s"
+            + (f"; step {outcome['step_ended_by']}" if outcome["step_ended_by"] else ""),
+            max(longest, heard) <= bound,
+        )
+
+
+def fuzz(_: Workbench, seconds: int = FUZZ) -> Iterator[Finding]:
+    """End, swell and move by nothing that every node of a rig is sent at random."""
+    for outcome in _trials("fuzz", seconds):
+        growth = float(outcome["memory_growth_MB"])
+        yield Finding(
+            f"fuzz_{outcome['fuzz'].partition(' ')[0]}",
+            f"{outcome['sent']} random messages and requests on {outcome['topics']} topics and "
+            f"{outcome['services']} services, {outcome['fuzz']}",
+            f"no node ends, none grows by more than {FUZZ_GROWTH:g} MB, no motor turns",
+            f"none ended; {outcome['most_grown']} {growth:+.1f} MB; "
+            + ("a motor turned" if outcome["moved"] else "none turned"),
+            growth <= FUZZ_GROWTH and not outcome["moved"] and outcome["sent"] > 0,
+        )
+
+
+CHECKS: tuple[Check, ...] = (
+    drive_level,
+    same_joints,
+    many_steps,
+    faults,
+    killed_nodes,
+    two_rigs,
+    nuisances,
+    fuzz,
+)
+
+
+def judge(kind: str, outcomes: Sequence[dict[str, Any]]) -> Iterator[Finding]:
+    """Yield what the trials of one fault show."""
+    over = [outcome for outcome in outcomes if outcome["distance_mm"] > _allowed(kind, outcome)]
+    longest = max(outcomes, key=lambda outcome: float(outcome["distance_mm"]))
+    yield Finding(
+        f"{kind}_bound",
+        f"{kind} at {len(outcomes)} moments: way of the needle afterwards",
+        "within the bound at the step's speed",
+        f"{len(over)} beyond; longest {longest['distance_mm']:.3f} mm at "
+        f"{longest['speed_mm_s']:.1f} mm/s, bound {_allowed(kind, longest):.3f} mm",
+        not over,
+    )
+    yield from judge_recovery(kind, outcomes)
+
+
+def judge_recovery(kind: str, outcomes: Sequence[dict[str, Any]]) -> Iterator[Finding]:
+    """Yield what the trials of one fault show, apart from distances."""
+    if kind == "kill_driver":
+        # Nobody is left to say why, but the drives.
+        named = sum(outcome["drives_faulted"] == 2 for outcome in outcomes)
+        wanted = "both drives report the missing heartbeat"
+    else:
+        named = sum(outcome["state"] == "FAULT" and outcome["logged"] for outcome in outcomes)
+        wanted = "FAULT with the reason on device/status and in the log"
+    reasons = sorted({str(outcome["reason"]) for outcome in outcomes if outcome["reason"]})
+    yield Finding(
+        f"{kind}_named",
+        f"{kind}: what is said",
+        wanted,
+        f"{named} of {len(outcomes)}" + (f", such as '{reasons[0]}'" if reasons else ""),
+        named == len(outcomes),
+    )
+    moved = max(float(outcome["moved_by_itself_mm"]) for outcome in outcomes)
+    troubles = [str(outcome["trouble_after"]) for outcome in outcomes if outcome["trouble_after"]]
+    yield Finding(
+        f"{kind}_recovery",
+        f"{kind}: motion without a command; a step after reset and enable",
+        "at most one count (50 nm), the step succeeds",
+        f"{moved * 1e6:.0f} nm; {len(outcomes) - len(troubles)} of {len(outcomes)} succeed"
+        + (f" ({troubles[0]})" if troubles else ""),
+        moved <= 5.1e-5 and not troubles,
+    )
+
+
+def _allowed(kind: str, outcome: dict[str, Any]) -> float:
+    speed = float(outcome["speed_mm_s"])
+    if kind == "stall":
+        if outcome["words"].endswith("insertion"):
+            return 0.05
+        # The insertion goes on until the rotation is far enough off.
+        until = _FOLLOWING / float(outcome["turn_rate_rad_s"]) + _NOTICED
+        return 0.05 + speed * until
+    bound = BOUNDS[kind]
+    return bound.way + speed * bound.time
+
+
+def _trials(*words: object) -> list[dict[str, Any]]:
+    """Run trials in a process of their own; return what each came to.
+
+    Raises
+    ------
+    UserError
+        If they do not end well.
+    """
+    command = [sys.executable, "-m", "needle_verification.ros.drive_trials", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode != EXIT_DONE:
+        lines = done.stderr.strip().splitlines() or ["no word"]
+        raise UserError(f"{' '.join(command[2:])}: {lines[-1]}")
+    return [json.loads(line) for line in done.stdout.splitlines()]

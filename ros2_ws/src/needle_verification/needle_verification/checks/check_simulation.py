@@ -1,0 +1,299 @@
+"""Step A: the rig steers end to end in simulation, from one command."""
+
+from __future__ import annotations
+
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from needle_bags.reading.bag_reader import read_run
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_common.errors import UserError
+from needle_verification.checking import (
+    Check,
+    Finding,
+    Run,
+    Workbench,
+    diagnostics,
+    payloads,
+    unreadable,
+)
+
+SAME_TOPICS = ("/needle/tip", "/device/joint_trajectory", "/sim/tip_pose")
+# What a run has said -> at most how long after that it is interrupted [s].
+MILESTONES = (
+    ("", 0.3),
+    ("ROS_DOMAIN_ID", 0.5),
+    ("ROS_DOMAIN_ID", 4.0),
+    (r"3\d\.\d of", 0.5),
+    (r"6\d\.\d of", 0.5),
+    ("operator: inserted", 0.1),
+    ("operator: inserted", 1.0),
+)
+SEED = 2009
+SHORT = ("--depth-mm", "12")
+WARN = 1
+
+
+def camera(bench: Workbench) -> Iterator[Finding]:
+    """Steer by images: converged, quick, with a bag that opens and a report."""
+    run = bench.run("camera_1")
+    yield _exit(run, "camera", "scripts/simulate", 0)
+    summary = run.summary
+    yield Finding(
+        "camera_converged",
+        "level camera: converged",
+        "true",
+        str(summary.get("converged")),
+        summary.get("converged") is True,
+    )
+    r1 = summary.get("r1_final_mm")
+    yield Finding(
+        "camera_r1_final",
+        "level camera: |r1| at 120 mm against the truth",
+        "<= 1 mm",
+        f"{r1} mm" if r1 is not None else f"no result: {run.last_line}",
+        isinstance(r1, float) and abs(r1) <= 1.0,
+    )
+    wall = run.wall
+    yield Finding("camera_wall", "second run", "< 40 s", f"{wall:.1f} s", wall < 40.0)
+    why = unreadable(run.bag)
+    yield Finding("camera_bag", "its bag", "opens with rosbags and mcap", why or "opens", not why)
+    missing = [
+        name
+        for name in ("report.html", "summary.json", "parameters.yaml")
+        if not (run.bag / name).is_file()
+    ]
+    missing += [] if any(run.bag.glob("*.png")) else ["*.png"]
+    seen = f"without {', '.join(missing)}" if missing else "all there"
+    yield Finding("camera_files", "its folder", "report, figures, summary", seen, not missing)
+
+
+def open_loop(bench: Workbench) -> Iterator[Finding]:
+    """Not steered, the needle ends where its constant curvature takes it."""
+    arguments = ("--controller", "open_loop", "--level", "tip", "--noise-mm", "0")
+    run = bench.run("open_loop", *arguments)
+    r1 = run.summary.get("r1_final_mm")
+    yield Finding(
+        "open_loop_r1_final",
+        "open loop: r1 at 120 mm",
+        "14.6 +- 0.1 mm",
+        f"{r1} mm" if r1 is not None else f"no result: {run.last_line}",
+        isinstance(r1, float) and abs(r1 - 14.6) <= 0.1,
+    )
+    yield _exit(run, "open_loop", "open loop", 1)
+
+
+def same_seed(bench: Workbench) -> Iterator[Finding]:
+    """One seed, one run, bit for bit; another seed, another run."""
+    for level in ("tip", "camera"):
+        one = bench.run(f"{level}_1", "--level", level)
+        again = bench.run(f"{level}_1_again", "--level", level)
+        differ = _differences(one.bag, again.bag)
+        counts = {name: len(data) for name, data in payloads(one.bag, SAME_TOPICS).items()}
+        yield Finding(
+            f"same_seed_{level}",
+            f"level {level}: twice the same seed",
+            "tips, commands and truth bit for bit",
+            f"different: {', '.join(differ)}" if differ else f"same: {counts}",
+            not differ and all(counts.values()),
+        )
+        trips = one.summary.get("watchdog_trips"), again.summary.get("watchdog_trips")
+        yield Finding(
+            f"same_seed_{level}_trips", "  watchdog trips", "0 and 0", str(trips), trips == (0, 0)
+        )
+    other = bench.run("tip_2", "--level", "tip", "--seed", "2")
+    differ = _differences(bench.run("tip_1", "--level", "tip").bag, other.bag)
+    yield Finding(
+        "other_seed",
+        "level tip: another seed",
+        "all differ",
+        f"different: {', '.join(differ)}",
+        len(differ) == len(SAME_TOPICS),
+    )
+
+
+def tip_speed(bench: Workbench) -> Iterator[Finding]:
+    """Run the graph without images quickly."""
+    run = bench.run("tip_1", "--level", "tip")
+    steps, rate = run.summary.get("steps"), run.summary.get("steps_per_s")
+    spent = steps / rate if steps and rate else float("nan")
+    yield Finding(
+        "tip_speed",
+        "level tip: time for the 120 steps",
+        "< 10 s",
+        f"{steps} steps in {spent:.1f} s (command to result: {run.wall:.1f} s)",
+        steps == 120 and spent < 10.0,
+    )
+
+
+def interrupt(bench: Workbench) -> Iterator[Finding]:
+    """Interrupted at any moment: exit code 130, no process left, the bag readable."""
+    # when a run is interrupted is random, but the same each time this runs
+    generator = random.Random(SEED)
+    for number, (milestone, latest) in enumerate(MILESTONES):
+        delay = latest * generator.random()
+        kind = generator.choice((signal.SIGINT, signal.SIGTERM))
+        started = bench.start(f"interrupt_{number}", "--level", "tip")
+        started.wait_until_said(milestone)
+        time.sleep(delay)
+        started.interrupt(kind)
+        run = started.wait(60.0)
+        why = unreadable(run.bag) if run.bag.exists() else ""
+        bag = f"bag unreadable ({why})" if why else "bag reads" if run.bag.exists() else "no bag"
+        seen = f"exit code {run.code}, {len(run.left_over)} processes left, {bag}"
+        if run.left_in_memory:
+            seen += f", left in shared memory: {', '.join(run.left_in_memory)}"
+        if "warning" in run.output:
+            seen += f" ({run.output.partition('warning')[2].strip()})"
+        yield Finding(
+            f"interrupt_{number}",
+            f"{kind.name} {delay:.2f} s after '{milestone or 'the command'}'",
+            "exit code 130, 0 processes left, bag reads (or is not begun)",
+            seen,
+            run.code == 130 and not run.left_over and not why and not run.left_in_memory,
+        )
+
+
+def bad_parameter(bench: Workbench) -> Iterator[Finding]:
+    """Name an unknown parameter or node in a file, and run nothing."""
+    files = {
+        "plane_controller: {ros__parameters: {curvatur: 9.0}}": "curvatur",
+        "plane_controler: {ros__parameters: {curvature: 9.0}}": "plane_controler",
+        "plane_controller: {ros__parameters: {curvature: .nan}}": "curvature",
+    }
+    for number, (text, named) in enumerate(files.items()):
+        path = bench.folder / f"bad_{number}.yaml"
+        path.write_text(text, encoding="utf-8")
+        run = bench.run(f"bad_parameter_{number}", "--level", "tip", "--params", str(path))
+        left = "a bag is left" if run.bag.exists() else "no bag left"
+        yield Finding(
+            f"bad_parameter_{number}",
+            text,
+            f"exit code 2, {named} named in the last line, nothing left",
+            f"exit code {run.code}, {left}, {len(run.left_over)} processes: {run.last_line}",
+            run.code == 2
+            and named in run.last_line
+            and not run.bag.exists()
+            and not run.left_over
+            and "Traceback" not in run.output,
+        )
+
+
+def bad_tip(bench: Workbench) -> Iterator[Finding]:
+    """NaN, a wrong frame, mm for m: all named; no command comes from them."""
+    patterns = {"not_finite": "finite", "frame": "frame", "millimetres": "from the entry|jumped"}
+    for kind, pattern in patterns.items():
+        run = _run_with(bench, f"bad_tip_{kind}", [kind], "--level", "tip", *SHORT)
+        yield _named(run, "plane_controller", kind, pattern)
+        # A refused tip may cost a further exposure, and with it another noise: the run as a whole
+        # may differ from one without. But each command bears the stamp of the tip behind it.
+        recorded = read_run(run.bag)
+        strange = {result.stamp for result in recorded.results} - set(
+            recorded.truth.stamps.tolist()
+        )
+        done = sum(result.outcome == "succeeded" for result in recorded.results)
+        yield Finding(
+            f"{kind}_no_motion",
+            f"commands with bad data '{kind}' about",
+            "12 steps, all from an exposure's tip, none from a bad one",
+            f"{done} steps, {len(strange)} not from an exposure, "
+            f"{recorded.last_status('tips_rejected')} tips refused",
+            not strange and done == 12,
+        )
+
+
+def lonely_image(bench: Workbench) -> Iterator[Finding]:
+    """Name a left image without its right; the needle moves as without it."""
+    usual = bench.run("camera_short", *SHORT)
+    run = _run_with(bench, "lonely_image", ["left_image"], *SHORT)
+    yield _named(run, "stereo_tracker", "left_image", "without|partner|pair|match")
+    yield _unmoved(run, usual, "lonely_image")
+
+
+CHECKS: tuple[Check, ...] = (
+    camera,
+    open_loop,
+    same_seed,
+    tip_speed,
+    interrupt,
+    bad_parameter,
+    bad_tip,
+    lonely_image,
+)
+
+
+def _exit(run: Run, key: str, what: str, code: int) -> Finding:
+    left = f", left: {'; '.join(run.left_over)}" if run.left_over else ""
+    seen = f"{run.code}{left}"
+    if run.code != code:
+        seen += f" ({run.last_line})"
+    passed = run.code == code and not run.left_over
+    return Finding(
+        f"{key}_exit_code", f"{what}: exit code, processes left", str(code), seen, passed
+    )
+
+
+def _differences(one: Path, other: Path) -> list[str]:
+    """Return the topics whose messages differ in any bit."""
+    ours, theirs = payloads(one, SAME_TOPICS), payloads(other, SAME_TOPICS)
+    return [topic for topic in SAME_TOPICS if ours[topic] != theirs[topic]]
+
+
+def _run_with(bench: Workbench, name: str, kinds: list[str], *arguments: str) -> Run:
+    """Run `simulate` with a second publisher of bad data in its graph."""
+    started = bench.start(name, *arguments)
+    command = [sys.executable, "-m", "needle_verification.ros.bad_input", "--ros-args"]
+    command += ["-p", f"kinds:=[{', '.join(kinds)}]", "--disable-external-lib-logs"]
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(started.domain())}
+    with subprocess.Popen(command, env=environment) as intruder:
+        try:
+            run = started.wait()
+        finally:
+            intruder.send_signal(signal.SIGINT)
+    if run.code not in (EXIT_DONE, EXIT_MISSED):
+        raise UserError(f"{name} ended with exit code {run.code}: {run.last_line}")
+    return run
+
+
+def _named(run: Run, node: str, kind: str, pattern: str) -> Finding:
+    """Look for a bad datum's name in the node's log and in its diagnostics."""
+    logged = [
+        line
+        for line in run.log(node).splitlines()
+        if re.search("WARN|ERROR", line) and re.search(pattern, line)
+    ]
+    told = [
+        message
+        for level, name, message in diagnostics(run.bag)
+        if level >= WARN and name.startswith(node) and re.search(pattern, message)
+    ]
+    seen = (
+        f"log: {logged[0] if logged else 'nothing'}; diagnostics: {told[0] if told else 'nothing'}"
+    )
+    return Finding(
+        f"{kind}_named",
+        f"bad data '{kind}'",
+        "a clear line in the log and in diagnostics",
+        seen,
+        bool(logged and told),
+    )
+
+
+def _unmoved(run: Run, usual: Run, key: str) -> Finding:
+    topics = ("/device/joint_trajectory", "/sim/tip_pose")
+    ours, theirs = payloads(run.bag, topics), payloads(usual.bag, topics)
+    differ = [topic for topic in topics if ours[topic] != theirs[topic]]
+    return Finding(
+        f"{key}_no_motion",
+        "motion with bad data",
+        "the same as without, bit for bit",
+        f"different: {', '.join(differ)}" if differ else "the same",
+        not differ,
+    )

@@ -1,0 +1,107 @@
+"""`scripts/paper`: every figure and number of [KC09] section IV, the paper's value beside ours."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from needle_common.commands.cli import EXIT_DONE, run_command, write_json
+from needle_common.commands.options import CommandParser, output_file
+from needle_common.errors import UserError
+from needle_verification.descendants import ending_descendants
+
+PAGE = "paper.md"
+IMAGES = "images"
+OUT = "bags/paper"
+DESCRIPTION = """\
+Run every figure and number of [KC09] section IV and write them beside the paper's values: paper.md
+and its figures under images/. Trials go through the whole node graph, studies through monte_carlo.
+"""
+EPILOG = """\
+examples:
+  scripts/paper                    all of it, into bags/paper/ (about ten minutes)
+  scripts/paper --out docs         the same, into the page that goes with this checkout
+  scripts/paper --quick --out /tmp/paper
+      three trials in place of nine, 1,000 runs in place of 10,000
+
+exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `paper`; returns its exit code."""
+    return run_command(lambda: _paper(sys.argv[1:] if arguments is None else arguments))
+
+
+def _paper(arguments: Sequence[str]) -> int:
+    parser = CommandParser("paper", DESCRIPTION, EPILOG)
+    parser.add_argument("--quick", action="store_true", help="fewer trials and runs")
+    parser.add_argument("--out", metavar="DIR", help=f"where to write (default: {OUT}/)")
+    parser.add_argument("--runs", metavar="DIR", help="keep bags and studies there and use them")
+    parser.add_argument("--seed", default="1", metavar="N", help="seed of all noise (default: 1)")
+    parser.add_argument("--json", metavar="FILE", help="write the figures as a flat JSON object")
+    given = parser.parse_args(arguments)
+    if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
+        raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
+    file = output_file("--json", given.json)
+    checkout = _checkout()
+    out = checkout / OUT if given.out is None else Path(given.out).expanduser().absolute()
+    _make(out / IMAGES, "--out")
+    # They take a second to import: not for a command line that is refused.
+    from needle_analysis.report.figure_style import save  # noqa: PLC0415
+    from needle_verification.paper.paper_figures import figures_of  # noqa: PLC0415
+    from needle_verification.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
+    from needle_verification.paper.paper_results import collect  # noqa: PLC0415
+    from needle_verification.paper.paper_runs import Laboratory  # noqa: PLC0415
+
+    with _folder(given.runs) as folder, ending_descendants():
+        laboratory = Laboratory([str(checkout / "scripts" / "simulate")], folder)
+        results = collect(laboratory, int(given.seed), quick=given.quick)
+    for name, figure in figures_of(results).items():
+        save(figure, out / IMAGES / f"{name}.png")
+    (out / PAGE).write_text(page(results), encoding="utf-8")
+    print(as_text(list(table(results))))
+    print(f"written: {out / PAGE}")
+    if file is not None:
+        write_json(file, key_figures(results))
+    return EXIT_DONE
+
+
+def _make(folder: Path, option: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{option} {folder}: {error.strerror}") from error
+
+
+@contextlib.contextmanager
+def _folder(keep: str | None) -> Iterator[Path]:
+    if keep is not None:
+        folder = Path(keep).expanduser().absolute()
+        _make(folder, "--runs")
+        yield folder
+        return
+    folder = Path(tempfile.mkdtemp(prefix="needle_paper_"))
+    try:
+        yield folder
+    except UserError:
+        raise  # it may name a log in there
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def _checkout() -> Path:
+    for folder in Path(__file__).resolve().parents:
+        if (folder / "scripts" / "simulate").is_file():
+            return folder
+    raise UserError("paper runs from a checkout only: there is no scripts/simulate beside it")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,99 @@
+"""Runs what the paper's results are made of: trials through the whole graph, and studies."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_bags.reading.bag_reader import Run, read_run
+from needle_bringup.simulation.installed import find_executable
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
+from needle_common.errors import UserError
+
+Columns = Mapping[str, npt.NDArray[np.float64]]
+SUMMARY = "summary.json"
+
+
+class Laboratory:
+    """Where trials and studies are run, each once.
+
+    Parameters
+    ----------
+    simulate : sequence of str
+        The command that runs one trial through the whole graph.
+    folder : Path
+        Keeps the bags and the studies' files; what is there already is not run again.
+    """
+
+    def __init__(self, simulate: Sequence[str], folder: Path) -> None:
+        self._simulate = list(simulate)
+        self._folder = folder
+
+    def trial(self, name: str, *arguments: str) -> Run:
+        """Run one trial and read its bag; that it misses the plane is a result as well.
+
+        Raises
+        ------
+        UserError
+            If it does not run.
+        """
+        bag = self._folder / name
+        if not (bag / SUMMARY).is_file():
+            shutil.rmtree(bag, ignore_errors=True)  # what an earlier, broken run left
+            command = [*self._simulate, *arguments, "--bag", str(bag)]
+            _run(name, command, (EXIT_DONE, EXIT_MISSED))
+        return read_run(bag)
+
+    def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
+        """Run a Monte Carlo study; return its figures, and its runs column by column.
+
+        Raises
+        ------
+        UserError
+            If it does not run.
+        """
+        figures, runs = self._folder / f"{name}.json", self._folder / f"{name}.csv"
+        if not figures.is_file():
+            command = [find_executable("needle_sim", "monte_carlo"), *arguments]
+            _run(name, [*command, "--csv", str(runs), "--json", str(figures)], (EXIT_DONE,))
+        with runs.open(encoding="utf-8", newline="") as stream:
+            reader = csv.reader(stream)
+            head = next(reader)
+            rows = [[float(cell) if cell else np.nan for cell in row] for row in reader]
+        table = np.array(rows)
+        columns = {name: table[:, k] for k, name in enumerate(head)}
+        return dict(json.loads(figures.read_text("utf-8"))), columns
+
+    def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
+        """Find the curvature in a trial's bag with `identify_curvature`; return what it found.
+
+        Raises
+        ------
+        UserError
+            If it does not run.
+        """
+        figures = self._folder / f"{name}.json"
+        if not figures.is_file():
+            command = [find_executable("needle_controller", "identify_curvature")]
+            command += [str(self._folder / bag), *arguments, "--json", str(figures)]
+            _run(name, command, (EXIT_DONE,))
+        return dict(json.loads(figures.read_text("utf-8")))
+
+
+def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:
+    print(f"running {name} ...", file=sys.stderr, flush=True)
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode in good:
+        return
+    if done.returncode in (130, -2):
+        raise KeyboardInterrupt
+    last = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
+    raise UserError(f"{name}: {Path(command[0]).name} ended with code {done.returncode}: {last}")

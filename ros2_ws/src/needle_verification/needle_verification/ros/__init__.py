@@ -1,0 +1,1 @@
+"""Trials of running nodes: bad input, faults, kills, floods."""

@@ -1,0 +1,214 @@
+"""The hand, the controller and the witness of a drive trial in one node."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import JointState, Joy
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+from needle_common.errors import UserError
+from needle_common.ros.base_node import STEADY_CLOCK
+from needle_common.ros.conversions import (
+    HOLD,
+    JOINT_STATES,
+    LATCHED,
+    NANOSECONDS,
+    RELIABLE,
+    to_nanoseconds,
+    to_stamp,
+    values_of,
+)
+
+JOINTS = ("insertion_joint", "rotation_joint")
+# What a count of each encoder is [m], [rad]: the emulator's defaults.
+INSERTION_COUNT = 1.0 / 2.0e7
+ROTATION_COUNT = math.tau / 65536.0
+_HOLD_PERIOD = 0.05
+_PATIENCE = 20.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Motors:
+    """Where the motors really were [m], [rad], at their time [ns], heard at steady time [s]."""
+
+    stamp_ns: int
+    heard_at: float
+    insertion: float
+    rotation: float
+
+
+class DriveHand(Node):
+    """Presses the hold, sends steps, calls services; hears what came of it.
+
+    Parameters
+    ----------
+    steers : bool
+        Whether it sends steps: a second sender of commands would have all of them refused.
+    """
+
+    def __init__(self, *, steers: bool = True) -> None:
+        super().__init__("drive_hand")
+        self.motors: list[Motors] = []
+        self.joints: JointState | None = None
+        self.joint_stamps: list[int] = []
+        self.results: dict[int, str] = {}
+        self.status: dict[str, str] = {}
+        self.real_states: set[str] = set()
+        self.pressed = False
+        self.scale = 1.0
+        # What commands are stamped with.
+        self.now_ns: Callable[[], int] = lambda: self.get_clock().now().nanoseconds
+        self._last_hold = 0
+        self._last_stamp = 0
+        self._commands = (
+            self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
+            if steers
+            else None
+        )
+        self._holds = self.create_publisher(Joy, "device/hold", HOLD)
+        listen = self.create_subscription
+        self._joint_states = listen(JointState, "joint_states", self._on_joints, JOINT_STATES)
+        listen(JointState, "sim/drive_positions", self._on_positions, JOINT_STATES)
+        listen(Header, "device/result", self._on_result, RELIABLE)
+        listen(DiagnosticStatus, "device/status", self._on_status, LATCHED)
+        self._device: dict[str, Any] = {
+            name: self.create_client(kind, f"device/{name}")
+            for kind, names in (
+                (Trigger, ("home", "retract", "stop", "reset")),
+                (SetBool, ("enable", "confirm_needle_out")),
+            )
+            for name in names
+        }
+        self.create_timer(_HOLD_PERIOD, self.send_hold, clock=STEADY_CLOCK)
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self)
+
+    # ---- waiting ------------------------------------------------------------------------------
+
+    def look(self, timeout: float = 0.0) -> None:
+        """Take one message, waiting for it at most `timeout` [s]."""
+        self._executor.spin_once(timeout_sec=timeout)
+
+    def until(self, condition: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
+        """Wait for a condition.
+
+        Raises
+        ------
+        UserError
+            If it does not come within `patience` [s].
+        """
+        deadline = time.monotonic() + patience
+        while not condition():
+            if time.monotonic() > deadline:
+                raise UserError(f"waited {patience:g} s in vain: {what}; device: {self.status}")
+            self.look(0.01)
+
+    def pause(self, seconds: float) -> None:
+        """Listen for so long."""
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            self.look(0.005)
+
+    # ---- acting -------------------------------------------------------------------------------
+
+    def ready(self) -> bool:
+        """Return whether the driver is there."""
+        return (
+            all(client.service_is_ready() for client in self._device.values())
+            and (self._commands is None or self._commands.get_subscription_count() > 0)
+            and self._joint_states.get_publisher_count() > 0
+        )
+
+    def call(self, name: str, data: bool | None = None) -> tuple[bool, str]:
+        """Call a service of the device; return its answer."""
+        request = Trigger.Request() if data is None else SetBool.Request(data=data)
+        future = self._device[name].call_async(request)
+        self.until(future.done, f"an answer from device/{name}")
+        answer = future.result()
+        return bool(answer.success), str(answer.message)
+
+    def insist(self, name: str, data: bool | None = None, patience: float = _PATIENCE) -> None:
+        """Call a service until it succeeds.
+
+        Raises
+        ------
+        UserError
+            If it does not within `patience` [s].
+        """
+        deadline = time.monotonic() + patience
+        while True:
+            success, message = self.call(name, data)
+            if success:
+                return
+            if time.monotonic() > deadline:
+                fault = self.status.get("fault", "")
+                raise UserError(f"device/{name} refused for {patience:g} s: {message} ({fault})")
+            self.pause(0.05)
+
+    def command(self, insertion: float, rotation: float, duration: float) -> int:
+        """Send a step to these joints [m], [rad] in `duration` [s]; return its stamp."""
+        stamp = max(self.now_ns(), self._last_stamp + 1)
+        self._last_stamp = stamp
+        point = JointTrajectoryPoint(positions=[insertion, rotation])
+        whole = math.floor(duration)
+        point.time_from_start.sec = whole
+        point.time_from_start.nanosec = round((duration - whole) * NANOSECONDS)
+        message = JointTrajectory(joint_names=list(JOINTS), points=[point])
+        message.header.stamp = to_stamp(stamp)
+        assert self._commands is not None
+        self._commands.publish(message)
+        return stamp
+
+    def press(self) -> None:
+        """Press the hold anew, and wait until it counts."""
+        self.release()
+        self.pressed = True
+        self.until(lambda: self.status.get("hold_owner") == self.get_name(), "the hold counts")
+
+    def release(self) -> None:
+        """Release the hold, and wait until that is known."""
+        self.pressed = False
+        self.send_hold()
+        self.until(lambda: self.status.get("hold_owner", "") == "", "the hold is off")
+
+    def send_hold(self) -> None:
+        """Say what the hold is."""
+        self._last_hold = max(time.time_ns(), self._last_hold + 1)
+        message = Joy(axes=[self.scale if self.pressed else 0.0], buttons=[int(self.pressed)])
+        message.header.frame_id = self.get_name()
+        message.header.stamp = to_stamp(self._last_hold)
+        self._holds.publish(message)
+
+    def close(self) -> None:
+        """Let go of everything."""
+        self._executor.shutdown()
+        self.destroy_node()
+
+    # ---- hearing ------------------------------------------------------------------------------
+
+    def _on_joints(self, message: JointState) -> None:
+        self.joints = message
+        self.joint_stamps.append(to_nanoseconds(message.header.stamp))
+
+    def _on_positions(self, message: JointState) -> None:
+        at = dict(zip(message.name, message.position, strict=True))
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        self.motors.append(Motors(stamp_ns, time.monotonic(), at[JOINTS[0]], at[JOINTS[1]]))
+
+    def _on_result(self, message: Header) -> None:
+        self.results[to_nanoseconds(message.stamp)] = message.frame_id
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        self.status = values_of(message)
+        if self.status.get("simulated") == "false":
+            self.real_states.add(self.status.get("state", ""))

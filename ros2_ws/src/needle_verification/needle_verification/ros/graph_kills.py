@@ -1,0 +1,109 @@
+"""kill -9 of a node while the needle is steered: how the motion ends, and how it goes on."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from needle_common.errors import UserError
+from needle_common.ros.conversions import LATCHED, values_of
+from needle_verification.ros.drive_hand import DriveHand
+from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
+
+KILLED = ("plane_controller", "stereo_tracker", "operator")
+_READY = 120.0
+_WATCHED = 3.0
+_STILL = 1.0
+_RESUMED = 60.0
+_DEEP_ENOUGH = 0.002
+
+
+def kill_trials(
+    folder: Path, domain: int, kinds: Sequence[str], count: int, seed: int
+) -> Iterator[dict[str, Any]]:
+    """Yield what came of each trial, in real time, each with a graph of its own.
+
+    Parameters
+    ----------
+    folder : Path
+        Takes the logs.
+    domain : int
+        ROS_DOMAIN_ID.
+    kinds : sequence of str
+        Which of `KILLED`.
+    count : int
+        Trials of each.
+    seed : int
+        Of moments and simulations.
+    """
+    for kind in kinds:
+        if kind not in KILLED:
+            raise UserError(f"node {kind!r} is not one of {', '.join(KILLED)}")
+    for kind in kinds:
+        rng = random.Random(f"{seed} {kind}")
+        for number in range(count):
+            place = folder / f"{kind}_{number}"
+            place.mkdir()
+            graph = TrialProcesses(place, domain, graph_in_real_time(rng.randrange(1000)))
+            hand = DriveHand(steers=False)
+            try:
+                yield {"fault": kind, "number": number, **_kill(graph, hand, kind, rng)}
+            finally:
+                graph.stop()
+                hand.close()
+
+
+def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random) -> dict[str, Any]:
+    controller: dict[str, str] = {}
+
+    def on_controller(message: DiagnosticStatus) -> None:
+        controller.update(values_of(message))
+
+    hand.create_subscription(DiagnosticStatus, "needle/controller_status", on_controller, LATCHED)
+    hand.until(
+        lambda: bool(hand.motors) and hand.motors[-1].insertion > _DEEP_ENOUGH, "steering", _READY
+    )
+    graph.check()
+    hand.pause(rng.uniform(0.0, 2.0))
+    before, seen = hand.motors[-1], len(hand.motors)
+    graph.kill(kind)
+    hand.pause(_WATCHED)
+    stopped = hand.motors[-1]
+    moving = [at for at in hand.motors[seen:] if at.insertion != stopped.insertion]
+    distance = stopped.insertion - before.insertion
+    state, reason = hand.status.get("state", ""), hand.status.get("reason", "")
+    controller_says = f"{controller.get('state')}: {controller.get('reason')}"
+    still_from = len(hand.motors)
+    hand.pause(_STILL)
+    moved = max(abs(at.insertion - stopped.insertion) for at in hand.motors[still_from:])
+    # On it goes only by a new press of the hold, or by the node that was missing.
+    if kind == "operator":
+        hand.press()
+    elif kind == "stereo_tracker":
+        graph.start(kind)
+    else:
+        # A controller that begins anew wants the needle out.
+        hand.insist("retract")
+        hand.until(lambda: hand.status.get("activity") == "none", "retracted", _READY)
+        stopped = hand.motors[-1]
+        # To the others a killed node lives on until its lease ends, and two senders are too many.
+        hand.until(
+            lambda: hand.count_publishers("device/joint_trajectory") == 0, "its lease", _READY
+        )
+        graph.start(kind)
+        graph.restart("operator")
+    hand.until(
+        lambda: hand.motors[-1].insertion > stopped.insertion + 1e-4, "steering again", _RESUMED
+    )
+    return {
+        "distance_mm": distance * 1e3,
+        "stopped_after_s": moving[-1].heard_at - before.heard_at if moving else 0.0,
+        "state": state,
+        "reason": reason,
+        "controller": controller_says,
+        "moved_by_itself_mm": moved * 1e3,
+    }

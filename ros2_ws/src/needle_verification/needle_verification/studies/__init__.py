@@ -1,0 +1,1 @@
+"""Studies of tracker and controller over simulated needles."""

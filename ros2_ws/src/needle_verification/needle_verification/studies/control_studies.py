@@ -1,0 +1,174 @@
+"""The studies of step B: what is asked of `monte_carlo`, and what it must answer."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import os
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+from needle_bringup.simulation.installed import find_executable
+from needle_common.errors import UserError
+from needle_verification.checking import Finding
+
+AT_END = "converged_at_end"
+LAST_20 = "converged_last_20"
+SEED = "20090201"
+RUNS_A_DRAW = 1000
+ALL_TROUBLES = ("--outliers", "0.05", "--dropped", "0.2", "--delay", "1", "--kappa-patches", "0.2")
+"""Together with 20 deg of play."""
+# A study runs in one thread; numpy's others only wait, which counts as processor time too.
+ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+Figures = Mapping[str, float | None]
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """One study, and what it must show.
+
+    Attributes
+    ----------
+    key : str
+        Short name.
+    controller : str
+        The preset.
+    options : tuple of str
+        Of monte_carlo, beside the controller, the draws and the seed.
+    at_least, at_most : dict
+        Result's key to bound.
+    """
+
+    key: str
+    controller: str
+    options: tuple[str, ...]
+    at_least: dict[str, float] = dataclasses.field(default_factory=dict)
+    at_most: dict[str, float] = dataclasses.field(default_factory=dict)
+
+
+PAPER = (
+    Study("paper_endpoint", "paper", (), {AT_END: 0.955}),
+    Study("paper_cell", "paper", ("--grid", "cell"), {AT_END: 0.98}),
+)
+FIGURE_3 = Study(
+    "figure_3",
+    "paper",
+    ("--initial=-3,2,15", "--noise-mm", "0.5"),
+    {},
+    {"settle_median_mm": 50.0},
+)
+BEST = Study(
+    "best",
+    "best",
+    (),
+    {AT_END: 0.999, LAST_20: 0.998},
+    {
+        "rms_last_20_mm": 0.25,
+        "p95_last_20_mm": 0.48,
+        "settle_median_mm": 40.0,
+        "settle_p95_mm": 70.0,
+        "rotation_mean_deg": 1500.0,
+    },
+)
+TROUBLE = tuple(
+    Study(key, "best", options, {AT_END: least})
+    for key, options, least in (
+        ("kappa_08", ("--kappa-scale", "0.8"), 0.998),
+        ("kappa_12", ("--kappa-scale", "1.2"), 0.998),
+        *((f"play_{d}", ("--play-deg", str(d)), 0.995) for d in (10, 20, 30, 40)),
+        *((f"lag_{d}", ("--lag-mm", str(d)), 0.97) for d in (4, 8)),
+        ("outliers", ("--outliers", "0.05"), 0.998),
+        ("dropped", ("--dropped", "0.2"), 0.998),
+        ("late", ("--delay", "1"), 0.998),
+        ("all_troubles", (*ALL_TROUBLES, "--play-deg", "20"), 0.975),
+        ("roll_120", ("--roll-deg", "180"), 0.965),
+        ("roll_160", ("--roll-deg", "180", "--depth-mm", "160"), 0.985),
+        ("x_120", ("--x-mm", "10"), 0.965),
+        ("x_180", ("--x-mm", "10", "--depth-mm", "180"), 0.998),
+        ("flips", ("--flips", "11"), 0.999),
+    )
+)
+SPEED = (
+    Study("speed_paper", "paper", (), {}, {"cpu_s": 0.2}),
+    Study("speed_best", "best", (), {}, {"cpu_s": 10.0}),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """A study that was run.
+
+    Attributes
+    ----------
+    figures : mapping
+        What `--json` has.
+    peak_memory : float
+        Largest resident memory of the process [bytes].
+    """
+
+    figures: Figures
+    peak_memory: float
+
+
+def run(study: Study, folder: Path, draws: int, seed: str = SEED) -> Measured:
+    """Run a study in a process of its own.
+
+    Parameters
+    ----------
+    study : Study
+        Which.
+    folder : Path
+        Takes its file.
+    draws : int
+        Runs from each of the 1000 starts.
+    seed : str
+        Of all randomness.
+
+    Raises
+    ------
+    UserError
+        If it does not run.
+    """
+    file, said = folder / f"{study.key}.json", folder / f"{study.key}.txt"
+    command = [find_executable("needle_sim", "monte_carlo"), "--controller", study.controller]
+    command += [*study.options, "--draws", str(draws), "--seed", seed, "--json", str(file)]
+    with said.open("wb") as output:
+        process = subprocess.Popen(
+            command, env={**os.environ, **ONE_THREAD}, stdout=output, stderr=subprocess.STDOUT
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        last = ["", *said.read_text("utf-8", errors="replace").strip().splitlines()][-1]
+        raise UserError(f"{study.key}: {last}")
+    return Measured(json.loads(file.read_text(encoding="utf-8")), usage.ru_maxrss * 1024.0)
+
+
+def judge(study: Study, figures: Figures, draws: int) -> Iterator[Finding]:
+    """Compare a study's figures with what they must be.
+
+    Fewer than the full 10,000 runs get the benefit of the doubt: a share may fall short of its
+    bound by three standard deviations of what that many runs would show.
+    """
+    runs = RUNS_A_DRAW * draws
+    for key, bound, is_least in _bounds(study):
+        value = figures[key]
+        slack = 3.0 * math.sqrt(bound * (1.0 - bound) / runs) if is_least and draws < 10 else 0.0
+        passed = value is not None and (value >= bound - slack if is_least else value <= bound)
+        yield Finding(
+            f"{study.key}_{key}",
+            f"{study.controller} {' '.join(study.options) or '(undisturbed)'}: {key}",
+            f"{'>=' if is_least else '<='} {bound:g}",
+            "nothing" if value is None else f"{value:.4g} of {runs} runs",
+            passed,
+        )
+
+
+def _bounds(study: Study) -> Sequence[tuple[str, float, bool]]:
+    return [
+        *((key, bound, True) for key, bound in study.at_least.items()),
+        *((key, bound, False) for key, bound in study.at_most.items()),
+    ]

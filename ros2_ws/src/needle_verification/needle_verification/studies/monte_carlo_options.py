@@ -1,0 +1,160 @@
+"""The command line of `monte_carlo`: what it understands, and what it refuses in one line."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+from needle_common.commands.options import (
+    CommandParser,
+    join_start,
+    number,
+    output_file,
+    start,
+    whole_number,
+)
+from needle_common.errors import UserError
+from needle_sim.studies.disturbances import Disturbances
+from needle_sim.studies.start_grids import GRIDS, Bounds
+
+DESCRIPTION = """\
+Steer many simulated needles to the plane x = 0 and say how many get there.
+
+The default is the study of [KC09]: 10 x 10 x 10 starts (x, pitch, roll up to the given bounds, roll
+centred on 0), each 10 times with other noise, 120 mm deep, +-1 mm noise on each coordinate of the
+tip. What is judged is the true tip. The first tip is measured before the needle moves, every other
+after a step of 1 mm. Disturbances act on the plant alone; the controller is told of none. It knows
+the sensor's noise bound.
+"""
+
+EPILOG = """\
+figures (--json FILE has all of them, flat; null where there is none):
+  converged_at_end    share of runs within +-1 mm of the plane at the end
+  converged_last_20   share within +-1 mm after each of the last 20 steps
+  rms, p95, max       of the distance over the last 20 steps of all runs
+  settle              insertion of the last entry into +-1 mm, of the runs that end inside
+  rotation_mean       how much the base turns, either way, summed over a run
+  wall_s, cpu_s       time of the study, by the clock and on the processor (threads of numpy
+                      that wait count too: OPENBLAS_NUM_THREADS=1 keeps them out)
+  diverged            share that ends outside, farther off than its start, and still moving away
+
+examples:
+  ros2 run needle_sim monte_carlo --controller paper
+  ros2 run needle_sim monte_carlo --controller paper --grid cell --json paper.json
+  ros2 run needle_sim monte_carlo --controller open_loop --initial=-3,2,15 --draws 1
+  ros2 run needle_sim monte_carlo --controller paper --kappa-scale 0.8 --csv runs.csv
+
+exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class MonteCarloOptions:
+    """What one study was asked for; SI."""
+
+    controller: str
+    grid: str
+    draws: int
+    bounds: Bounds
+    initial: tuple[float, float, float] | None
+    depth: float
+    disturbances: Disturbances
+    flips: int
+    seed: int
+    json: Path | None
+    csv: Path | None
+
+
+def parse(arguments: Sequence[str]) -> MonteCarloOptions:
+    """Return the options of a command line (without the program's name).
+
+    Raises
+    ------
+    UserError
+        Anything that cannot be run as asked.
+    """
+    given = _parser().parse_args(join_start(arguments))
+    if given.grid not in GRIDS:
+        raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
+    return MonteCarloOptions(
+        controller=given.controller,
+        grid=given.grid,
+        draws=whole_number("--draws", given.draws, 1, 1000),
+        bounds=Bounds(
+            x=number("--x-mm", given.x_mm, 0.0, 100.0, "mm") * 1e-3,
+            pitch=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 80.0, "deg")),
+            roll=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
+        ),
+        initial=None if given.initial is None else _initial(given.initial),
+        depth=number("--depth-mm", given.depth_mm, 1.0, 1000.0, "mm") * 1e-3,
+        disturbances=Disturbances(
+            noise=number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
+            outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
+            dropped=number("--dropped", given.dropped, 0.0, 1.0, "-"),
+            pitch_noise=math.radians(
+                number("--pitch-noise-deg", given.pitch_noise_deg, 0.0, 90.0, "deg")
+            ),
+            delay=whole_number("--delay", given.delay, 0, 100),
+            curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
+            curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
+            play=math.radians(number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
+            lag_length=number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
+        ),
+        flips=whole_number("--flips", given.flips, 0, 100),
+        seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
+        json=output_file("--json", given.json),
+        csv=output_file("--csv", given.csv),
+    )
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser("monte_carlo", DESCRIPTION, EPILOG)
+    add = parser.add_argument
+    add(
+        "--controller",
+        default="best",
+        metavar="NAME",
+        help="best, paper, open_loop, kalman, measured_pitch, extended_kalman or orientation_fit "
+        "(default: best)",
+    )
+    add(
+        "--grid",
+        default="endpoint",
+        metavar="endpoint|cell|random",
+        help="starts on the bounds too, in the middles of cells, or anywhere (default: endpoint)",
+    )
+    numbers = (
+        ("--draws", "10", "N", "runs from each start"),
+        ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip"),
+        ("--depth-mm", "120", "D", "how far to insert"),
+        ("--x-mm", "3", "X", "bound of the starts' distance from the plane"),
+        ("--pitch-deg", "10", "P", "bound of the starts' pitch"),
+        ("--roll-deg", "30", "R", "bound of the starts' roll"),
+        ("--kappa-scale", "1", "S", "the needle's curvature, in terms of what is assumed"),
+        ("--play-deg", "0", "D", "dead band between base and tip angle, +-"),
+        ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
+        ("--outliers", "0", "F", "share of measurements off by 5-10 mm in a random direction"),
+        ("--dropped", "0", "F", "share of measurements that are missing"),
+        ("--pitch-noise-deg", "2", "P", "controller measured_pitch: largest error of the pitch"),
+        ("--delay", "0", "N", "steps that a measurement comes late"),
+        ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
+        ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),
+        ("--seed", "1", "N", "seed of all randomness: same seed, same figures"),
+    )
+    for name, default, metavar, text in numbers:
+        add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
+    add(
+        "--initial",
+        metavar="X_MM,PITCH_DEG,ROLL_DEG",
+        help="all 1000 N runs from this one start instead of a grid",
+    )
+    add("--json", metavar="FILE", help="write the figures as one flat JSON object")
+    add("--csv", metavar="FILE", help="one line for each run: its start and what became of it")
+    return parser
+
+
+def _initial(text: str) -> tuple[float, float, float]:
+    x_mm, pitch_deg, roll_deg = start(text, largest_x=100.0, largest_pitch=80.0)
+    return x_mm * 1e-3, math.radians(pitch_deg), math.radians(roll_deg)

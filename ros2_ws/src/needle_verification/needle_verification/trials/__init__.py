@@ -1,0 +1,1 @@
+"""Trials whose processes are started, killed and damaged from outside."""

@@ -1,0 +1,109 @@
+"""The recorder's writer beside rosbags' and beside the disk itself, with the same messages."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.format.bag_metadata import BagTopic
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.recording.allocator import keep_freed_memory
+
+EXPOSURES = 150
+SMALL_EACH = 10
+_IMAGE = "sensor_msgs/msg/Image"
+_SMALL = "sensor_msgs/msg/JointState"
+_TOPICS = (("/left", _IMAGE), ("/right", _IMAGE), ("/joint_states", _SMALL))
+_START = 1_700_000_000_000_000_000
+_STORE = get_typestore(Stores.ROS2_JAZZY)
+
+Message = tuple[int, int, bytes]
+
+
+@dataclass(frozen=True)
+class Speeds:
+    """How fast each way takes the same messages to the disk [MB/s]."""
+
+    megabytes: float
+    recorder: float
+    rosbags: float
+    disk: float
+
+
+def measure() -> Speeds:
+    """Write stereo pairs and what goes with them; the disk's own cache is emptied each time."""
+    keep_freed_memory()  # as the recorder does
+    images = np.random.default_rng(1).integers(0, 256, (2, 1024 * 768 + 64), dtype=np.uint8)
+    left, right = (image.tobytes() for image in images)
+    small = images[0, :200].tobytes()
+
+    def messages() -> Iterator[Message]:
+        for number in range(EXPOSURES):
+            time_ns = _START + number * 33_000_000
+            yield 0, time_ns, left
+            yield 1, time_ns, right
+            for _ in range(SMALL_EACH):
+                yield 2, time_ns, small
+
+    size = sum(len(data) for _, _, data in messages()) / 1e6
+    ways = (_record, _write_rosbags, _write_plainly)
+    # In turn, so that what else the machine does meets all of them.
+    seconds = [[_timed(way, messages) for way in ways] for _ in range(3)]
+    recorder, rosbags, disk = (size / min(times) for times in zip(*seconds, strict=True))
+    return Speeds(size, recorder, rosbags, disk)
+
+
+def _timed(
+    write: Callable[[Path, Iterator[Message]], None], messages: Callable[[], Iterator[Message]]
+) -> float:
+    folder = Path(tempfile.mkdtemp(prefix="needle_bench_"))
+    try:
+        begin = time.perf_counter()
+        write(folder / "bag", messages())
+        for file in (folder / "bag").iterdir():
+            with file.open("rb") as stream:
+                os.fsync(stream.fileno())
+        return time.perf_counter() - begin
+    finally:
+        shutil.rmtree(folder)
+
+
+def _record(path: Path, messages: Iterator[Message]) -> None:
+    bag = BagWriter(path)
+    topics = [
+        bag.add_topic(
+            BagTopic(
+                name,
+                kind,
+                _STORE.generate_msgdef(kind, ros_version=2)[0],
+                _STORE.hash_rihs01(kind),
+            )
+        )
+        for name, kind in _TOPICS
+    ]
+    for topic, time_ns, data in messages:
+        bag.write(topics[topic], data, time_ns, time_ns)
+    bag.close()
+
+
+def _write_rosbags(path: Path, messages: Iterator[Message]) -> None:
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as bag:
+        topics = [bag.add_connection(name, kind, typestore=_STORE) for name, kind in _TOPICS]
+        for topic, time_ns, data in messages:
+            bag.write(topics[topic], time_ns, data)
+
+
+def _write_plainly(path: Path, messages: Iterator[Message]) -> None:
+    path.mkdir()
+    with (path / "data").open("wb") as stream:
+        for _, _, data in messages:
+            stream.write(data)
