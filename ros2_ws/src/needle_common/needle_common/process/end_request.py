@@ -12,6 +12,7 @@ from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
 from needle_common.process.exit_timer import ExitTimer
+from needle_common.process.signal_exit import SignalExit
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # From the signal to the end [s]: a node that is still busy then ends there.
@@ -47,11 +48,9 @@ class EndRequest:
 
     def __init__(self, grace: float | None = GRACE, code: int = 0) -> None:
         self.wanted = False
-        self._grace = grace
-        self._code = code
         self._timer = ExitTimer()
-        self._latest = math.inf
         self._before = _handle(self._take)
+        self._exit = SignalExit(grace, code) if LeaveAtOnce.began and grace is not None else None
 
     def __enter__(self) -> EndRequest:
         return self
@@ -65,20 +64,13 @@ class EndRequest:
     def leave(self, code: int) -> None:
         """Say that nothing is left to save: the process is gone soon, with this exit code."""
         self.wanted = True
-        self._limit(TAKE_APART, code)
+        if self._exit is not None:
+            self._exit.set_code(code)
+        if LeaveAtOnce.began:
+            self._timer.start(TAKE_APART, code)
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
-        first = not self.wanted
         self.wanted = True
-        if first and self._grace is not None:
-            self._limit(self._grace, self._code)
-
-    def _limit(self, seconds: float, code: int) -> None:
-        if not LeaveAtOnce.began:
-            return
-        now = time.monotonic()
-        self._latest = min(self._latest, now + seconds)
-        self._timer.start(self._latest - now, code)
 
 
 class LeaveAtOnce:

@@ -5,11 +5,11 @@ from __future__ import annotations
 import ctypes
 
 _CLOCK_MONOTONIC = 1
-_SIGEV_THREAD = 2
+SIGEV_THREAD = 2
 _NANOSECONDS = 1_000_000_000
 
 
-class _SignalEvent(ctypes.Structure):
+class SignalEvent(ctypes.Structure):
     """C's `struct sigevent`, 64 bytes."""
 
     _fields_ = (
@@ -36,7 +36,7 @@ class ExitTimer:
     """
 
     def __init__(self) -> None:
-        self._library = _library()
+        self._library = system_library()
         self._timer: ctypes.c_void_p | None = None
 
     def start(self, seconds: float, code: int) -> None:
@@ -48,9 +48,9 @@ class ExitTimer:
             If the system has no timer to give.
         """
         self.stop()
-        event = _SignalEvent(
+        event = SignalEvent(
             value=code,
-            notify=_SIGEV_THREAD,
+            notify=SIGEV_THREAD,
             function=ctypes.cast(self._library["_exit"], ctypes.c_void_p),
         )
         timer = ctypes.c_void_p()
@@ -68,7 +68,7 @@ class ExitTimer:
             self._timer = None
 
 
-def _library() -> ctypes.CDLL:
-    """Return the library that has timers: before glibc 2.34 that was one of its own."""
+def system_library() -> ctypes.CDLL:
+    """Return the library of timers and asynchronous reading: its own before glibc 2.34."""
     found = ctypes.CDLL(None, use_errno=True)
     return found if hasattr(found, "timer_create") else ctypes.CDLL("librt.so.1", use_errno=True)

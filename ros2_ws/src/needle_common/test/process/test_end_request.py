@@ -80,6 +80,36 @@ with EndRequest() as end:
     assert run(code) == (5, "")
 
 
+def test_an_end_after_a_signal_needs_no_interpreter() -> None:
+    # The signal comes while compiled code keeps the lock for good: a mutex is taken twice.
+    code = """
+import ctypes, subprocess
+from needle_common.process.end_request import EndRequest, LeaveAtOnce
+LeaveAtOnce(1)
+wait = 'read go; until grep -q "^State:.S" /proc/$0/status; do :; done; kill -TERM $0'
+with EndRequest(0.1, code=7):
+    held, mutex = ctypes.PyDLL(None), ctypes.create_string_buffer(64)
+    held.pthread_mutex_lock(mutex)
+    sender = subprocess.Popen(["sh", "-c", wait, str(os.getpid())], stdin=subprocess.PIPE)
+    sender.stdin.write(b"go\\n"); sender.stdin.flush()
+    held.pthread_mutex_lock(mutex)
+"""
+    assert run(code) == (7, "")
+
+
+def test_the_end_after_a_signal_has_the_code_that_was_said_last() -> None:
+    code = """
+from needle_common.process import end_request
+end_request.TAKE_APART = 60.0
+end_request.LeaveAtOnce(1)
+with end_request.EndRequest(0.1, code=7) as end:
+    end.leave(5)
+    send(signal.SIGTERM)
+    while True: pass
+"""
+    assert run(code) == (5, "")
+
+
 def test_a_tests_own_process_lives_on() -> None:
     code = """
 from needle_common.process.end_request import TAKE_APART, EndRequest
@@ -178,8 +208,8 @@ def test_timers_of_an_older_c_library_are_found(monkeypatch: pytest.MonkeyPatch)
     libc, librt = types.SimpleNamespace(), types.SimpleNamespace(timer_create=None)
     libraries = {None: libc, "librt.so.1": librt}
     monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libraries[name])
-    assert vars(exit_timer._library()) == {"timer_create": None}
+    assert vars(exit_timer.system_library()) == {"timer_create": None}
     assert not vars(libc)
     libc.timer_create = None
     del librt.timer_create
-    assert vars(exit_timer._library()) == {"timer_create": None}
+    assert vars(exit_timer.system_library()) == {"timer_create": None}

@@ -66,6 +66,8 @@ _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 _DESK_LOOK = 0.1
 _HELD_UP = 2.5 * PERIOD
+# From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
+_GRACE = 0.9
 _SLACK = 0.1 * PERIOD
 
 
@@ -396,8 +398,7 @@ def main() -> int:
         help_text=HELP,
         parameters=DeviceDriverParameters,
         spin=spin,
-        # Each wait of `close` has a limit of its own, and the axes stand and are off behind it.
-        grace=None,
+        grace=_GRACE,
     )
 
 
