@@ -40,6 +40,7 @@ from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_n
 from needle_common.ros.conversions import RELIABLE, to_stamp
 from needle_common.ros.discovery import AnsweringNodes, full_name
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, parameter
 
 CLOCK: Final = "/clock"
@@ -77,7 +78,7 @@ class RigAppearedError(Exception):
     """A rig came up while topics are played under their own names."""
 
 
-class Player(Node):
+class Player(WholeNode):
     """Publishes a bag's messages when they are due."""
 
     def __init__(self, options: PlayerOptions, contents: BagContents) -> None:

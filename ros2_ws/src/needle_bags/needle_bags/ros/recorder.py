@@ -33,6 +33,7 @@ from needle_common.files.bag_directory import recover_hint
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).
@@ -70,7 +71,7 @@ DEVICE_STATUS = "/device/status"
 FAULTS = ("FAULT", "ESTOPPED")
 
 
-class Recorder(Node):
+class Recorder(WholeNode):
     """Subscribes to whatever the graph has and hands it to a `Recording`."""
 
     def __init__(self) -> None:

@@ -34,6 +34,7 @@ from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp, val
 from needle_common.ros.discovery import RECORDER, full_name, publishers_of
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 
 HELP = """\
 operator: stands in for the person who holds the needle's switch, in simulation.
@@ -57,7 +58,7 @@ DISABLE_TIMEOUT_INTERRUPTED = 0.3
 RELEASES = 3
 
 
-class OperatorNode(Node):
+class OperatorNode(WholeNode):
     """Shell around `OperatorSequence`: calls what it asks for and tells it what was heard."""
 
     def __init__(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import sys
 import weakref
 from collections import Counter
@@ -195,9 +194,6 @@ def _run(
         end.leave(code)
         if node is not None:
             node.destroy_node()
-        else:
-            # Half made, it is in a circle with its callbacks, and others would go on seeing it.
-            gc.collect()
         rclpy.try_shutdown()
     return code
 

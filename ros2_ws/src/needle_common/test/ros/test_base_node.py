@@ -3,8 +3,6 @@
 import dataclasses
 import os
 import signal
-import weakref
-from typing import ClassVar
 
 import pytest
 from rclpy.node import Node
@@ -57,16 +55,8 @@ class Fails(Node):
 class Refuses(Node):
     """Does not like its parameters."""
 
-    made: ClassVar[weakref.ref[Node]]
-
     def __init__(self) -> None:
-        super().__init__("refuses")
-        Refuses.made = weakref.ref(self)
-        self.create_timer(1.0, self._on_timer, clock=STEADY_CLOCK)
         raise UserError("rate = 0 Hz, must be > 0")
-
-    def _on_timer(self) -> None:
-        pass
 
 
 class MissesAnother(Node):
@@ -94,11 +84,6 @@ def test_a_fault_in_a_callback_is_an_internal_error(capsys: pytest.CaptureFixtur
 def test_bad_parameters_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(Refuses) == EXIT_BAD_INPUT
     assert capsys.readouterr().err == "error: rate = 0 Hz, must be > 0\n"
-
-
-def test_a_node_that_was_not_finished_is_not_in_the_graph() -> None:
-    run(Refuses)
-    assert Refuses.made() is None
 
 
 @pytest.mark.parametrize("word", ["--help", "-h"])

@@ -18,7 +18,6 @@ from geometry_msgs.msg import (
 )
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -45,6 +44,7 @@ from needle_common.ros.discovery import (
 )
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_controller.protocol.heard_messages import HeardMessages
 from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendStep, State
 from needle_controller.ros import conversions
@@ -65,7 +65,7 @@ _LOG_PERIOD = 2.0
 _PLANES_SEEN = 32
 
 
-class PlaneControllerNode(Node):
+class PlaneControllerNode(WholeNode):
     """The ROS shell of `steering.Steering`: converts, calls, publishes, reports.
 
     Parameters

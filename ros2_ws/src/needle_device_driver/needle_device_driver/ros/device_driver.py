@@ -9,7 +9,7 @@ import time
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
-from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
+from rclpy.lifecycle import LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
@@ -31,6 +31,7 @@ from needle_common.ros.discovery import (
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameter_desk import ParameterDesk
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeLifecycleNode
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock
 from needle_device_driver.cia402.cycle_schedule import CycleSchedule
@@ -71,7 +72,7 @@ _GRACE = 0.9
 _SLACK = 0.1 * PERIOD
 
 
-class DeviceDriverNode(LifecycleNode):
+class DeviceDriverNode(WholeLifecycleNode):
     """Runs the cycle: set-points, SYNC, answers, supervision.
 
     Parameters

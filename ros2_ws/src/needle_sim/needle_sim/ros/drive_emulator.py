@@ -21,6 +21,7 @@ from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_n
 from needle_common.ros.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.bus.socketcand_port import SocketcandPort
 from needle_sim.drives.drive_server import DriveServer, Port
@@ -53,7 +54,7 @@ _LOOK_AROUND = 0.05
 _PATIENCE = 0.2
 
 
-class DriveEmulatorNode(Node):
+class DriveEmulatorNode(WholeNode):
     """Runs the drives and tells what their motors did.
 
     Parameters

@@ -28,6 +28,7 @@ from needle_common.ros.conversions import (
 from needle_common.ros.discovery import AnsweringNodes, unheard, unpublished, unrecorded
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.lock_step import Action, LockStep
 from needle_sim.rig.pace import Pace
@@ -63,7 +64,7 @@ _IDLE = 0.01
 _TURNS_PER_LOOK = 5
 
 
-class SimRigNode(Node):
+class SimRigNode(WholeNode):
     """Owns the clock, the simulated bench and the device interface in front of it.
 
     Parameters

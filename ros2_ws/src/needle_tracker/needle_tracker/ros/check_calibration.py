@@ -10,7 +10,6 @@ import numpy as np
 import rclpy
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import Image
@@ -19,6 +18,7 @@ from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, writ
 from needle_common.errors import UserError
 from needle_common.process.reach import keep_to_this_machine
 from needle_common.ros.conversions import IMAGES_BEST_EFFORT, to_nanoseconds
+from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
 from needle_tracker.calibrating.calibration_check import check
@@ -76,7 +76,7 @@ def _live_view(
     return averaged_view(name, session, pairs)
 
 
-class _Capture(Node):
+class _Capture(WholeNode):
     """Takes a number of image pairs from the topics."""
 
     def __init__(

@@ -30,6 +30,7 @@ from needle_common.ros.conversions import IMAGES, to_stamp
 from needle_common.ros.discovery import unheard
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, load_calibration
 from needle_tracker.sources.image_files import Image as GreyImage
@@ -86,7 +87,7 @@ class StereoCameraParameters:
         check_fields(self)
 
 
-class StereoCameraNode(Node):
+class StereoCameraNode(WholeNode):
     """Publishes what its source gives.
 
     Parameters

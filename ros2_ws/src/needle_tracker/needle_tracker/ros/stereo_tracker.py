@@ -12,7 +12,6 @@ from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
-from rclpy.node import Node
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import String
@@ -30,6 +29,7 @@ from needle_common.ros.conversions import (
 from needle_common.ros.discovery import AnsweringNodes, unpublished, unrecorded
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
@@ -59,7 +59,7 @@ in use, latched), ~/annotated_image (while someone subscribes).
 _CHECK_PERIOD = 0.05  # [s]
 
 
-class StereoTrackerNode(Node):
+class StereoTrackerNode(WholeNode):
     """The ROS shell of `pair_answers.PairAnswers`: converts, calls, publishes, reports.
 
     Parameters

@@ -10,13 +10,13 @@ import sys
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
-from rclpy.node import Node
 from sensor_msgs.msg import Image, JointState
 
 from needle_common.errors import UserError
 from needle_common.ros.base_node import run_node
 from needle_common.ros.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 
 HELP = """\
@@ -43,7 +43,7 @@ class BadInputParameters:
             raise UserError("kinds is empty")
 
 
-class BadInput(Node):
+class BadInput(WholeNode):
     """Answers every so many joint states with a bad tip or a left image alone."""
 
     def __init__(self) -> None:

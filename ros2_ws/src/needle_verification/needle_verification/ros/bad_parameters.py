@@ -17,11 +17,11 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
+from needle_common.ros.whole_node import WholeNode
 
 Answer = dict[str, Any]
 
@@ -44,7 +44,7 @@ FAR_PLANE = 0.09
 _LIMIT = 20.0
 
 
-class BadParameters(Node):
+class BadParameters(WholeNode):
     """Speaks to `plane_controller` in its own domain."""
 
     def __init__(self) -> None:

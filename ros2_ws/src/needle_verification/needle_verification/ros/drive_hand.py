@@ -10,7 +10,6 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -28,6 +27,7 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
+from needle_common.ros.whole_node import WholeNode
 
 JOINTS = ("insertion_joint", "rotation_joint")
 # What a count of each encoder is [m], [rad]: the emulator's defaults.
@@ -47,7 +47,7 @@ class Motors:
     rotation: float
 
 
-class DriveHand(Node):
+class DriveHand(WholeNode):
     """Presses the hold, sends steps, calls services; hears what came of it.
 
     Parameters

@@ -18,6 +18,7 @@ from std_srvs.srv import SetBool
 from needle_common.errors import UserError
 from needle_common.ros.base_node import executor_of
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
+from needle_common.ros.whole_node import WholeNode
 from needle_verification.trials.random_messages import class_of, random_message
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
@@ -99,7 +100,7 @@ def _half(
     }
 
 
-class _Witness(Node):
+class _Witness(WholeNode):
     """Sees the driver's first state, and whether a motor turned, by the emulator's own word."""
 
     def __init__(self) -> None:

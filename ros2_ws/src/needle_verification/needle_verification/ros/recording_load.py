@@ -31,6 +31,7 @@ from needle_common.ros.base_node import run_node
 from needle_common.ros.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
 from needle_common.ros.discovery import unrecorded
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 
 HELP = """\
@@ -88,7 +89,7 @@ class _Stream:
         self.count += 1
 
 
-class RecordingLoad(Node):
+class RecordingLoad(WholeNode):
     """Publishes numbered messages on the rig's topics."""
 
     def __init__(self) -> None:
