@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter, deque
+from collections import deque
 from typing import Any
 
 from needle_common.diagnostics import Diagnostic, Level
@@ -16,7 +16,35 @@ from needle_tracker.tracking.track import TrackState
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]
 _RATE_WINDOW = 5.0  # [s]
+_MOST_REASONS = 20  # told by name
+OTHER_REASONS = "other reasons"
 _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
+
+
+class ReasonCounts:
+    """How often each reason was given: the latest by name, all others together.
+
+    Reasons quote what came from outside: there is no end of them, and each report tells them all.
+    """
+
+    def __init__(self) -> None:
+        self._named: dict[str, int] = {}
+        self._others = 0
+
+    def add(self, reason: str) -> None:
+        """Count a reason once more."""
+        # What is named comes in the order in which it was last given.
+        self._named[reason] = self._named.pop(reason, 0) + 1
+        if len(self._named) > _MOST_REASONS:
+            self._others += self._named.pop(next(iter(self._named)))
+
+    def total(self) -> int:
+        """Return how many were counted."""
+        return sum(self._named.values()) + self._others
+
+    def items(self) -> list[tuple[str, int]]:
+        """Return reasons and counts, `OTHER_REASONS` last and only where there are some."""
+        return [*self._named.items(), *([(OTHER_REASONS, self._others)] if self._others else [])]
 
 
 @dataclasses.dataclass
@@ -25,16 +53,16 @@ class Health:
 
     Attributes
     ----------
-    refused : Counter
+    refused : ReasonCounts
         Pairs refused before they were looked at, by reason.
-    rejected : Counter
+    rejected : ReasonCounts
         Pairs that gave no believed tip, by reason.
     swapped : bool
         Whether left and right images seem to be swapped.
     """
 
-    refused: Counter[str]
-    rejected: Counter[str]
+    refused: ReasonCounts = dataclasses.field(default_factory=ReasonCounts)
+    rejected: ReasonCounts = dataclasses.field(default_factory=ReasonCounts)
     joints_without_insertion: int = 0
     last_refusal: tuple[float, str] | None = None
     camera_info: dict[str, str] = dataclasses.field(default_factory=dict)
@@ -59,7 +87,7 @@ class Health:
 
     def pair_refused(self, reason: str, now: float) -> None:
         """Note a pair that was not looked at."""
-        self.refused[reason] += 1
+        self.refused.add(reason)
         self.last_refusal = (now, reason)
 
     def pair_done(self, arrival: float, now: float, measured: Measurement) -> None:
@@ -68,7 +96,7 @@ class Health:
         self._state = measured.state
         self._reason = measured.reason
         if measured.tip is None:
-            self.rejected[measured.reason] += 1
+            self.rejected.add(measured.reason)
         else:
             self._tips += 1
             self._single_tips += bool(measured.reason)
@@ -100,7 +128,7 @@ class Health:
             "latency_max_ms": f"{1e3 * latencies[-1]:.1f}" if recent else "",
             "left_without_right": str(counts.unpaired_left),
             "right_without_left": str(counts.unpaired_right),
-            "pairs_refused": str(sum(self.refused.values())),
+            "pairs_refused": str(self.refused.total()),
         }
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
         return Diagnostic(*self._images_level(now, matcher), values)

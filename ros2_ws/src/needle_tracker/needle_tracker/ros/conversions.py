@@ -21,12 +21,13 @@ RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
 INSERTION_JOINT = "insertion_joint"
 _ENCODINGS = ("mono8", "8UC1")
+_QUOTED = 40  # characters of a text that is not known
 
 
 def to_frame(message: Image, side: str, camera: Camera) -> Frame:
     """Return the image in a message, or why it is not one of this camera."""
     if message.encoding not in _ENCODINGS:
-        return Frame(None, f"{side} image is {message.encoding!r}, wants 'mono8'")
+        return Frame(None, f"{side} image is {message.encoding[:_QUOTED]!r}, wants 'mono8'")
     if (message.width, message.height) != (camera.width, camera.height):
         return Frame(
             None,

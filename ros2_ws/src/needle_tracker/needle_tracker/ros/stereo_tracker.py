@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -89,7 +88,7 @@ class StereoTrackerNode(WholeNode):
         rate = parameters.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
-        self._health = Health(Counter(), Counter())
+        self._health = Health()
         # What every start begins with is not worth a warning in the log.
         self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
 

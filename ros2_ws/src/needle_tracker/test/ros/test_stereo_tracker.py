@@ -304,6 +304,25 @@ def test_bad_images_are_answered_without_a_tip_and_named(
     assert found(bench.pair(20, images))
 
 
+def test_reasons_without_end_are_told_in_a_report_of_bounded_length(bench: Bench) -> None:
+    pixels = np.zeros((2, 2), np.uint8)
+    count = 50
+    for number in range(count):
+        bench.joints(10 + number)
+        bench.image("left", 10 + number, pixels, f"{number} " + "x" * 3000)
+        bench.image("right", 10 + number, pixels)
+        assert not found(bench.answer())
+    bench.until(lambda: bench.health["images"][2].get("pairs_refused") == str(count))
+    last = f"'{count - 1} x"
+    bench.until(lambda: all(last in bench.health[part][1] for part in ("images", "track")))
+    for part, kind in (("images", "refused: "), ("track", "no tip: ")):
+        told = {k: int(v) for k, v in bench.health[part][2].items() if k.startswith(kind)}
+        assert sum(told.values()) == count
+        assert told[f"{kind}other reasons"] == count - 20
+        assert list(told)[-2].startswith(f"{kind}left image is '{count - 1} x")
+        assert max(map(len, [*told, bench.health[part][1]])) < 120
+
+
 def test_an_image_without_all_its_bytes_is_no_tip(bench: Bench, images: Images) -> None:
     bench.joints(10)
     bench.image("left", 10, images[0], cut_off=1)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import Counter
 from collections.abc import Callable
 
 import numpy as np
@@ -126,7 +125,7 @@ def test_a_tip_of_one_view_is_told_as_such(
     tracker: StereoTracker, draw_pair: Drawer, make_arc: Arc
 ) -> None:
     pair = list(draw_pair(make_arc(0.05, 6.0, 1.0)))
-    health = Health(Counter(), Counter())
+    health = Health()
     for number in range(11):
         if number == 10:
             pair[1] = np.full_like(pair[1], 90)
