@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -27,6 +28,8 @@ from needle_common.ros.discovery import unheard
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.driven_tick import DrivenTick
 
+# Beyond any drive: the shape of a needle there cannot be reckoned [m], [rad].
+_FARTHEST = {"insertion_joint": 1.0, "rotation_joint": 1e5}
 _PATIENCE = 0.01
 
 
@@ -171,8 +174,24 @@ class DrivenDevice:
         self._tick.driver_at(to_nanoseconds(message.header.stamp))
 
     def _on_positions(self, message: JointState) -> None:
+        at = places_of(message)
         self._tick.heard()
         self._tick.drives_moved()
         self._motors_turn = any(velocity != 0.0 for velocity in message.velocity)
-        at = dict(zip(message.name, message.position, strict=True))
         self._bench.move_to(at["insertion_joint"], at["rotation_joint"])
+
+
+def places_of(message: JointState) -> dict[str, float]:
+    """Return where the axes are, by joint [m], [rad].
+
+    Raises
+    ------
+    ValueError
+        A joint is missing, or where no drive can be.
+    """
+    at = dict(zip(message.name, message.position, strict=True))
+    for joint, farthest in _FARTHEST.items():
+        place = at.get(joint, math.nan)
+        if not abs(place) <= farthest:
+            raise ValueError(f"{joint} is at {place:g}: no drive is")
+    return at
