@@ -6,12 +6,12 @@ import time
 from typing import Any
 
 import pytest
-from needle_common.own_context_node import own_context
 from rclpy.context import Context
 from rclpy.node import Node
 from std_msgs.msg import Bool
 
 from needle_common.errors import UserError
+from needle_common.ros.own_context import own_context
 from needle_common.ros.whole_node import WholeLifecycleNode, WholeNode
 
 LIMIT = 20.0
