@@ -117,6 +117,11 @@ def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[
     assert ros2("topic", "echo", "--once", "/rig/status", "--field", "frame_id").out == (
         "above\n---\n"
     )
+    of_another = ros2(
+        "topic", "echo", "/rig/status", "--filter", "not m.frame_id", "--timeout", "1"
+    )
+    assert of_another.out == ""
+    assert ros2("topic", "echo", "--once", "/rig/status", "--filter", "m.frame_id").out == expected
     axes = ros2("topic", "echo", "--once", "/rig/axes").out
     assert axes.count("- 0.5\n") == 128
     assert "- '...'\n" in axes

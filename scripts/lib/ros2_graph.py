@@ -203,6 +203,7 @@ def _add_topic_commands(verbs: Any) -> None:
     command = _command(verbs, "echo", echo)
     command.add_argument("topic_name")
     command.add_argument("message_type", nargs="?")
+    command.add_argument("--filter", metavar="EXPR", help="in Python, of the message m")
     command.add_argument("--field", help="of the message; sub-fields after a dot")
     command.add_argument("-f", "--full-length", action="store_true")
     command.add_argument("-l", "--truncate-length", type=int, default=TRUNCATE, metavar="N")

@@ -99,6 +99,9 @@ def echo(node: Node, options: argparse.Namespace) -> None:
     def show(message: Any) -> None:
         if options.once and seen:
             return
+        # As in the real one, it is the user's own program.
+        if options.filter is not None and not eval(options.filter, {"m": message}):
+            return
         for name in fields:
             if not hasattr(message, name):
                 raise GraphError(f"Invalid field '{options.field}': no '{name}'")
