@@ -57,7 +57,7 @@ Check = Callable[["Workbench"], Iterator[Finding]]
 
 
 @dataclasses.dataclass(frozen=True)
-class Run:
+class SimulateRun:
     """A finished run of `scripts/simulate`.
 
     Attributes
@@ -183,7 +183,7 @@ class StartedRun:
         """Return (pid, command) of every process of this run."""
         return processes_with(MARK, self._mark)
 
-    def wait(self, timeout: float = 300.0) -> Run:
+    def wait(self, timeout: float = 300.0) -> SimulateRun:
         """Wait for the end; a run that does not end is killed and has code -9."""
         try:
             code = self.process.wait(timeout)
@@ -195,7 +195,7 @@ class StartedRun:
         for pid, _ in left_over:
             os.kill(pid, signal.SIGKILL)
         names = [f"{pid} {name}" for pid, name in left_over]
-        return Run(code, wall, self.output, self._bag, names)
+        return SimulateRun(code, wall, self.output, self._bag, names)
 
 
 class Workbench:
@@ -212,14 +212,14 @@ class Workbench:
     def __init__(self, command: Sequence[str], folder: Path) -> None:
         self._command = list(command)
         self.folder = folder
-        self._runs: dict[str, Run] = {}
+        self._runs: dict[str, SimulateRun] = {}
 
     def start(self, name: str, *arguments: str) -> StartedRun:
         """Start `simulate` with these arguments and a bag of this name."""
         bag = self.folder / name
         return StartedRun([*self._command, *arguments, "--bag", str(bag)], bag)
 
-    def run(self, name: str, *arguments: str) -> Run:
+    def run(self, name: str, *arguments: str) -> SimulateRun:
         """Run `simulate`; a name that has run before gives that run again."""
         if name not in self._runs:
             self._runs[name] = self.start(name, *arguments).wait()

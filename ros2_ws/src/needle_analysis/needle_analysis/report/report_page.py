@@ -63,7 +63,7 @@ TILES = (
     ("Wall time", "wall_s", "{:.1f}", "s"),
 )
 """Label, key, format and unit of the figures at the top."""
-_ABOUT = ("level", "controller", "seed")
+_SUMMARY_KEYS = ("level", "controller", "seed")
 
 
 def build_page(
@@ -133,7 +133,7 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
 def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> str:
     words, sentence = verdict_text(summary)
     about = [run.path.absolute().name]
-    about += [f"{key} {summary[key]}" for key in _ABOUT if summary[key] is not None]
+    about += [f"{key} {summary[key]}" for key in _SUMMARY_KEYS if summary[key] is not None]
     good = summary["converged"] is True and summary["rerun_of"] is None
     return html_page.banner(words, sentence, " · ".join(about), good=good)
 

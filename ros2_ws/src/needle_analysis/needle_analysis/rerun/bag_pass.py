@@ -14,8 +14,8 @@ import numpy.typing as npt
 from rosbags.typesys import Stores, get_typestore
 from tqdm import tqdm
 
-from needle_analysis.rerun.bag_hearing import as_heard
 from needle_analysis.rerun.comparison import Record, members
+from needle_analysis.rerun.reception_order import in_reception_order
 from needle_analysis.run.run_summary import reduced_states, target_offset
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_order import Reorder, SentMessage, messages_as_sent
@@ -265,7 +265,7 @@ def _topics(stage: Stage | None) -> frozenset[str]:
 
 
 def _in_hearing_order(run: Run) -> Reorder:
-    return functools.partial(as_heard, namespace=run.namespace)
+    return functools.partial(in_reception_order, namespace=run.namespace)
 
 
 def _inputs(

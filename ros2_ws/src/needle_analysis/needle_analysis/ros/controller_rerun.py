@@ -15,11 +15,11 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import to_nanoseconds, values_of
 from needle_controller.protocol.heard_messages import HeardMessage
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, PublishUpdate, SendStep, State
+from needle_controller.protocol.steering_types import Action, PublishUpdate, SendStep, SteeringState
 from needle_controller.ros import conversions
 from needle_controller.ros.parameters import PlaneControllerParameters
 
-_STEERING = (State.STEERING.value, State.WAITING_FOR_TIP.value)
+_STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6
 """[s]"""
 
@@ -40,7 +40,7 @@ class ControllerStage:
     ends : mapping of int to JointSample
         Stamp of a command [ns] to where it led (`step_ends`).
     unheard : frozenset of HeardMessage
-        What the recorded controller did not hear (`bag_hearing.unheard_messages`).
+        What the recorded controller did not hear (`reception_order.unheard_messages`).
 
     Attributes
     ----------
@@ -145,7 +145,11 @@ class ControllerStage:
             if not reply.success:
                 self.notes.append(f"would not have started: {reply.message}")
             return actions
-        if before in _STEERING and now == State.IDLE.value and values.get("reason") == "stopped":
+        if (
+            before in _STEERING
+            and now == SteeringState.IDLE.value
+            and values.get("reason") == "stopped"
+        ):
             return self._steering.on_stop()[1]
         return ()
 

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import yaml
 
-from needle_analysis.rerun.bag_hearing import unheard_messages
 from needle_analysis.rerun.bag_pass import (
     TIP_TOPICS,
     has_images,
@@ -18,6 +17,7 @@ from needle_analysis.rerun.bag_pass import (
     run_tips,
 )
 from needle_analysis.rerun.comparison import compare
+from needle_analysis.rerun.reception_order import unheard_messages
 from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.rerun.rerun_text import describe, errors_text, flat, tolerance_table
 from needle_analysis.ros.controller_rerun import ControllerStage, step_ends

@@ -54,8 +54,8 @@ Each snapshot goes into the same bag; what was written is not kept for the next.
 
 Subscribes to every topic of the graph; publishes /diagnostics: a warning when messages are lost,
 what came cannot be understood (it is recorded all the same) or the disk is nearly full. Down to
-`reserve` the recording ends, the bag is completed, and the node stays to say so; the rest of the
-graph goes on.
+`reserve` the recording ends, the bag is completed, and the node stays and reports it; the rest of
+the graph goes on.
 Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters.
 """
 

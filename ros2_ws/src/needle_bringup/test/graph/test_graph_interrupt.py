@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_verification.checking import Run, StartedRun, Workbench, unreadable
+from needle_verification.checking import SimulateRun, StartedRun, Workbench, unreadable
 
 LIMIT = 60.0
 # The first line of progress; the operator may not have heard of the step that ended at 30.0 mm.
@@ -21,7 +21,7 @@ def start(bag: Path, *arguments: str) -> StartedRun:
     return bench.start(bag.name, *arguments)
 
 
-def check_nothing_left(finished: Run) -> None:
+def check_nothing_left(finished: SimulateRun) -> None:
     """Fail if a process or a shared-memory port outlived the run."""
     assert finished.left_over == []
     assert finished.left_in_memory == []

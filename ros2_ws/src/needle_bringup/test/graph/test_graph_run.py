@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from needle_analysis.ros import rerun
-from needle_verification.checking import Run, Workbench, payloads, unreadable
+from needle_verification.checking import SimulateRun, Workbench, payloads, unreadable
 
 SHORT = ("--depth-mm", "10")
 TOPICS = ("/needle/tip", "/device/joint_trajectory", "/sim/tip_pose")
 
 
-def run(bag: Path, *arguments: str) -> Run:
-    """Run `simulate` to its end and check that it leaves nothing behind."""
+def run(bag: Path, *arguments: str) -> SimulateRun:
+    """SimulateRun `simulate` to its end and check that it leaves nothing behind."""
     bench = Workbench([sys.executable, "-m", "needle_bringup.simulation.simulate"], bag.parent)
     finished = bench.run(bag.name, *arguments)
     assert finished.left_over == []

@@ -7,7 +7,7 @@ import dataclasses
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import DEPTH_TOLERANCE
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_controller.protocol.steering_types import DeviceStatus, SteeringSettings
+from needle_controller.protocol.steering_types import DeviceReport, SteeringSettings
 
 _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
@@ -20,7 +20,7 @@ class Situation:
     ----------
     steering : bool
         Whether it is steering already.
-    device : DeviceStatus or None
+    device : DeviceReport or None
         What the driver last said.
     joints : JointSample or None
         Where the joints are.
@@ -29,7 +29,7 @@ class Situation:
     """
 
     steering: bool
-    device: DeviceStatus | None
+    device: DeviceReport | None
     joints: JointSample | None
     withdrawal: str
 
@@ -68,7 +68,7 @@ def obstacle(situation: Situation, control: PlaneControl, settings: SteeringSett
     return situation.withdrawal or _needle_obstacle(joints, control, settings)
 
 
-def _device_obstacle(device: DeviceStatus | None) -> str:
+def _device_obstacle(device: DeviceReport | None) -> str:
     if device is None:
         return "no device/status has come"
     if device.state == "MOVING":
@@ -80,7 +80,7 @@ def _device_obstacle(device: DeviceStatus | None) -> str:
     return ""
 
 
-def _agree(device: DeviceStatus, joints: JointSample) -> bool:
+def _agree(device: DeviceReport, joints: JointSample) -> bool:
     """Return whether the joints are where the device has them: not those of a motion before."""
     if device.insertion is None or device.rotation is None:
         return True

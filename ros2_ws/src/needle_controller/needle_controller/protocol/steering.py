@@ -20,13 +20,13 @@ from needle_controller.protocol.start_conditions import Situation, is_out, obsta
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceStatus,
+    DeviceReport,
     Log,
     PublishUpdate,
-    Reply,
     SendStep,
-    State,
+    StartReply,
     SteeringSettings,
+    SteeringState,
 )
 from needle_controller.protocol.step_watch import REST_INSERTION, Followed, StepWatch
 from needle_controller.protocol.tip_covariance import TipCovariance
@@ -51,7 +51,7 @@ class Steering:
 
     Attributes
     ----------
-    state, awaiting : State, Awaiting
+    state, awaiting : SteeringState, Awaiting
         Where the protocol is, and what it needs to go on.
     reason : str
         Why it is there, or what is amiss.
@@ -74,7 +74,7 @@ class Steering:
     def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
         self.settings = settings
         self.control = control
-        self.state = State.IDLE
+        self.state = SteeringState.IDLE
         self.awaiting = Awaiting.NOTHING
         self.reason = "not started"
         self.starts = 0
@@ -85,7 +85,7 @@ class Steering:
         self.reach: Reachability | None = None
         self.intake = TipIntake()
         self._retraction = RetractionWatch()
-        self._device: DeviceStatus | None = None
+        self._device: DeviceReport | None = None
         self._ready_step: SendStep | None = None
         self._sent: SendStep | None = None
         self._followed: StepWatch | None = None
@@ -109,7 +109,7 @@ class Steering:
 
     # What a person asks for
 
-    def on_start(self) -> tuple[Reply, list[Action]]:
+    def on_start(self) -> tuple[StartReply, list[Action]]:
         """Begin steering, or say why not."""
         joints = self.intake.joints.latest
         why = obstacle(
@@ -118,23 +118,23 @@ class Steering:
             self.settings,
         )
         if why:
-            return Reply(False, why), [Log("warning", f"not started: {why}")]
+            return StartReply(False, why), [Log("warning", f"not started: {why}")]
         if joints is not None and is_out(joints, self.settings):
             self.control.restart()
             self.intake.last = None
             self.step = 0
             self._retraction.begin(joints.insertion)
-        self.state, self.reason = State.STEERING, ""
+        self.state, self.reason = SteeringState.STEERING, ""
         self.starts += 1
         self._failed.forget()
         self.intake.want_any()
-        return Reply(True, "steering"), [Log("info", "steering"), *self._ask()]
+        return StartReply(True, "steering"), [Log("info", "steering"), *self._ask()]
 
-    def on_stop(self) -> tuple[Reply, list[Action]]:
+    def on_stop(self) -> tuple[StartReply, list[Action]]:
         """Send no further step; one under way ends with the hold, or by itself."""
         if not self._steering:
-            return Reply(True, f"was not steering ({self.state.value})"), []
-        return Reply(True, "stopped"), self._leave(State.IDLE, "stopped", "info")
+            return StartReply(True, f"was not steering ({self.state.value})"), []
+        return StartReply(True, "stopped"), self._leave(SteeringState.IDLE, "stopped", "info")
 
     # What comes in
 
@@ -190,7 +190,7 @@ class Steering:
         self.reason = f"step {text}"
         why = self._failed.aborted(text, moved=self._moved_since_command())
         if why:
-            return actions + self._leave(State.FAULT, why, "error")
+            return actions + self._leave(SteeringState.FAULT, why, "error")
         return actions + self._ask() + self._use_tip()
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
@@ -206,7 +206,7 @@ class Steering:
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
-    def on_device(self, status: DeviceStatus) -> list[Action]:
+    def on_device(self, status: DeviceReport) -> list[Action]:
         """Take the driver's state."""
         self._device = status
         actions = self._heard()
@@ -214,9 +214,9 @@ class Steering:
             return actions
         if status.state in _STOPPED_DEVICE:
             why = f"device is {status.state}: {status.reason}"
-            return actions + self._leave(State.FAULT, why, "error")
+            return actions + self._leave(SteeringState.FAULT, why, "error")
         if status.state in _DISABLED_DEVICE:
-            return actions + self._leave(State.IDLE, f"device is {status.state}", "warning")
+            return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
             actions += self._ask()
         elif self.awaiting is Awaiting.DEVICE:
@@ -244,7 +244,7 @@ class Steering:
 
     @property
     def _steering(self) -> bool:
-        return self.state in {State.STEERING, State.WAITING_FOR_TIP}
+        return self.state in {SteeringState.STEERING, SteeringState.WAITING_FOR_TIP}
 
     def _is_moving(self) -> bool:
         """Return whether the device says so, or the joints do since the last look."""
@@ -256,9 +256,9 @@ class Steering:
         if (refusal := self.intake.watch(steady, self.settings.tip_timeout)) is not None:
             self.watchdog_trips += 1
             actions = [*self._refuse(refusal), *self._use_tip()]
-        if waited < self.settings.tip_timeout or self.state is State.WAITING_FOR_TIP:
+        if waited < self.settings.tip_timeout or self.state is SteeringState.WAITING_FOR_TIP:
             return actions
-        self.state = State.WAITING_FOR_TIP
+        self.state = SteeringState.WAITING_FOR_TIP
         self.watchdog_trips += 1
         self.reason = f"no good tip for {self.settings.tip_timeout:g} s"
         if self._followed is not None:
@@ -276,7 +276,7 @@ class Steering:
                 f"no device/result for step {self.step + 1} in {timeout:g} s, and the device does "
                 "not move: the command or its answer is lost"
             )
-            return self._leave(State.FAULT, why, "error")
+            return self._leave(SteeringState.FAULT, why, "error")
         if self._patience.unheard(steady) < timeout or self.silence:
             return []
         # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
@@ -315,7 +315,7 @@ class Steering:
             return []
         why, is_enough = self._failed.unfollowed(watch.step, sample)
         if is_enough:
-            return self._leave(State.FAULT, why, "error")
+            return self._leave(SteeringState.FAULT, why, "error")
         self.reason = why
         return [Log("warning", why, "unfollowed")]
 
@@ -350,14 +350,14 @@ class Steering:
         )
         self.reason = "; ".join(update.estimate.warnings)
         actions: list[Action] = [PublishUpdate(tip.stamp_ns, update)]
-        if self.state is State.WAITING_FOR_TIP:
-            self.state = State.STEERING
+        if self.state is SteeringState.WAITING_FOR_TIP:
+            self.state = SteeringState.STEERING
             actions.append(Log("info", "STEERING: a good tip came"))
         rate = float(update.command.rotation_rate)
         self._ready_step = next_step(tip.stamp_ns, joints, rate, settings)
         if self._ready_step is None:
             text = f"insertion {joints.insertion:.6g} m reached"
-            return actions + self._leave(State.DONE, text, "info")
+            return actions + self._leave(SteeringState.DONE, text, "info")
         return actions + self._send()
 
     def _send(self) -> list[Action]:
@@ -400,7 +400,7 @@ class Steering:
         why = self._retraction.obstacle if away else f"the clock of joint_states went {gap:.4g} s"
         if not self._steering:
             return [Log("warning", why)]
-        return self._leave(State.IDLE, why, "warning")
+        return self._leave(SteeringState.IDLE, why, "warning")
 
     def _end_by_retraction(self, sample: JointSample) -> list[Action]:
         self.control.restart()
@@ -408,9 +408,9 @@ class Steering:
         if not self._steering:
             return []
         why = f"needle retracted to {sample.insertion:.4g} m: draw it out before steering again"
-        return self._leave(State.IDLE, why, "warning")
+        return self._leave(SteeringState.IDLE, why, "warning")
 
-    def _leave(self, state: State, reason: str, severity: str) -> list[Action]:
+    def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason
         self.awaiting = Awaiting.NOTHING
         self._patience.silence = ""

@@ -11,7 +11,7 @@ TIP_COVARIANCES = ("configured", "from_tip_pose")
 """Where a tip's covariance comes from."""
 
 
-class State(enum.Enum):
+class SteeringState(enum.Enum):
     """The controller's states."""
 
     IDLE = "IDLE"
@@ -71,7 +71,7 @@ class SteeringSettings:
 
 
 @dataclasses.dataclass(frozen=True)
-class DeviceStatus:
+class DeviceReport:
     """What the driver says of itself.
 
     Attributes
@@ -131,7 +131,7 @@ Action = SendStep | PublishUpdate | Log
 
 
 @dataclasses.dataclass(frozen=True)
-class Reply:
+class StartReply:
     """Answer to a service call."""
 
     success: bool

@@ -26,13 +26,13 @@ from needle_controller.observers.estimator import Estimate
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import ControlUpdate
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import DeviceStatus, SendStep, State
+from needle_controller.protocol.steering_types import DeviceReport, SendStep, SteeringState
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import TipMeasurement
 
 TARGET_PLANE = "target_plane"
 INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
-_LEVELS = {State.FAULT: Level.ERROR, State.WAITING_FOR_TIP: Level.WARN}
+_LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
 
 
 def to_joint_sample(message: JointState, sent_ns: int) -> JointSample:
@@ -91,10 +91,10 @@ def to_plane(message: PoseStamped) -> TargetPlane:
     return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
 
 
-def to_device_status(message: DiagnosticStatus) -> DeviceStatus:
+def to_device_status(message: DiagnosticStatus) -> DeviceReport:
     """Return what the protocol needs of device/status."""
     values = values_of(message)
-    return DeviceStatus(
+    return DeviceReport(
         state=values.get("state", ""),
         homed=values.get("homed", "").lower() == "true",
         hold_owner=values.get("hold_owner", ""),

@@ -46,7 +46,13 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_controller.protocol.heard_messages import HeardMessages
-from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendStep, State
+from needle_controller.protocol.steering_types import (
+    Action,
+    Log,
+    PublishUpdate,
+    SendStep,
+    SteeringState,
+)
 from needle_controller.ros import conversions
 from needle_controller.ros.parameters import PlaneControllerParameters
 
@@ -187,7 +193,7 @@ class PlaneControllerNode(WholeNode):
 
     def _waits_for(self) -> list[str]:
         missing = list(dict.fromkeys(self._missing() + unpublished(self, self._sources)))
-        if missing or self._steering.state is not State.IDLE:
+        if missing or self._steering.state is not SteeringState.IDLE:
             return missing
         return [f"service call {self.resolve_service_name('~/start')}"]
 

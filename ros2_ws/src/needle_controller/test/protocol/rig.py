@@ -11,18 +11,18 @@ from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceStatus,
+    DeviceReport,
     Log,
     SendStep,
-    State,
+    SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
 from needle_controller.ros.parameters import PlaneControllerParameters
 
 TICK = 20_000_000
-HELD = DeviceStatus("HOLDING", True, "operator")
-MOVING = DeviceStatus("MOVING", True, "operator")
-FREE = DeviceStatus("HOLDING", True, "")
+HELD = DeviceReport("HOLDING", True, "operator")
+MOVING = DeviceReport("MOVING", True, "operator")
+FREE = DeviceReport("HOLDING", True, "")
 
 
 class Rig:
@@ -98,5 +98,5 @@ def logged(actions: list[Action]) -> str:
     return "; ".join(action.text for action in actions if isinstance(action, Log))
 
 
-def where(rig: Rig) -> tuple[State, Awaiting]:
+def where(rig: Rig) -> tuple[SteeringState, Awaiting]:
     return rig.steering.state, rig.steering.awaiting

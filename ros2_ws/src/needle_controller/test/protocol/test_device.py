@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from needle_controller.protocol.failed_steps import MOST_REFUSALS
-from needle_controller.protocol.steering_types import Awaiting, DeviceStatus, State
+from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
 
 from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
@@ -26,7 +26,7 @@ def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
     actions = rig.steering.on_time(99.0 + timeout)
     assert none_sent(actions)
     assert "no device/result for step 1" in logged(actions)
-    assert where(rig) == (State.FAULT, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_result(step.stamp_ns, "succeeded") == []
     assert rig.expose() == []
@@ -47,7 +47,7 @@ def test_a_slow_step_of_a_device_that_never_says_moving_is_no_lost_answer() -> N
         rig.joints()
         assert rig.steering.on_time(0.1 * tenth) == []
     rig.run(step)
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
 
 
 def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> None:
@@ -58,7 +58,7 @@ def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> 
     said = logged(rig.steering.on_time(rig.steering.settings.result_timeout))
     assert "nothing heard of the device" in said
     assert rig.steering.silence
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
     assert rig.steering.on_time(1e3) == []
     rig.run(step)
     assert not rig.steering.silence
@@ -76,7 +76,7 @@ def test_a_retraction_ends_steering_until_the_needle_is_out() -> None:
     rig.now += TICK
     rig.insertion -= 0.0002
     assert "retracted" in logged(rig.settle())
-    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     assert "retracted" in rig.steering.on_start()[0].message
     rig.insertion = 0.004
     rig.settle()
@@ -103,13 +103,13 @@ def test_stop_and_start_go_on_with_what_is_known() -> None:
 @pytest.mark.parametrize(
     ("device", "state"),
     [
-        (DeviceStatus("FAULT", True, "", "following error"), State.FAULT),
-        (DeviceStatus("ESTOPPED", True, "", "pressed"), State.FAULT),
-        (DeviceStatus("DISABLED", True, ""), State.IDLE),
-        (DeviceStatus("UNCONFIGURED", False, ""), State.IDLE),
+        (DeviceReport("FAULT", True, "", "following error"), SteeringState.FAULT),
+        (DeviceReport("ESTOPPED", True, "", "pressed"), SteeringState.FAULT),
+        (DeviceReport("DISABLED", True, ""), SteeringState.IDLE),
+        (DeviceReport("UNCONFIGURED", False, ""), SteeringState.IDLE),
     ],
 )
-def test_a_device_that_stops_ends_steering(device: DeviceStatus, state: State) -> None:
+def test_a_device_that_stops_ends_steering(device: DeviceReport, state: SteeringState) -> None:
     rig = Rig()
     step = sent(rig.expose())
     actions = rig.steering.on_device(device)
@@ -124,10 +124,10 @@ def test_a_device_that_stops_ends_steering(device: DeviceStatus, state: State) -
 def test_commands_that_never_move_end_in_a_fault() -> None:
     rig = Rig()
     for _ in range(MOST_REFUSALS):
-        assert rig.steering.state is State.STEERING
+        assert rig.steering.state is SteeringState.STEERING
         step = sent(rig.expose())
         actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
-    assert where(rig) == (State.FAULT, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
     assert "beyond a limit" in logged(actions)
 
 

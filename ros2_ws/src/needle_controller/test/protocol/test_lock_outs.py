@@ -9,7 +9,7 @@ import pytest
 
 from needle_controller.protocol.failed_steps import MOST_UNFOLLOWED
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
-from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, State
+from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, SteeringState
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
 
 from .rig import HELD, TICK, Rig, logged, none_sent, sent, where
@@ -123,10 +123,10 @@ def test_a_spike_in_joint_states_stops_nothing(spike: tuple[int, float, float], 
     )
     if step is not None:
         rig.run(step)
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
     rig.run(good_tips(rig))
     steps(rig, 5)
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
 
 
 def test_joints_that_jumped_and_came_back_need_no_drawing_out() -> None:
@@ -135,7 +135,7 @@ def test_joints_that_jumped_and_came_back_need_no_drawing_out() -> None:
     deep = rig.insertion
     rig.insertion = 0.005
     assert "jumped from 0.015 m" in logged(rig.settle(CONFIRMED_BY))
-    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     assert "draw the needle out" in rig.steering.on_start()[0].message
     rig.insertion = deep
     rig.settle(CONFIRMED_BY)
@@ -167,7 +167,7 @@ def test_a_clock_that_went_back_is_a_stop_and_a_start() -> None:
     steps(rig, 5)
     rig.now -= 50 * SECOND
     assert "clock" in logged(rig.settle(CONFIRMED_BY))
-    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     assert rig.steering.on_start()[0].success
     rig.run(good_tips(rig))
     assert rig.steering.step == 6
@@ -178,7 +178,7 @@ def test_joints_that_were_silent_go_on() -> None:
     steps(rig, 5)
     rig.now += 100 * SECOND
     rig.settle(CONFIRMED_BY)
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
     good_tips(rig)
 
 
@@ -187,14 +187,14 @@ def test_steps_that_the_joints_do_not_follow_are_a_fault(share: float) -> None:
     rig = Rig()
     steps(rig, 3)
     count = 0
-    while rig.steering.state is State.STEERING:
+    while rig.steering.state is SteeringState.STEERING:
         rig.run(good_tips(rig), part=share)
         said = logged(rig.settle())
         count += 1
         assert count <= MOST_UNFOLLOWED
     assert count == MOST_UNFOLLOWED
     assert "said to have succeeded" in said
-    assert where(rig) == (State.FAULT, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
     assert rig.steering.step == 3
     # A person has looked after it.
     assert rig.steering.on_start()[0].success
@@ -208,7 +208,7 @@ def test_a_step_that_was_followed_forgets_those_that_were_not() -> None:
         rig.run(good_tips(rig), part=0.5)
         rig.settle()
         rig.run(good_tips(rig))
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
 
 
 def test_nothing_is_sent_from_a_tip_exposed_before_the_last_motion() -> None:

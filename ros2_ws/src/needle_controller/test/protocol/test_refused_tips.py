@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, Log, State
+from needle_controller.protocol.steering_types import Awaiting, Log, SteeringState
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
 
 from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
@@ -31,7 +31,7 @@ def test_a_refused_tip_moves_nothing_and_asks_for_another(
     assert rig.steering.tips_rejected == 1
     assert said in rig.steering.reason
     assert rig.steering.control.started == before
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     assert rig.steering.tip_after_ns == bad.stamp_ns
     sent(rig.expose())
     assert rig.steering.rejection == ""
@@ -55,7 +55,7 @@ def test_millimetres_are_a_jump_no_needle_makes() -> None:
 def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None:
     rig = Rig()
     step = sent(rig.expose())
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
     bad = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.1, 0.0, 1.0]))
     assert "from the entry point" in logged(rig.steering.on_tip(bad))
     assert rig.steering.tips_rejected == 1
@@ -94,16 +94,16 @@ def test_no_tip_in_time_waits_and_a_good_one_goes_on() -> None:
     timeout = rig.steering.settings.tip_timeout
     assert rig.steering.on_time(100.0) == []
     assert rig.steering.on_time(100.0 + 0.99 * timeout) == []
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     assert "no good tip" in logged(rig.steering.on_time(100.0 + timeout))
-    assert where(rig) == (State.WAITING_FOR_TIP, Awaiting.TIP)
+    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     assert rig.steering.watchdog_trips == 1
     assert rig.steering.on_time(100.0 + 3 * timeout) == []
     bad = TipMeasurement(rig.now + TICK, "rig", np.full(3, np.nan))
     rig.expose(bad)
-    assert where(rig) == (State.WAITING_FOR_TIP, Awaiting.TIP)
+    assert where(rig) == (SteeringState.WAITING_FOR_TIP, Awaiting.TIP)
     sent(rig.expose())
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
 
 
 def test_time_does_not_run_while_a_person_pauses() -> None:
@@ -118,7 +118,7 @@ def test_time_does_not_run_while_a_person_pauses() -> None:
     assert "nothing heard" in logged(rig.steering.on_time(2e6))
     rig.run(step)
     assert rig.steering.on_time(3e6) == []
-    assert rig.steering.state is State.STEERING
+    assert rig.steering.state is SteeringState.STEERING
 
 
 def test_a_tip_whose_joints_never_come_is_given_up() -> None:

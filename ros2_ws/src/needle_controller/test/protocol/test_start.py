@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import Awaiting, DeviceStatus, State
+from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
 
 from .rig import HELD, MOVING, Rig, sent, where
 
@@ -15,18 +15,18 @@ from .rig import HELD, MOVING, Rig, sent, where
     ("device", "said"),
     [
         (None, "device/status"),
-        (DeviceStatus("HOLDING", False, ""), "not homed"),
-        (DeviceStatus("DISABLED", True, ""), "not enabled"),
-        (DeviceStatus("ESTOPPED", True, ""), "not enabled"),
+        (DeviceReport("HOLDING", False, ""), "not homed"),
+        (DeviceReport("DISABLED", True, ""), "not enabled"),
+        (DeviceReport("ESTOPPED", True, ""), "not enabled"),
     ],
 )
-def test_start_says_why_not(device: DeviceStatus | None, said: str) -> None:
+def test_start_says_why_not(device: DeviceReport | None, said: str) -> None:
     rig = Rig(started=False)
     rig.steering._device = device
     reply, _ = rig.steering.on_start()
     assert not reply.success
     assert said in reply.message
-    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
 
 
 def test_start_needs_joints() -> None:
@@ -62,7 +62,7 @@ def test_start_twice_and_stop_twice() -> None:
     rig = Rig()
     assert not rig.steering.on_start()[0].success
     assert rig.steering.on_stop()[0].success
-    assert where(rig) == (State.IDLE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.IDLE, Awaiting.NOTHING)
     assert rig.steering.on_stop()[0].success
 
 
@@ -75,11 +75,11 @@ def test_tips_move_nothing_while_idle() -> None:
     ("device", "said"),
     [
         (MOVING, "waiting for the device, which moves"),
-        (DeviceStatus("MOVING", False, ""), "waiting for the device, which moves"),
-        (DeviceStatus("HOLDING", True, "", "", 0.0, 0.0), "waiting for joint_states"),
+        (DeviceReport("MOVING", False, ""), "waiting for the device, which moves"),
+        (DeviceReport("HOLDING", True, "", "", 0.0, 0.0), "waiting for joint_states"),
     ],
 )
-def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) -> None:
+def test_a_start_waits_for_the_end_of_homing(device: DeviceReport, said: str) -> None:
     """The joints lag behind the device: homing has ended there, and not here."""
     rig = Rig(started=False, insertion=0.0015)
     rig.steering.on_device(device)
@@ -88,6 +88,6 @@ def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) ->
     assert reply.message.startswith(said)
     rig.insertion = 0.0
     rig.settle()
-    rig.steering.on_device(DeviceStatus("HOLDING", True, "operator", "", 0.0, 0.0))
+    rig.steering.on_device(DeviceReport("HOLDING", True, "operator", "", 0.0, 0.0))
     assert rig.steering.on_start()[0].success
     sent(rig.expose())

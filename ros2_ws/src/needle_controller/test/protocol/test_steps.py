@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Awaiting, PublishUpdate, State
+from needle_controller.protocol.steering_types import Awaiting, PublishUpdate, SteeringState
 from needle_controller.protocol.tip_gate import TipMeasurement
 
 from .rig import FREE, HELD, MOVING, TICK, Rig, none_sent, sent, where
@@ -14,10 +14,10 @@ from .rig import FREE, HELD, MOVING, TICK, Rig, none_sent, sent, where
 
 def test_start_without_hold_asks_for_no_tip_until_somebody_holds() -> None:
     rig = Rig(held=False)
-    assert where(rig) == (State.STEERING, Awaiting.HOLD)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
     assert none_sent(rig.expose())
     assert rig.steering.on_device(HELD) == []
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     # The tip seen before the hold is not used, a new one is asked for.
     assert rig.steering.tip_after_ns == rig.now
     sent(rig.expose())
@@ -25,7 +25,7 @@ def test_start_without_hold_asks_for_no_tip_until_somebody_holds() -> None:
 
 def test_a_tip_leads_to_one_step() -> None:
     rig = Rig()
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     actions = rig.expose()
     step = sent(actions)
     assert step.stamp_ns == rig.now
@@ -37,7 +37,7 @@ def test_a_tip_leads_to_one_step() -> None:
     update = next(action for action in actions if isinstance(action, PublishUpdate))
     assert update.stamp_ns == rig.now
     assert update.update.estimate.reduced[0] == pytest.approx(-0.003)
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
     # One tip, one step.
     assert none_sent(rig.expose())
 
@@ -47,7 +47,7 @@ def test_a_finished_step_asks_for_a_tip_exposed_after_its_end() -> None:
     step = sent(rig.expose())
     assert none_sent(rig.run(step))
     end = rig.now
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     assert rig.steering.step == 1
     assert rig.steering.tip_after_ns == end
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
@@ -79,7 +79,7 @@ def test_a_tip_waits_for_its_joints() -> None:
     rig = Rig()
     rig.now += TICK
     assert rig.steering.on_tip(rig.measured()) == []
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     step = sent(rig.joints())
     rig.run(step)
     # Joints interpolated at the exposure, between two samples.
@@ -93,9 +93,9 @@ def test_a_step_waits_for_a_device_that_still_says_moving() -> None:
     rig = Rig()
     rig.steering.on_device(MOVING)
     assert none_sent(rig.expose())
-    assert where(rig) == (State.STEERING, Awaiting.DEVICE)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.DEVICE)
     sent(rig.steering.on_device(HELD))
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
 
 
 def test_a_hold_lost_before_the_step_asks_for_a_fresh_tip() -> None:
@@ -103,9 +103,9 @@ def test_a_hold_lost_before_the_step_asks_for_a_fresh_tip() -> None:
     rig.steering.on_device(MOVING)
     rig.expose()
     assert none_sent(rig.steering.on_device(FREE))
-    assert where(rig) == (State.STEERING, Awaiting.HOLD)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
     assert none_sent(rig.steering.on_device(HELD))
-    assert where(rig) == (State.STEERING, Awaiting.TIP)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     assert rig.steering.tip_after_ns == rig.now
     sent(rig.expose())
 
@@ -115,7 +115,7 @@ def test_an_aborted_step_resumes_from_where_the_joints_are() -> None:
     step = sent(rig.expose())
     rig.steering.on_device(FREE)
     rig.run(step, part=0.3, text="aborted: hold released")
-    assert where(rig) == (State.STEERING, Awaiting.HOLD)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
     assert rig.steering.step == 0
     assert "hold released" in rig.steering.reason
     assert none_sent(rig.expose())
@@ -149,20 +149,20 @@ def test_answers_to_other_commands_are_not_ours() -> None:
     rig = Rig()
     step = sent(rig.expose())
     assert rig.steering.on_result(step.stamp_ns - 1, "succeeded") == []
-    assert where(rig) == (State.STEERING, Awaiting.RESULT)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
 
 
 def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     rig = Rig(depth=0.0025)
     ends = []
-    while rig.steering.state is State.STEERING:
+    while rig.steering.state is SteeringState.STEERING:
         actions = rig.expose()
-        if rig.steering.state is State.STEERING:
+        if rig.steering.state is SteeringState.STEERING:
             step = sent(actions)
             ends.append((step.insertion, step.duration))
             rig.run(step)
     np.testing.assert_allclose(ends, [(0.001, 0.5), (0.002, 0.5), (0.0025, 0.25)])
     assert ends[-1][0] == 0.0025
-    assert where(rig) == (State.DONE, Awaiting.NOTHING)
+    assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
     assert rig.steering.insertion == 0.0025
     assert not rig.steering.on_start()[0].success

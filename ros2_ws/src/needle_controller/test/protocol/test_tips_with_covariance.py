@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from needle_controller.model.target_plane import plane_from_pose
-from needle_controller.protocol.steering_types import Action, PublishUpdate, State
+from needle_controller.protocol.steering_types import Action, PublishUpdate, SteeringState
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
 
@@ -124,7 +124,7 @@ def test_a_source_of_tips_alone_is_told_what_to_set() -> None:
     rig.steering.on_time(0.0)
     assert rig.steering.on_time(1.9) == []
     rig.steering.on_time(2.0)
-    assert rig.steering.state is State.WAITING_FOR_TIP
+    assert rig.steering.state is SteeringState.WAITING_FOR_TIP
     assert "set it to configured" in rig.steering.reason
     assert rig.steering.intake.refused == {Fault.NO_COVARIANCE: 1}
 

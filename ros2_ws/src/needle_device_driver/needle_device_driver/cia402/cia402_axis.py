@@ -59,7 +59,7 @@ class Cia402Axis(Axis):
         As given.
     monitor : DriveMonitor
         What the drive sends.
-    lacking : tuple of str
+    missing_optional_objects : tuple of str
         What the drive lacks that it could be set up without.
     """
 
@@ -73,7 +73,7 @@ class Cia402Axis(Axis):
         self._period = period
         self._watchdog = watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
-        self.lacking: tuple[str, ...] = ()
+        self.missing_optional_objects: tuple[str, ...] = ()
         self._machine = DriveMachine(
             settings.magnitude(settings.tolerance), period, self.monitor.feedback
         )
@@ -363,7 +363,9 @@ class Cia402Axis(Axis):
             self._homed = False
             self._origin += 1
         self.monitor.begin_set_up()
-        self.lacking = set_up(self._link, self._settings, period=self._period, homed=self._homed)
+        self.missing_optional_objects = set_up(
+            self._link, self._settings, period=self._period, homed=self._homed
+        )
         self._limits_due = False
         await_start(self._link, self.monitor, self._settings, self._period)
         arm_watchdog(self._link, self._settings, self._watchdog)

@@ -38,9 +38,13 @@ class DriveCycle:
         self._paused = 0
 
     @property
-    def lacking(self) -> tuple[str, ...]:
+    def missing_optional_objects(self) -> tuple[str, ...]:
         """What the drives lack that they could be set up without."""
-        return tuple(f"{axis.name} drive {text}" for axis in self._axes for text in axis.lacking)
+        return tuple(
+            f"{axis.name} drive {text}"
+            for axis in self._axes
+            for text in axis.missing_optional_objects
+        )
 
     @property
     def needs_cycles(self) -> bool:

@@ -74,19 +74,19 @@ def set_up(
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
     # Not while this set-up keeps the loop from its heartbeat.
     access.write(od.CONSUMER_HEARTBEAT, 0)
-    lacking: list[str] = []
+    missing: list[str] = []
     if settings.actuated:
-        lacking += _set_up_motion(link, access, settings, period)
+        missing += _set_up_motion(link, access, settings, period)
         write_limits(access, settings, homed=homed)
         map_pdo(access, node, od.COMMAND)
         map_pdo(access, node, od.SET_POINT)
-    lacking += _map_status(access, node)
+    missing += _map_status(access, node)
     map_pdo(access, node, od.POSITION)
     silence_unused(access)
     access.offer(od.CYCLE_PERIOD, round(period * 1e6))
     access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
     link.send(od.NMT, bytes([od.NMT_START, node]))
-    return tuple(lacking)
+    return tuple(missing)
 
 
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> None:
@@ -154,8 +154,8 @@ def _set_up_motion(
     ]
     if settings.max_torque > 0.0:
         wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.ROUNDED))
-    lacking = (_set(access, entry, value, need) for entry, value, need in wanted)
-    return [text for text in lacking if text]
+    missing = (_set(access, entry, value, need) for entry, value, need in wanted)
+    return [text for text in missing if text]
 
 
 def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
@@ -170,7 +170,7 @@ def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
         else:
             access.write(entry, value)
     except DriveRefusalError as error:
-        if error.lacking:
+        if error.object_is_missing:
             return _LEFT_OUT.format(entry)
         if need is not _Need.WISH:
             raise

@@ -33,7 +33,7 @@ class DriveRefusalError(DriveError):
         self.code = code
 
     @property
-    def lacking(self) -> bool:
+    def object_is_missing(self) -> bool:
         """Whether the drive does not have the entry at all."""
         return self.code in _NO_SUCH_OBJECT
 
@@ -136,7 +136,7 @@ class ObjectAccess:
         try:
             self.read(entry)
         except DriveRefusalError as error:
-            if error.lacking:
+            if error.object_is_missing:
                 return False
             raise
         return True

@@ -19,7 +19,7 @@ from needle_device_driver.supervisor.command import (
     CommandPoint,
 )
 from needle_device_driver.supervisor.hold import HoldMessage
-from needle_device_driver.supervisor.reports import DeviceStatus, JointSample, StepResult
+from needle_device_driver.supervisor.reports import DeviceStatus, MeasuredJoints, StepResult
 from needle_device_driver.supervisor.states import State
 
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
@@ -51,7 +51,7 @@ def to_hold_message(message: Joy) -> HoldMessage:
     )
 
 
-def to_joint_state(joints: JointSample, stamp: Time) -> JointState:
+def to_joint_state(joints: MeasuredJoints, stamp: Time) -> JointState:
     """Return measured joints as a message."""
     message = JointState(
         name=[INSERTION_JOINT, ROTATION_JOINT],

@@ -299,7 +299,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             self._refusal = why_not
             self.get_logger().error(f"not configured: {why_not}")
             return TransitionCallbackReturn.FAILURE
-        for text in self._drives.lacking:
+        for text in self._drives.missing_optional_objects:
             self.get_logger().warning(text)
         self._tell_health()
         return TransitionCallbackReturn.SUCCESS

@@ -7,12 +7,12 @@ from collections.abc import Callable
 from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.axis_rules import axes_problem
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import MotionRun
 from needle_device_driver.supervisor.reports import SUCCEEDED, Event, Notice, StepResult
+from needle_device_driver.supervisor.retraction_bound import RetractionBound
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
-from needle_device_driver.supervisor.watch import axes_problem
-from needle_device_driver.supervisor.way_out import WayOut
 
 _WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
 
@@ -59,7 +59,7 @@ class DeviceCore:
         self._limits = limits
         self._feedback_delay = feedback_delay
         self._on_stop = on_stop
-        self._way_out = WayOut(limits.max_depth)
+        self._retraction_bound = RetractionBound(limits.max_depth)
         self._run: MotionRun | None = None
         self._homing_time = 0.0
         self._seen_powered = False
@@ -86,7 +86,7 @@ class DeviceCore:
         if self.snapshot is None:
             return 0.0
         insertion = self.snapshot.insertion
-        return insertion.position - self._way_out.target(insertion)
+        return insertion.position - self._retraction_bound.target(insertion)
 
     def notice(self, text: str, rule: Rule | None = None) -> None:
         """Tell a person something once."""
@@ -240,7 +240,7 @@ class DeviceCore:
     def poll(self, now: float) -> PairSnapshot:
         """Read the axes."""
         self.snapshot = self._axes.poll(now)
-        self._way_out.note(self.snapshot.insertion)
+        self._retraction_bound.note(self.snapshot.insertion)
         return self.snapshot
 
     def watch_axes(self, now: float) -> None:

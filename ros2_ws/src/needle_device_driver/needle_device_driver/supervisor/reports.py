@@ -120,7 +120,7 @@ class DeviceStatus:
 
 
 @dataclasses.dataclass(frozen=True)
-class JointSample:
+class MeasuredJoints:
     """Measured joints: insertion [m], rotation [rad] and their velocities."""
 
     insertion: float

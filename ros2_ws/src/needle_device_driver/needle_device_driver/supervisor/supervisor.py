@@ -8,15 +8,15 @@ from needle_common.foreign_text import plain
 from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.axis_rules import axes_problem
 from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
 from needle_device_driver.supervisor.command_stamps import CommandStamps
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage, HoldRefusals
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import INNER_SWITCH
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, JointSample, Reply
+from needle_device_driver.supervisor.reports import DeviceStatus, Event, MeasuredJoints, Reply
 from needle_device_driver.supervisor.states import Activity, State, Trigger
-from needle_device_driver.supervisor.watch import axes_problem
 
 _SWITCHING = "waiting for the axes to switch off"
 
@@ -87,12 +87,12 @@ class MotionSupervisor:
         """Return what happened since the last call."""
         return self._core.take_events()
 
-    def joints(self, now: float) -> JointSample | None:
+    def joints(self, now: float) -> MeasuredJoints | None:
         """Return the measured joints; None when there is no reply within the age limit."""
         snapshot = self._core.snapshot
         if snapshot is None or snapshot.age(now) > self._limits.reply_age_limit:
             return None
-        return JointSample(
+        return MeasuredJoints(
             snapshot.insertion.position,
             snapshot.rotation.position,
             snapshot.insertion.velocity,

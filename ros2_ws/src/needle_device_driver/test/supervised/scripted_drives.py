@@ -36,7 +36,7 @@ class ScriptedDrive:
             for index, cob_id in ((0x1400, 0x200), (0x1800, 0x40000180)):
                 value = off + cob_id + 0x100 * number + node
                 self.objects[index + number, 1] = value.to_bytes(4, "little")
-        self.lacking: set[int] = set()
+        self.missing_objects: set[int] = set()
         # Of a write: the abort code, or 0; what the drive makes of it.
         self.refuses: Callable[[int, int, bytes], int] = lambda index, sub, value: 0
         self.stores: Callable[[int, bytes], bytes] = lambda index, value: value
@@ -178,7 +178,7 @@ class ScriptedDrive:
         size = 4 - (data[0] >> 2 & 3)
         written = data[0] != 0x40
         code = self.refuses(index, sub, data[4 : 4 + size]) if written else 0
-        if index in self.lacking:
+        if index in self.missing_objects:
             code = 0x0602_0000
         if code:
             self.say(0x580, b"\x80" + head + code.to_bytes(4, "little"))

@@ -165,9 +165,9 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
 
 
 def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> None:
-    drive_bench.insertion.lacking = {0x1006, 0x1029, 0x6007, 0x60C2}
+    drive_bench.insertion.missing_objects = {0x1006, 0x1029, 0x6007, 0x60C2}
     assert drive_bench.supervisor.configure(drive_bench.clock()).success
-    assert [text.partition(":")[0] for text in drive_bench.drives.lacking] == [
+    assert [text.partition(":")[0] for text in drive_bench.drives.missing_optional_objects] == [
         "insertion drive has no 0x6007",
         "insertion drive has no 0x60C2",
         "insertion drive has no 0x60C2",
@@ -176,10 +176,10 @@ def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> 
 
 def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: DriveBench) -> None:
     bench = drive_bench
-    bench.insertion.lacking = {0x60FD}
+    bench.insertion.missing_objects = {0x60FD}
     bench.insertion.status_size = 3
     bench.ready()
-    assert "no digital inputs" in bench.drives.lacking[0]
+    assert "no digital inputs" in bench.drives.missing_optional_objects[0]
     bench.cycle(1, holding=True)
     bench.step()
     bench.cycle(30, holding=True)
@@ -187,7 +187,7 @@ def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: Drive
 
 
 def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: DriveBench) -> None:
-    drive_bench.insertion.lacking = {0x1016}
+    drive_bench.insertion.missing_objects = {0x1016}
     reply = drive_bench.supervisor.configure(drive_bench.clock())
     assert "refuses to write 0 to 0x1016:1 consumer heartbeat time" in reply.message
 

@@ -42,7 +42,7 @@ def sdo_count(bench: DriveBench, request: str) -> int:
 def test_a_setting_that_a_drive_keeps_for_itself_is_told(drive_bench: DriveBench) -> None:
     drive_bench.insertion.refuses = refuse(RANGE, 0x605B, 0x607F, 0x609A, 0x1029, 0x1006)
     steps(drive_bench)
-    assert [text.partition(":")[0] for text in drive_bench.drives.lacking] == [
+    assert [text.partition(":")[0] for text in drive_bench.drives.missing_optional_objects] == [
         "insertion drive keeps its own 0x605B",
         "insertion drive keeps its own 0x607F",
         "insertion drive keeps its own 0x609A",
@@ -213,7 +213,7 @@ def test_digital_inputs_that_cannot_be_mapped_are_done_without(drive_bench: Driv
     drive.status_size = 3
     steps(drive_bench)
     assert drive.objects[0x1A00, 0] == b"\x02"
-    assert "no digital inputs" in drive_bench.drives.lacking[0]
+    assert "no digital inputs" in drive_bench.drives.missing_optional_objects[0]
 
 
 def test_an_answer_that_is_one_sync_old_does_not_bring_a_fault_back(
@@ -297,7 +297,7 @@ def test_a_fault_that_stays_in_a_drive_without_error_code_is_told_all_the_same(
     bench = drive_bench
     bench.configured()
     drive = bench.insertion
-    drive.state, drive.deaf_to_reset, drive.lacking = "fault", True, {0x603F}
+    drive.state, drive.deaf_to_reset, drive.missing_objects = "fault", True, {0x603F}
     bench.cycle(1)
     sdo = drive.sdo
 

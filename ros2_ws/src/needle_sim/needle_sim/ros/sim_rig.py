@@ -33,9 +33,9 @@ from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.lock_step import Action, LockStep
 from needle_sim.rig.pace import Pace
 from needle_sim.ros.conversions import to_truth
-from needle_sim.ros.driven_device import DrivenDevice
-from needle_sim.ros.own_device import OwnDevice
+from needle_sim.ros.drive_follower import DriveFollower
 from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.ros.simulated_device import SimulatedDevice
 from needle_sim.ros.simulated_sensors import SimulatedCameras, SimulatedTips
 
 HELP = """\
@@ -111,9 +111,9 @@ class SimRigNode(WholeNode):
         self._clock_publisher = self.create_publisher(Clock, "/clock", RELIABLE)
         self._truth = self.create_publisher(PoseStamped, "sim/tip_pose", RELIABLE)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._device: OwnDevice | DrivenDevice
+        self._device: SimulatedDevice | DriveFollower
         if values.level == "drive":
-            self._device = DrivenDevice(
+            self._device = DriveFollower(
                 self,
                 self._diagnostics,
                 self._bench,
@@ -121,7 +121,7 @@ class SimRigNode(WholeNode):
                 on_step_end=self._on_step_end,
             )
         else:
-            self._device = OwnDevice(
+            self._device = SimulatedDevice(
                 self,
                 self._diagnostics,
                 self._bench,

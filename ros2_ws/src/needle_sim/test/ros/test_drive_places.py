@@ -5,7 +5,7 @@ import math
 import pytest
 from sensor_msgs.msg import JointState
 
-from needle_sim.ros.driven_device import places_of
+from needle_sim.ros.drive_follower import places_of
 
 JOINTS = ["insertion_joint", "rotation_joint"]
 

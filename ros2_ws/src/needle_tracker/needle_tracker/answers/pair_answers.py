@@ -46,7 +46,7 @@ class RollEstimate:
 
 
 @dataclasses.dataclass(frozen=True)
-class AnsweringSettings:
+class PairingSettings:
     """What is told beside the tracker's own settings.
 
     Attributes
@@ -98,7 +98,7 @@ class PairAnswers:
         The stereo rig.
     tracker : TrackerSettings
         The tracker's settings.
-    settings : AnsweringSettings
+    settings : PairingSettings
         What else is told.
     """
 
@@ -106,7 +106,7 @@ class PairAnswers:
         self,
         calibration: StereoCalibration,
         tracker: TrackerSettings,
-        settings: AnsweringSettings,
+        settings: PairingSettings,
     ) -> None:
         self.tracker = StereoTracker(calibration, tracker)
         self.tracker.warm_up()

@@ -13,9 +13,9 @@ from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_co
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
 from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
-from needle_tracker.calibrating.calibration_doubts import doubts, misfits, square_error
 from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
 from needle_tracker.calibrating.calibration_file import save_calibration
+from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error
 from needle_tracker.calibrating.calibration_session import load_session
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate

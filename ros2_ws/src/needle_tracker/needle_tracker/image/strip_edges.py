@@ -30,7 +30,7 @@ _BOTH, _ONE, _FULL = 0.6, 0.2, 1.0
 _LOOK_COLUMNS = 2  # an edge is so near where the needle's width has it
 _PEAK_COLUMNS, _PEAK_SHARE = 6, 0.4
 # What lies beside an edge, so far and so wide [columns], is something if it is so dark, or bright.
-_BESIDE_FROM, _BESIDE_COLUMNS, _SOMETHING = 1.6, 4, 0.15
+_BESIDE_FROM, _BESIDE_COLUMNS, _LEAST_CONTRAST_BESIDE = 1.6, 4, 0.15
 
 
 @compiled
@@ -105,7 +105,7 @@ def is_something(level: Array, place: float, half: float, side: int) -> bool:
     for k in range(_BESIDE_COLUMNS):
         column = place + side * (half + _BESIDE_FROM + k)
         beside += abs(between(level, column)) / _BESIDE_COLUMNS
-    return beside > _SOMETHING
+    return beside > _LEAST_CONTRAST_BESIDE
 
 
 @compiled

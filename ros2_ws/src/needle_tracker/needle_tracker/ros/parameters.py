@@ -6,7 +6,7 @@ import dataclasses
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
-from needle_tracker.answers.pair_answers import AnsweringSettings
+from needle_tracker.answers.pair_answers import PairingSettings
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.calibration import Phantom
 from needle_tracker.tracking.gates import GateSettings
@@ -157,9 +157,9 @@ class StereoTrackerParameters:
                 f"lost_after = {self.lost_after} is above forget_after = {self.forget_after}"
             )
 
-    def answering_settings(self) -> AnsweringSettings:
+    def answering_settings(self) -> PairingSettings:
         """Return how pairs are made and answered."""
-        return AnsweringSettings(
+        return PairingSettings(
             pair_tolerance_ns=round(self.pair_tolerance * 1e9),
             joint_timeout=self.joint_timeout,
             lean=self.lean,

@@ -26,14 +26,14 @@ from needle_tracker.image.tip_fit import ImageTip, fit_tip, hidden
 from needle_tracker.optics.calibration import SIDES
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import (
-    UsualVisibility,
+    VisibilityAverage,
     is_half_sound,
     is_sound,
     look_alike,
     shows_lines,
-    sights_against,
-    sights_for,
-    sights_of_excluded,
+    sights_to_confirm,
+    sights_to_contradict,
+    sights_to_exclude,
 )
 from needle_tracker.tracking.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
 from needle_tracker.tracking.gates import DISAGREE_ALONG, UNCERTAIN
@@ -48,7 +48,7 @@ Last = tuple[ImageTip, ImageTip]
 UNCLEAR = "not clear enough to begin with"
 # A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
 # that is to say which of two ends is the needle's.
-_YOUNG, _YOUNG_SURPRISE, _YOUNG_NEAR = 15e-3, 9.0, 2.0
+_ENTRY_REGION, _ENTRY_SURPRISE, _ENTRY_NEAR = 15e-3, 9.0, 2.0
 _FROM_ENTRY = 25e-3  # up to here the entry says about where the end is [m]
 _FITTING = 9.0  # squared, over the covariance: place and direction of what one view guides to
 _AGREE = 1e-3  # two views that say the same do so along the needle, too [m]
@@ -70,7 +70,7 @@ class Acquisition:
         What else is known.
     track : Track
         What is known of the needle; contested tips are noted there.
-    usual : UsualVisibility
+    usual : VisibilityAverage
         How much it stands out.
     """
 
@@ -80,7 +80,7 @@ class Acquisition:
         detection: tuple[DetectionSettings, DetectionSettings],
         settings: TrackerSettings,
         track: Track,
-        usual: UsualVisibility,
+        usual: VisibilityAverage,
     ) -> None:
         self._follower = follower
         self._views = follower.views
@@ -278,10 +278,14 @@ class Acquisition:
         track, tip = self._track, measured.tip or measured.contested
         alike = self._usual.is_like(found)
         if tip is not None and track.is_excluded(tip, insertion):
-            return sights_of_excluded(track.state, found, alike=alike)
+            return sights_to_exclude(track.state, found, alike=alike)
         if measured.tip is None:
             refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
-            return sights_against(track.state, found, alike=alike, on_way=on_way) if refused else 0
+            return (
+                sights_to_contradict(track.state, found, alike=alike, on_way=on_way)
+                if refused
+                else 0
+            )
         if track.fits(measured.tip, insertion, on_way=False):
             return 0
         if self._is_borne_out(measured.tip, found, insertion, on_way=on_way):
@@ -289,7 +293,7 @@ class Acquisition:
         near = on_way and track.fits(measured.tip, insertion, on_way=True)
         if self._begins_at_entry(measured, insertion):
             return 0
-        return sights_for(
+        return sights_to_confirm(
             track.state,
             measured.image_tips,
             alike=alike,
@@ -316,14 +320,14 @@ class Acquisition:
         waits for its first tip to be found never gets to where it is seen better.
         """
         tip = measured.tip
-        if self._track.has_begun or insertion is None or insertion > _YOUNG or tip is None:
+        if self._track.has_begun or insertion is None or insertion > _ENTRY_REGION or tip is None:
             return False
         left, right = measured.image_tips
         if left is None or right is None:
             return False
         if not (shows_lines((left, right)) and look_alike(left, right)):
             return False
-        return self._entry_surprise(tip, insertion) < _YOUNG_SURPRISE
+        return self._entry_surprise(tip, insertion) < _ENTRY_SURPRISE
 
     def _entry_surprise(self, tip: SpatialTip, insertion: float) -> float:
         """Return how far a tip is from where the entry has it, squared, over the covariance."""
@@ -350,7 +354,7 @@ class Acquisition:
         return fitting[0][1] if fitting else None
 
     def _is_near_entry(self, tip: SpatialTip, insertion: float) -> bool:
-        return insertion <= _YOUNG and self._entry_surprise(tip, insertion) < _YOUNG_NEAR
+        return insertion <= _ENTRY_REGION and self._entry_surprise(tip, insertion) < _ENTRY_NEAR
 
     def _shaft_problem(
         self, paths: tuple[Path, Path], tip: SpatialTip, insertion: float | None

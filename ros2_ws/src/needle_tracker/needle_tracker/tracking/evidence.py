@@ -80,7 +80,7 @@ def look_alike(left: ImageTip, right: ImageTip) -> bool:
     return plainer <= (_DISTURBED_RATIO if disturbed else _VISIBILITY_RATIO) * fainter
 
 
-class UsualVisibility:
+class VisibilityAverage:
     """How much the needle stands out in both views while it is seen well."""
 
     def __init__(self) -> None:
@@ -148,7 +148,7 @@ def _hardly_known(tip: ImageTip) -> ImageTip:
     return dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, _UNLIKE_PX))
 
 
-def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:
+def sights_to_contradict(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:
     """Return how many sights in a row win against a track that contradicts them; 0 where none do.
 
     Parameters
@@ -170,7 +170,7 @@ def sights_against(state: TrackState, found: Found, *, alike: bool, on_way: bool
     return _SOUND_SIGHTS + (0 if alike else _MORE_UNLIKE) + (0 if sure else _MORE_TRACKING)
 
 
-def sights_of_excluded(state: TrackState, found: Found, *, alike: bool) -> int | None:
+def sights_to_exclude(state: TrackState, found: Found, *, alike: bool) -> int | None:
     """Return how many sights in a row say that an established track was wrong; None: none do.
 
     Parameters
@@ -186,7 +186,7 @@ def sights_of_excluded(state: TrackState, found: Found, *, alike: bool) -> int |
     return _EXCLUDED_SIGHTS if plain and state is TrackState.LOST else None
 
 
-def sights_for(
+def sights_to_confirm(
     state: TrackState, found: Found, *, alike: bool, possible: bool, near: bool, guided: bool
 ) -> int | None:
     """Return how many sights in a row are wanted of a tip that nothing contradicts.

@@ -17,7 +17,7 @@ from needle_tracker.image.detection import DetectionSettings, Image
 from needle_tracker.image.tip_fit import Expected, ImageTip, fit_expected, hidden
 from needle_tracker.optics.compiled_projection import point_jacobian, project_point
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import Anchor
 
 Array = NDArray[np.float64]

@@ -16,9 +16,9 @@ from needle_tracker.image.detection import Image
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.compiled_projection import point_jacobian, project_point
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.tracking.evidence import UsualVisibility
+from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.following import SLACK, Follower, is_sound, misfit
-from needle_tracker.tracking.tip_motion import TipMotion, across
+from needle_tracker.tracking.tip_prediction import TipMotion, across
 from needle_tracker.tracking.track import Anchor
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -35,7 +35,7 @@ def kept_up(
     images: tuple[Image, Image],
     predicted: Anchor,
     last: tuple[ImageTip, ImageTip],
-    usual: UsualVisibility,
+    usual: VisibilityAverage,
 ) -> tuple[TipMotion, Seen] | None:
     """Return the prediction with what single views bear out of it taken in, and what they see.
 
@@ -49,7 +49,7 @@ def kept_up(
         Where the tip must be now.
     last : pair of ImageTip
         How it was seen last.
-    usual : UsualVisibility
+    usual : VisibilityAverage
         How much it stands out.
 
     Returns

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.tracking.gates import UNCERTAIN, GateSettings, refusal
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ _CONFIRM_KNOWN = 2
 _CONFIRM_MISSES = 2  # so many pairs may lie between
 _EXPECTED, _NO_SURPRISE = 4.0, 9.0  # squared, over its covariance
 _NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
-_ABOUT = 1.5e-3  # what is known worse bears nothing out (one sigma) [m]
+_WORST_PREDICTION = 1.5e-3  # what is known worse bears nothing out (one sigma) [m]
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
@@ -128,7 +128,7 @@ class Track:
         motion = anchor.motion.advanced(ahead, self._settings.reach.curvature, anchor.unseen)
         return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
 
-    def keep_up(self, predicted: Anchor, motion: TipMotion) -> None:
+    def update_from_single_view(self, predicted: Anchor, motion: TipMotion) -> None:
         """Take what one view alone says of a needle that is not believed for the moment.
 
         Parameters
@@ -280,7 +280,7 @@ class Track:
     def expects(self, tip: SpatialTip, insertion: float | None) -> bool:
         """Return whether a tip is where it is most likely, and that is known about."""
         predicted = self.predict(insertion)
-        if predicted is None or predicted.motion.sigma > _ABOUT:
+        if predicted is None or predicted.motion.sigma > _WORST_PREDICTION:
             return False
         return _is_about(tip, predicted, _FAR, _EXPECTED)
 

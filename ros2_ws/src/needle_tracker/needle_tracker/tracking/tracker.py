@@ -16,7 +16,7 @@ from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.acquisition import Acquisition
-from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, UsualVisibility, is_sound
+from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, VisibilityAverage, is_sound
 from needle_tracker.tracking.following import (
     FOLLOW_AHEAD,
     PLAIN_ALONG_PX,
@@ -71,7 +71,7 @@ class StereoTracker:
         )
         self._shapes = tuple((camera.height, camera.width) for camera in cameras)
         self.track = Track(settings.gates)
-        self._usual = UsualVisibility()
+        self._usual = VisibilityAverage()
         self._acquisition = Acquisition(
             self._follower, self._detection, settings, self.track, self._usual
         )
@@ -140,7 +140,7 @@ class StereoTracker:
                 raise ValueError(f"{side} image is {image.dtype}{image.shape}, wants uint8{shape}")
         for side, image in zip(SIDES, images, strict=True):
             if int(image[::8, ::8].max()) < self.settings.min_contrast:
-                self._keep_up(images, insertion)
+                self._update_from_single_view(images, insertion)
                 return self.skip(f"{side} image is black")
         if insertion is not None and insertion < self.settings.entry_zone:
             self._last = None
@@ -163,7 +163,7 @@ class StereoTracker:
         self, measured: Measurement, images: tuple[Image, Image], insertion: float | None
     ) -> Measurement:
         """Note that both views together give no tip; return what single ones say."""
-        alone = self._keep_up(images, insertion)
+        alone = self._update_from_single_view(images, insertion)
         if measured.reason in (HIDDEN, UNCERTAIN):
             self.track.hide()
         else:
@@ -181,7 +181,7 @@ class StereoTracker:
             measured, tip=tip, contested=None, image_tips=seen, reason=reason
         )
 
-    def _keep_up(
+    def _update_from_single_view(
         self, images: tuple[Image, Image], insertion: float | None
     ) -> tuple[SpatialTip, Seen] | None:
         """Follow with one view what both together do not show; return its tip and what it sees."""
@@ -194,7 +194,7 @@ class StereoTracker:
         if kept is None:
             return None
         motion, seen = kept
-        self.track.keep_up(predicted, motion)
+        self.track.update_from_single_view(predicted, motion)
         self._last = self._steadied(seen[0] or last[0], seen[1] or last[1])
         if self._believed is None or not self.track.is_established:
             return None

@@ -17,13 +17,13 @@ from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking import acquisition
 from needle_tracker.tracking.evidence import (
-    UsualVisibility,
+    VisibilityAverage,
     is_half_sound,
     is_sound,
     shows_lines,
-    sights_against,
-    sights_for,
-    sights_of_excluded,
+    sights_to_confirm,
+    sights_to_contradict,
+    sights_to_exclude,
 )
 from needle_tracker.tracking.measurement import Measurement, judged
 from needle_tracker.tracking.track import Track, TrackState
@@ -52,19 +52,19 @@ def established(settings: TrackerSettings) -> Track:
 
 @pytest.mark.parametrize("state", [TrackState.TRACKING, TrackState.LOST])
 def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> None:
-    assert sights_against(state, (GOOD, GOOD), alike=True, on_way=True) > 1
-    unlike = sights_against(state, (GOOD, GOOD), alike=False, on_way=True)
+    assert sights_to_contradict(state, (GOOD, GOOD), alike=True, on_way=True) > 1
+    unlike = sights_to_contradict(state, (GOOD, GOOD), alike=False, on_way=True)
     assert unlike == (0 if state is TrackState.TRACKING else 3)
     long = dataclasses.replace(GOOD, sigma_along=2.5)
-    assert sights_against(state, (long, GOOD), alike=True, on_way=True) > 1
+    assert sights_to_contradict(state, (long, GOOD), alike=True, on_way=True) > 1
     longer = dataclasses.replace(GOOD, sigma_along=3.5)
     for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (longer, GOOD), (GOOD, None)):
-        assert sights_against(state, found, alike=True, on_way=True) == 0
+        assert sights_to_contradict(state, found, alike=True, on_way=True) == 0
 
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
     lost = TrackState.LOST
-    waiting = functools.partial(sights_for, possible=True, guided=False)
+    waiting = functools.partial(sights_to_confirm, possible=True, guided=False)
     assert waiting(lost, (GOOD, GOOD), alike=True, near=True) == 0
     assert waiting(lost, (GOOD, GOOD), alike=True, near=False) == 2
     assert waiting(lost, (GOOD, GOOD), alike=False, near=True) == 3
@@ -75,7 +75,7 @@ def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
 
 
 def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
-    waiting = functools.partial(sights_for, alike=False, near=True, guided=False)
+    waiting = functools.partial(sights_to_confirm, alike=False, near=True, guided=False)
     for state in (TrackState.TRACKING, TrackState.CONFIRMING):
         assert waiting(state, (GOOD, GOOD), possible=True) == 0
         assert waiting(state, (GOOD, GOOD), possible=False) == 2
@@ -123,7 +123,7 @@ def test_what_begins_at_the_entry_is_no_needle_that_has_begun(
 @pytest.mark.parametrize("plainer", [0.8, 1.3])
 def test_a_line_that_is_unlike_and_disturbed_may_be_half_another_s(plainer: float) -> None:
     """Half a shadow's where it is fainter than the needle, half a cable's where it is plainer."""
-    usual = UsualVisibility()
+    usual = VisibilityAverage()
     unlike = dataclasses.replace(GOOD, visibility=plainer * GOOD.visibility)
     mixed = dataclasses.replace(unlike, sigma_across=0.4)
     assert usual.unmixed((mixed, GOOD)) == (mixed, GOOD)
@@ -138,7 +138,7 @@ def test_a_line_that_is_unlike_and_disturbed_may_be_half_another_s(plainer: floa
 
 def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
     found = (GOOD, dataclasses.replace(GOOD, sigma_across=0.4, sigma_along=3.0))
-    waiting = functools.partial(sights_for, alike=True, possible=True, near=False)
+    waiting = functools.partial(sights_to_confirm, alike=True, possible=True, near=False)
     for state in (TrackState.TRACKING, TrackState.LOST):
         assert waiting(state, found, guided=True) == 2
         assert waiting(state, found, guided=False) != 2
@@ -146,12 +146,12 @@ def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
 
 def test_an_established_track_is_wrong_where_a_plain_needle_is_seen_elsewhere() -> None:
     plain = dataclasses.replace(GOOD, sigma_across=0.1)
-    wanted = functools.partial(sights_of_excluded, alike=True)
+    wanted = functools.partial(sights_to_exclude, alike=True)
     assert wanted(TrackState.LOST, (plain, plain)) == 4
     assert wanted(TrackState.TRACKING, (plain, plain)) is None
     for other in (dataclasses.replace(GOOD, sigma_across=0.2), hidden(plain), None):
         assert wanted(TrackState.LOST, (plain, other)) is None
-    assert sights_of_excluded(TrackState.LOST, (plain, plain), alike=False) is None
+    assert sights_to_exclude(TrackState.LOST, (plain, plain), alike=False) is None
 
 
 def test_a_needle_that_was_mistaken_is_found_where_it_is(
@@ -196,7 +196,7 @@ def test_a_tip_that_points_elsewhere_is_not_the_one_that_is_waited_for(
 
 
 def test_what_lies_over_the_needle_is_not_like_it() -> None:
-    usual = UsualVisibility()
+    usual = VisibilityAverage()
     assert usual.is_like((GOOD, GOOD))
     usual.see((GOOD, GOOD))
     assert usual.is_like((dataclasses.replace(GOOD, visibility=0.5), GOOD))
@@ -207,7 +207,7 @@ def test_what_lies_over_the_needle_is_not_like_it() -> None:
 
 
 def test_where_the_needle_must_be_light_on_it_is_allowed_and_something_over_it_is_not() -> None:
-    usual = UsualVisibility()
+    usual = VisibilityAverage()
     usual.see((GOOD, GOOD))
 
     def allowed(share: float, sigma: float) -> bool:
@@ -248,7 +248,7 @@ def test_a_tip_just_where_it_is_expected_is_told_from_one_beside(settings: Track
 
 def test_how_much_light_there_is_says_nothing() -> None:
     dim = dataclasses.replace(GOOD, contrast=GOOD.contrast / 4.0)
-    usual = UsualVisibility()
+    usual = VisibilityAverage()
     usual.see((GOOD, GOOD))
     assert usual.is_like((dim, GOOD))
     assert is_sound((dim, GOOD), 0.3, 2.0)
@@ -258,7 +258,7 @@ def test_how_much_light_there_is_says_nothing() -> None:
 
 
 def test_what_is_unlike_the_needle_hardly_says_where_it_is() -> None:
-    usual = UsualVisibility()
+    usual = VisibilityAverage()
     unlike = dataclasses.replace(GOOD, visibility=0.95)
     assert usual.doubted((unlike, GOOD)) == (unlike, GOOD)
     usual.see((GOOD, GOOD))

@@ -13,7 +13,7 @@ from needle_tracker.image.detection import DetectionSettings
 from needle_tracker.image.tip_fit import Expected, ImageTip, fit_expected, hidden
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.following import HiddenEnds, weighed
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.triangulation import triangulate
 

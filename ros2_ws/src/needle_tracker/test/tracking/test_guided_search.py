@@ -17,12 +17,12 @@ from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking import acquisition
 from needle_tracker.tracking import tracker as following_tracker
-from needle_tracker.tracking.evidence import UsualVisibility
+from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.following import Follower
 from needle_tracker.tracking.gates import UNCERTAIN
 from needle_tracker.tracking.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import Anchor, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings, default_settings
@@ -171,7 +171,7 @@ def test_a_line_that_may_be_half_a_shadow_s_says_little_however_it_is_found(
             patch.setattr(StereoTracker, "_follow", lambda *_: None)
             if across_px is not None:
                 patch.setattr(
-                    UsualVisibility,
+                    VisibilityAverage,
                     "unmixed",
                     lambda _, tips: tuple(
                         dataclasses.replace(tip, sigma_across=across_px) for tip in tips

@@ -15,7 +15,7 @@ from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.acquisition import Acquisition
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.single_view import seen_alone
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import SURPRISING, TOO_FAR, Anchor, TrackState
 from needle_tracker.tracking.tracker import EACH_VIEW, ONE_VIEW, StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings

@@ -134,7 +134,7 @@ def test_a_needle_kept_up_with_stays_uncertain_by_its_way(gates: GateSettings) -
     for insertion in (0.052, 0.054, 0.056):
         predicted = track.predict(insertion)
         assert predicted is not None
-        track.keep_up(predicted, predicted.motion)
+        track.update_from_single_view(predicted, predicted.motion)
     kept = track.predict(0.057)
     assert kept is not None
     assert kept.ahead == pytest.approx(1e-3)

@@ -13,7 +13,7 @@ from typing import Any
 
 from needle_common.commands.cli import EXIT_DONE
 from needle_common.errors import UserError
-from needle_verification.checking import Check, Finding, Run, Workbench, payloads
+from needle_verification.checking import Check, Finding, SimulateRun, Workbench, payloads
 
 STEPS = 10_000
 MOMENTS = 50
@@ -136,7 +136,7 @@ def same_joints(bench: Workbench) -> Iterator[Finding]:
     )
 
 
-def _told(run: Run) -> dict[str, list[bytes]]:
+def _told(run: SimulateRun) -> dict[str, list[bytes]]:
     """Return what was said, each thing once: joints are repeated while time stands still."""
     return {
         topic: [data for data, _ in itertools.groupby(messages)]

@@ -18,7 +18,7 @@ from needle_common.errors import UserError
 from needle_verification.checking import (
     Check,
     Finding,
-    Run,
+    SimulateRun,
     Workbench,
     diagnostics,
     payloads,
@@ -229,7 +229,7 @@ CHECKS: tuple[Check, ...] = (
 )
 
 
-def _exit(run: Run, key: str, what: str, code: int) -> Finding:
+def _exit(run: SimulateRun, key: str, what: str, code: int) -> Finding:
     left = f", left: {'; '.join(run.left_over)}" if run.left_over else ""
     seen = f"{run.code}{left}"
     if run.code != code:
@@ -246,8 +246,8 @@ def _differences(one: Path, other: Path) -> list[str]:
     return [topic for topic in SAME_TOPICS if ours[topic] != theirs[topic]]
 
 
-def _run_with(bench: Workbench, name: str, kinds: list[str], *arguments: str) -> Run:
-    """Run `simulate` with a second publisher of bad data in its graph."""
+def _run_with(bench: Workbench, name: str, kinds: list[str], *arguments: str) -> SimulateRun:
+    """SimulateRun `simulate` with a second publisher of bad data in its graph."""
     started = bench.start(name, *arguments)
     command = [sys.executable, "-m", "needle_verification.ros.bad_input", "--ros-args"]
     command += ["-p", f"kinds:=[{', '.join(kinds)}]", "--disable-external-lib-logs"]
@@ -262,7 +262,7 @@ def _run_with(bench: Workbench, name: str, kinds: list[str], *arguments: str) ->
     return run
 
 
-def _named(run: Run, node: str, kind: str, pattern: str) -> Finding:
+def _named(run: SimulateRun, node: str, kind: str, pattern: str) -> Finding:
     """Look for a bad datum's name in the node's log and in its diagnostics."""
     logged = [
         line
@@ -286,7 +286,7 @@ def _named(run: Run, node: str, kind: str, pattern: str) -> Finding:
     )
 
 
-def _unmoved(run: Run, usual: Run, key: str) -> Finding:
+def _unmoved(run: SimulateRun, usual: SimulateRun, key: str) -> Finding:
     topics = ("/device/joint_trajectory", "/sim/tip_pose")
     ours, theirs = payloads(run.bag, topics), payloads(usual.bag, topics)
     differ = [topic for topic in topics if ours[topic] != theirs[topic]]

@@ -33,7 +33,7 @@ _FARTHEST = {"insertion_joint": 1.0, "rotation_joint": 1e5}
 _PATIENCE = 0.01
 
 
-class DrivenDevice:
+class DriveFollower:
     """Moves the bench by what the emulated drives did, never by the driver's word.
 
     A tick of simulated time is over when the drives have told what they did in it and the driver

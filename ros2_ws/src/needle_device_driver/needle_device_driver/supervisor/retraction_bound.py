@@ -5,7 +5,7 @@ from __future__ import annotations
 from needle_device_driver.axes.axis import AxisSnapshot
 
 
-class WayOut:
+class RetractionBound:
     """Remembers the last known depth across the loss of the home position.
 
     Parameters

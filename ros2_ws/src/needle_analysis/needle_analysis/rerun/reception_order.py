@@ -19,7 +19,9 @@ _STATUS = "needle/controller_status"
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
-def as_heard(messages: list[SentMessage], namespace: str) -> list[tuple[int, SentMessage]]:
+def in_reception_order(
+    messages: list[SentMessage], namespace: str
+) -> list[tuple[int, SentMessage]]:
     """Return the messages with the times by which the controller had heard them, in their order.
 
     Parameters

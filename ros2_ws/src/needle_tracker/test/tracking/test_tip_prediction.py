@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from needle_tracker.tracking.tip_motion import TipMotion
+from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
 CURVATURE = 8.0

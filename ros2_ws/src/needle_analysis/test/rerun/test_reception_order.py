@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
 
-from needle_analysis.rerun.bag_hearing import as_heard, unheard_messages
+from needle_analysis.rerun.reception_order import in_reception_order, unheard_messages
 from needle_bags.format.bag_copy import BagCopy, standard_topic
 from needle_bags.reading.bag_order import SentMessage
 from needle_controller.protocol.heard_messages import HeardMessages
@@ -32,7 +32,7 @@ def status(time: int, *heard: tuple[str, int]) -> SentMessage:
 
 
 def order(*messages: SentMessage) -> list[tuple[str, int]]:
-    heard = as_heard(list(messages), "/rig/")
+    heard = in_reception_order(list(messages), "/rig/")
     assert [time for time, _ in heard] == sorted(time for time, _ in heard)
     assert all(time >= message.time for time, message in heard)
     return [(message.topic.rsplit("/", maxsplit=1)[-1], message.time) for _, message in heard]

@@ -20,7 +20,7 @@ from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.simulated_axis import SimulatedAxis
 
 
-class OwnDevice:
+class SimulatedDevice:
     """Answers to `device/...` and moves the bench.
 
     Parameters
