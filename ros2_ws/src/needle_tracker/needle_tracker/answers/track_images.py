@@ -165,16 +165,16 @@ def track_sequence(
             if last is not None and abs(insertion - last) > _NEW_RUN:
                 tracker.reset()
             last = insertion
-        problem = pair_problem(pair, calibration)
+        image, problem = image_problem(pair, calibration)
         if pair.left is not None and pair.right is not None and not problem:
             measured = tracker.process(pair.left, pair.right, insertion)
             swap.see(pair.left, pair.right, insertion, measured)
             checked = True
         else:
             if not checked and pair.left is not None and pair.right is not None:
-                raise UserError(f"{pair.name}: {problem}")
-            measured = tracker.skip(problem.partition(" is ")[0] + " cannot be used")
-            unusable.append(f"{pair.name} ({problem})")
+                raise UserError(f"{pair.name}: {image} is {problem}")
+            measured = tracker.skip(f"{image} cannot be used")
+            unusable.append(f"{pair.name} ({image} is {problem})")
         row = to_row(pair.name, measured)
         if row[1] == "0":
             entry = measured.state is TrackState.ENTRY
@@ -183,18 +183,17 @@ def track_sequence(
     return TrackedSequence(rows, reasons, unusable, without, swap.suspected)
 
 
-def pair_problem(pair: NamedPair, calibration: StereoCalibration) -> str:
-    """Return why a pair cannot be looked at; empty where it can."""
+def image_problem(pair: NamedPair, calibration: StereoCalibration) -> tuple[str, str]:
+    """Return which image of a pair cannot be looked at, and what it is; both empty where none."""
     cameras = (calibration.left, calibration.right)
     for side, image, camera in zip(SIDES, (pair.left, pair.right), cameras, strict=True):
         if image is None:
-            return f"{side} image is unreadable or not of 8 bit"
+            return f"{side} image", "unreadable or not of 8 bit"
         if image.shape != (camera.height, camera.width):
-            return (
-                f"{side} image is {image.shape[1]}x{image.shape[0]}, the calibration is for "
-                f"{camera.width}x{camera.height}"
-            )
-    return ""
+            size = f"{image.shape[1]}x{image.shape[0]}"
+            wanted = f"{camera.width}x{camera.height}"
+            return f"{side} image", f"{size}, the calibration is for {wanted}"
+    return "", ""
 
 
 def to_row(name: str, measured: Measurement) -> list[str]:

@@ -372,3 +372,15 @@ def _best_paths(
             place = cells[n, i]
             evidence[i, max(place - widths[i], 0) : place + widths[i] + 1] = -threshold
     return cells, lengths, sums
+
+
+def of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
+    """Return the dark paths of both views, or the bright ones: those that stand out more.
+
+    Beside a dark line there are bright ones, such as the gap between needle and shadow.
+    """
+    best = [
+        sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
+        for bright in (False, True)
+    ]
+    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]

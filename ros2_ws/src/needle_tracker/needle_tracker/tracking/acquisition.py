@@ -18,6 +18,7 @@ from needle_tracker.image.detection import (
     cut_path,
     distinct,
     find_paths,
+    of_one_polarity,
     without_shadows,
 )
 from needle_tracker.image.search_grid import SearchGrid, make_search_grid
@@ -36,16 +37,15 @@ from needle_tracker.tracking.evidence import (
     sights_to_exclude,
 )
 from needle_tracker.tracking.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
-from needle_tracker.tracking.gates import DISAGREE_ALONG, UNCERTAIN
 from needle_tracker.tracking.guided_search import guided_pairs, leads, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.track import SURPRISING, TOO_FAR, Anchor, Track, TrackState
+from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.track import Anchor, Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Last = tuple[ImageTip, ImageTip]
 
-UNCLEAR = "not clear enough to begin with"
 # A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
 # that is to say which of two ends is the needle's.
 _ENTRY_REGION, _ENTRY_SURPRISE, _ENTRY_NEAR = 15e-3, 9.0, 2.0
@@ -192,7 +192,7 @@ class Acquisition:
             paths.append(self._paths(images[i], i, grids[i], insertion, last))
             if not paths[i]:
                 return Measurement(None, state, f"no needle in the {side} image")
-        paths = _of_one_polarity(paths)
+        paths = of_one_polarity(paths)
         # Fitted as they are needed: the first pair is mostly the right one.
         fitted: tuple[dict[int, ImageTip | None], dict[int, ImageTip | None]] = ({}, {})
         pairs = [
@@ -222,7 +222,7 @@ class Acquisition:
             return first
         # Where something crosses the needle in one view, the other's end may lead to it.
         alone = tuple(max(filter(None, tips.values()), key=leads, default=None) for tips in fitted)
-        reason = "views do not meet"
+        reason: str = Refusal.NO_COMMON_POINT
         if None in alone:
             reason = f"no clear tip in the {SIDES[alone.index(None)]} image"
         return Measurement(None, state, reason, (alone[0], alone[1]))
@@ -240,11 +240,13 @@ class Acquisition:
         if on_way:
             found = self._usual.unmixed(found)
         measured = judged(self._views, self._track, found, insertion)
-        if measured.reason == DISAGREE_ALONG and insertion is not None:
+        if measured.reason == Refusal.DISAGREE_ALONG and insertion is not None:
             measured = self._one_sided(found, insertion, last) or measured
         wanted = self._sights_wanted(measured, found, insertion, on_way=on_way)
         if wanted is None:
-            return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
+            return dataclasses.replace(
+                measured, tip=None, reason=measured.reason or Refusal.UNCLEAR
+            )
         tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured
@@ -263,7 +265,7 @@ class Acquisition:
             return measured
         if self._track.contest(tip, insertion, wanted):
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
-        return dataclasses.replace(measured, tip=None, reason=measured.reason or UNCLEAR)
+        return dataclasses.replace(measured, tip=None, reason=measured.reason or Refusal.UNCLEAR)
 
     def _sights_wanted(
         self,
@@ -280,7 +282,7 @@ class Acquisition:
         if tip is not None and track.is_excluded(tip, insertion):
             return sights_to_exclude(track.state, found, alike=alike)
         if measured.tip is None:
-            refused = measured.reason in (TOO_FAR, SURPRISING, UNCERTAIN)
+            refused = measured.reason in (Refusal.TOO_FAR, Refusal.SURPRISING, Refusal.UNCERTAIN)
             return (
                 sights_to_contradict(track.state, found, alike=alike, on_way=on_way)
                 if refused
@@ -392,15 +394,3 @@ class Acquisition:
     def _grid(self, view: RefractedCamera) -> SearchGrid:
         settings = self._settings
         return make_search_grid(view, settings.gates.reach, first_distance=settings.hole_clearance)
-
-
-def _of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
-    """Return the dark paths of both views, or the bright ones: those that stand out more.
-
-    Beside a dark line there are bright ones, such as the gap between needle and shadow.
-    """
-    best = [
-        sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
-        for bright in (False, True)
-    ]
-    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]

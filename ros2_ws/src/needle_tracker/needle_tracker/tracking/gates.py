@@ -9,12 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.image.search_grid import Reach
+from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
-
-DISAGREE_ALONG = "views disagree along the needle"
-UNCERTAIN = "too uncertain"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,22 +88,22 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
     # Steered ever the same way, and a little more for what the margins leave open.
     largest_turn = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
     checks = [
-        (tip.disagreement > settings.max_disagreement, DISAGREE_ALONG),
-        (tip.disagreement_across > settings.max_miss_px, "views disagree across the needle"),
-        (largest_sigma > settings.max_depth_sigma, UNCERTAIN),
-        (tip.position[0] > settings.surface_height, "above the surface"),
-        (distance < settings.least_distance, "too close to the entry"),
-        (distance > reach.length + margin, "beyond the longest insertion"),
+        (tip.disagreement > settings.max_disagreement, Refusal.DISAGREE_ALONG),
+        (tip.disagreement_across > settings.max_miss_px, Refusal.DISAGREE_ACROSS),
+        (largest_sigma > settings.max_depth_sigma, Refusal.UNCERTAIN),
+        (tip.position[0] > settings.surface_height, Refusal.ABOVE_SURFACE),
+        (distance < settings.least_distance, Refusal.NEAR_ENTRY),
+        (distance > reach.length + margin, Refusal.BEYOND_REACH),
         (
             _angle_to_z(tip.position / distance) > float(reach.chord_angle(np.array(distance))),
-            "outside the reachable cone",
+            Refusal.OUTSIDE_CONE,
         ),
-        (_angle_to_z(tip.direction) > largest_turn, "direction not reachable"),
+        (_angle_to_z(tip.direction) > largest_turn, Refusal.DIRECTION),
     ]
     if insertion is not None:
         shortest = reach.shortest_chord(insertion)
-        checks.append((distance > insertion + margin, "farther than the insertion"))
-        checks.append((distance < shortest - margin, "short of the insertion"))
+        checks.append((distance > insertion + margin, Refusal.BEYOND_INSERTION))
+        checks.append((distance < shortest - margin, Refusal.SHORT_OF_INSERTION))
     return next((reason for failed, reason in checks if failed), None)
 
 

@@ -13,14 +13,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.tracking.gates import UNCERTAIN, GateSettings, refusal
+from needle_tracker.tracking.gates import GateSettings, refusal
+from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
 
-TOO_FAR = "too far from the last tip"
-SURPRISING = "too far from the prediction"
 _HEADING_TOLERANCE = 0.12  # [rad]
 _HIDDEN_PER_LOST = 4
 _CERTAIN = 0.5e-3  # [m]
@@ -150,16 +149,16 @@ class Track:
         following = predicted is not None and predicted.known and self.state is TrackState.TRACKING
         merged = predicted.motion.merged(tip) if predicted is not None and following else tip
         reason = refusal(merged, insertion, self._settings)
-        if reason == UNCERTAIN and refusal(tip, insertion, self._settings) is None:
+        if reason == Refusal.UNCERTAIN and refusal(tip, insertion, self._settings) is None:
             # Only the two together are: they contradict each other.
-            merged, reason = tip, SURPRISING
-        if predicted is None or reason not in (None, SURPRISING):
+            merged, reason = tip, Refusal.SURPRISING
+        if predicted is None or reason not in (None, Refusal.SURPRISING):
             return reason
         miss = float(np.linalg.norm(merged.position - predicted.motion.position))
         if miss > self.tolerance(predicted):
-            return TOO_FAR
+            return Refusal.TOO_FAR
         if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
-            return SURPRISING
+            return Refusal.SURPRISING
         return reason
 
     def accept(

@@ -27,14 +27,14 @@ from needle_tracker.tracking.following import (
     HiddenEnds,
     weighed,
 )
-from needle_tracker.tracking.gates import UNCERTAIN, tip_at_entry
+from needle_tracker.tracking.gates import tip_at_entry
 from needle_tracker.tracking.measurement import Measurement, judged
+from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.single_view import Seen, kept_up, seen_alone
-from needle_tracker.tracking.track import SURPRISING, TOO_FAR, Track, TrackState
+from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
-HIDDEN = "the end is hidden in both images"
 ONE_VIEW, EACH_VIEW = "one view alone", "each view by itself"
 _SLOW_CHANGE = 1.06  # of the needle's contrast, from pair to pair
 _CONTRADICTED = 3  # so many pairs in a row one view may contradict the other and the prediction
@@ -164,7 +164,7 @@ class StereoTracker:
     ) -> Measurement:
         """Note that both views together give no tip; return what single ones say."""
         alone = self._update_from_single_view(images, insertion)
-        if measured.reason in (HIDDEN, UNCERTAIN):
+        if measured.reason in (Refusal.HIDDEN, Refusal.UNCERTAIN):
             self.track.hide()
         else:
             self.track.miss()
@@ -172,7 +172,7 @@ class StereoTracker:
             self._last = None
             self._usual.forget()
         measured = dataclasses.replace(measured, state=self.track.state)
-        elsewhere = measured.reason in (TOO_FAR, SURPRISING)
+        elsewhere = measured.reason in (Refusal.TOO_FAR, Refusal.SURPRISING)
         if alone is None or elsewhere or self.track.state is not TrackState.TRACKING:
             return measured
         tip, seen = alone
@@ -283,11 +283,11 @@ class StereoTracker:
                 return None
             found = sights.tips
         if not (found[0].clear or found[1].clear or self._goes_on(found, insertion)):
-            measured = Measurement(None, self.track.state, HIDDEN, found)
+            measured = Measurement(None, self.track.state, Refusal.HIDDEN, found)
         else:
             measured = judged(self.views, self.track, found, insertion)
             sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
-            uncertain = measured.reason == UNCERTAIN and self.track.is_unbroken
+            uncertain = measured.reason == Refusal.UNCERTAIN and self.track.is_unbroken
             if measured.tip is None and (sound or not uncertain):
                 return None
         return dataclasses.replace(measured, regions=regions)

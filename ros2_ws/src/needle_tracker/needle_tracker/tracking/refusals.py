@@ -1,0 +1,29 @@
+"""Reasons why what was seen is not the tip; their texts are counted by and told."""
+
+from __future__ import annotations
+
+import enum
+
+
+class Refusal(str, enum.Enum):
+    """A reason, as a person reads it."""
+
+    def __str__(self) -> str:
+        """Return the text."""
+        return self.value
+
+    NO_COMMON_POINT = "views do not meet"
+    DISAGREE_ALONG = "views disagree along the needle"
+    DISAGREE_ACROSS = "views disagree across the needle"
+    UNCERTAIN = "too uncertain"
+    ABOVE_SURFACE = "above the surface"
+    NEAR_ENTRY = "too close to the entry"
+    BEYOND_REACH = "beyond the longest insertion"
+    OUTSIDE_CONE = "outside the reachable cone"
+    DIRECTION = "direction not reachable"
+    BEYOND_INSERTION = "farther than the insertion"
+    SHORT_OF_INSERTION = "short of the insertion"
+    TOO_FAR = "too far from the last tip"
+    SURPRISING = "too far from the prediction"
+    UNCLEAR = "not clear enough to begin with"
+    HIDDEN = "the end is hidden in both images"
