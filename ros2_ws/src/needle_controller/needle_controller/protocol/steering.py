@@ -28,7 +28,7 @@ from needle_controller.protocol.steering_types import (
     SteeringSettings,
     SteeringState,
 )
-from needle_controller.protocol.step_watch import REST_INSERTION, Followed, StepWatch
+from needle_controller.protocol.step_watch import Followed, StepWatch
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import AcceptedTip, Refusal, TipMeasurement
 from needle_controller.protocol.tip_intake import TipIntake
@@ -69,6 +69,8 @@ class Steering:
         Of the plane, at the last used tip.
     intake : TipIntake
         Tips and joints.
+    patience : Patience
+        How long has been waited, and for what.
     """
 
     def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
@@ -90,22 +92,7 @@ class Steering:
         self._sent: SendStep | None = None
         self._followed: StepWatch | None = None
         self._failed = FailedSteps()
-        self._patience = Patience()
-
-    @property
-    def silence(self) -> str:
-        """What of the device has not been heard for long; empty when all is well."""
-        return self._patience.silence
-
-    @property
-    def tip_after_ns(self) -> int:
-        """A tip exposed after this is wanted [ns]."""
-        return self.intake.after_ns
-
-    @property
-    def tips_rejected(self) -> int:
-        """Tips that were refused."""
-        return self.intake.refused.total()
+        self.patience = Patience()
 
     # What a person asks for
 
@@ -188,7 +175,7 @@ class Steering:
             return [*self._ask(), *self._watch_step(None), *self._use_tip()]
         actions: list[Action] = [Log("warning", f"step {self.step + 1} {text}", "abort")]
         self.reason = f"step {text}"
-        why = self._failed.aborted(text, moved=self._moved_since_command())
+        why = self._failed.aborted(text, moved=self.intake.has_moved)
         if why:
             return actions + self._leave(SteeringState.FAULT, why, "error")
         return actions + self._ask() + self._use_tip()
@@ -232,10 +219,10 @@ class Steering:
             Now, on the steady clock [s].
         """
         if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
-            self._patience.restart()
+            self.patience.restart()
             return []
         moving = self.awaiting is Awaiting.RESULT and self._is_moving()
-        waited = self._patience.waited(steady, moving=moving)
+        waited = self.patience.waited(steady, moving=moving)
         if self.awaiting is Awaiting.RESULT:
             return self._watch_result(waited, steady)
         return self._watch_tip(waited, steady)
@@ -248,7 +235,7 @@ class Steering:
 
     def _is_moving(self) -> bool:
         """Return whether the device says so, or the joints do since the last look."""
-        has_moved = self._patience.has_moved(self.intake.joints.latest)
+        has_moved = self.patience.has_moved(self.intake.joints.latest)
         return has_moved or (self._device is not None and self._device.state == "MOVING")
 
     def _watch_tip(self, waited: float, steady: float) -> list[Action]:
@@ -277,14 +264,14 @@ class Steering:
                 "not move: the command or its answer is lost"
             )
             return self._leave(SteeringState.FAULT, why, "error")
-        if self._patience.unheard(steady) < timeout or self.silence:
+        if self.patience.unheard(steady) < timeout or self.patience.silence:
             return []
         # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
-        self._patience.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
-        return [Log("warning", self.silence)]
+        self.patience.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        return [Log("warning", self.patience.silence)]
 
     def _heard(self) -> list[Action]:
-        return [Log("info", "the device is heard again")] if self._patience.heard() else []
+        return [Log("info", "the device is heard again")] if self.patience.heard() else []
 
     def _ask(self) -> list[Action]:
         """Ask for a tip of the needle at rest, or for the hold that must come first."""
@@ -297,7 +284,7 @@ class Steering:
             # Wherever a motion ended, it was over by then.
             self.intake.want_after(latest.stamp_ns)
         self.awaiting = Awaiting.TIP
-        self._patience.restart()
+        self.patience.restart()
         return []
 
     def _watch_step(self, sample: JointSample | None) -> list[Action]:
@@ -376,16 +363,8 @@ class Steering:
             return self._use_tip()
         self._ready_step, self._sent = None, step
         self.awaiting = Awaiting.RESULT
-        self._patience.restart()
+        self.patience.restart()
         return [step]
-
-    def _moved_since_command(self) -> bool:
-        latest, last = self.intake.joints.latest, self.intake.last
-        return (
-            latest is not None
-            and last is not None
-            and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
-        )
 
     def _take_jump(self, before: JointSample, sample: JointSample) -> list[Action]:
         """Take that the joints are in another place, or time, without a way there."""
@@ -413,7 +392,7 @@ class Steering:
     def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason
         self.awaiting = Awaiting.NOTHING
-        self._patience.silence = ""
+        self.patience.silence = ""
         self.intake.forget_waiting()
         self._ready_step = self._sent = self._followed = None
         return [Log(severity, f"{state.value}: {reason}" if reason else state.value)]

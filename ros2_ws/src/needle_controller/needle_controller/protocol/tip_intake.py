@@ -11,6 +11,7 @@ from collections import Counter
 
 from needle_controller.protocol.joint_history import JointHistory, JointSample
 from needle_controller.protocol.steering_types import SteeringSettings
+from needle_controller.protocol.step_watch import REST_INSERTION
 from needle_controller.protocol.tip_covariance import CovarianceHistory
 from needle_controller.protocol.tip_gate import (
     AcceptedTip,
@@ -127,6 +128,16 @@ class TipIntake:
             # All that came were refused: another exposure is wanted.
             self.want_after(self._refused_ns)
         return taken
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the needle moved since the last used tip."""
+        latest, last = self.joints.latest, self.last
+        return (
+            latest is not None
+            and last is not None
+            and abs(latest.insertion - last.joints.insertion) > REST_INSERTION
+        )
 
     def has_moved_on(self, step_length: float) -> bool:
         """Return whether the needle moved since the last used tip; if so, a later one is wanted.

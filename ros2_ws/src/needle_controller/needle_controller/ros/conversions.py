@@ -167,10 +167,10 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         "target_offset_m": repr(steering.control.plane.offset),
         "reachable": reachable,
         "reachable_depth_m": reachable_depth,
-        "reason": steering.silence or steering.reason,
+        "reason": steering.patience.silence or steering.reason,
         "awaiting": steering.awaiting.value,
-        "tip_after_ns": str(steering.tip_after_ns),
-        "tips_rejected": str(steering.tips_rejected),
+        "tip_after_ns": str(steering.intake.after_ns),
+        "tips_rejected": str(steering.intake.refused.total()),
         "tips_rejected_for": ", ".join(
             f"{fault.value} {count}" for fault, count in steering.intake.refused.items()
         ),
@@ -179,6 +179,6 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         "depth_m": repr(steering.settings.depth),
     }
     level = _LEVELS.get(steering.state, Level.OK)
-    if steering.rejection or steering.silence:
+    if steering.rejection or steering.patience.silence:
         level = max(level, Level.WARN)
     return Diagnostic(level, values["reason"] or steering.state.value, values)

@@ -57,11 +57,11 @@ def test_a_device_that_falls_silent_within_a_step_is_named_and_heard_again() -> 
     rig.steering.on_time(0.0)
     said = logged(rig.steering.on_time(rig.steering.settings.result_timeout))
     assert "nothing heard of the device" in said
-    assert rig.steering.silence
+    assert rig.steering.patience.silence
     assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
     assert rig.steering.on_time(1e3) == []
     rig.run(step)
-    assert not rig.steering.silence
+    assert not rig.steering.patience.silence
     rig.steering.on_device(HELD)
     sent(rig.expose())
 

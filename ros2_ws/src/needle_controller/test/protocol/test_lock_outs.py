@@ -87,7 +87,7 @@ def test_one_tip_from_the_future_holds_nothing_up(ahead: float, when: str) -> No
         assert rig.steering.on_start()[0].success
     step = good_tips(rig)
     assert step.stamp_ns == rig.now
-    assert rig.steering.tip_after_ns <= rig.now
+    assert rig.steering.intake.after_ns <= rig.now
 
 
 def test_stop_and_start_after_any_of_them_wants_no_tip_of_the_future() -> None:

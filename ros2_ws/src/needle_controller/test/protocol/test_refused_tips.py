@@ -28,11 +28,11 @@ def test_a_refused_tip_moves_nothing_and_asks_for_another(
     actions = rig.expose(bad)
     assert none_sent(actions)
     assert said in logged(actions)
-    assert rig.steering.tips_rejected == 1
+    assert rig.steering.intake.refused.total() == 1
     assert said in rig.steering.reason
     assert rig.steering.control.started == before
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert rig.steering.tip_after_ns == bad.stamp_ns
+    assert rig.steering.intake.after_ns == bad.stamp_ns
     sent(rig.expose())
     assert rig.steering.rejection == ""
 
@@ -58,7 +58,7 @@ def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None
     assert where(rig) == (SteeringState.STEERING, Awaiting.RESULT)
     bad = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.1, 0.0, 1.0]))
     assert "from the entry point" in logged(rig.steering.on_tip(bad))
-    assert rig.steering.tips_rejected == 1
+    assert rig.steering.intake.refused.total() == 1
     good = TipMeasurement(rig.now + TICK // 2, "rig", np.array([0.0, 0.0, 1e-3]))
     assert rig.steering.on_tip(good) == []
     rig.run(step)
@@ -68,10 +68,10 @@ def test_a_tip_that_nobody_waits_for_is_told_of_where_no_needle_can_be() -> None
 def test_an_old_stamp_is_refused_and_does_not_set_the_clock_back() -> None:
     rig = Rig()
     rig.run(sent(rig.expose()))
-    after = rig.steering.tip_after_ns
+    after = rig.steering.intake.after_ns
     old = TipMeasurement(TICK, "rig", np.zeros(3))
     assert "not newer" in logged(rig.steering.on_tip(old))
-    assert rig.steering.tip_after_ns == after
+    assert rig.steering.intake.after_ns == after
     sent(rig.expose())
 
 
@@ -79,7 +79,7 @@ def test_a_stamp_far_ahead_is_refused_and_does_not_block() -> None:
     rig = Rig()
     future = TipMeasurement(rig.now + 3600 * 10**9, "rig", np.zeros(3))
     assert "ahead of joint_states" in logged(rig.steering.on_tip(future))
-    assert rig.steering.tip_after_ns < future.stamp_ns
+    assert rig.steering.intake.after_ns < future.stamp_ns
     sent(rig.expose())
 
 
@@ -142,4 +142,4 @@ def test_each_reason_to_refuse_a_tip_is_told_for_itself() -> None:
         assert isinstance(log, Log)
         kinds.add(log.kind)
     assert len(kinds) == 3
-    assert rig.steering.tips_rejected == 3
+    assert rig.steering.intake.refused.total() == 3

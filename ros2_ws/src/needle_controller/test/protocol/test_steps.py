@@ -19,7 +19,7 @@ def test_start_without_hold_asks_for_no_tip_until_somebody_holds() -> None:
     assert rig.steering.on_device(HELD) == []
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     # The tip seen before the hold is not used, a new one is asked for.
-    assert rig.steering.tip_after_ns == rig.now
+    assert rig.steering.intake.after_ns == rig.now
     sent(rig.expose())
 
 
@@ -49,10 +49,10 @@ def test_a_finished_step_asks_for_a_tip_exposed_after_its_end() -> None:
     end = rig.now
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
     assert rig.steering.step == 1
-    assert rig.steering.tip_after_ns == end
+    assert rig.steering.intake.after_ns == end
     early = TipMeasurement(end - TICK // 2, "rig", np.array([0.0, 0.0, 0.0009]))
     assert rig.steering.on_tip(early) == []
-    assert rig.steering.tips_rejected == 0
+    assert rig.steering.intake.refused.total() == 0
     assert sent(rig.expose()).insertion == pytest.approx(0.002)
 
 
@@ -106,7 +106,7 @@ def test_a_hold_lost_before_the_step_asks_for_a_fresh_tip() -> None:
     assert where(rig) == (SteeringState.STEERING, Awaiting.HOLD)
     assert none_sent(rig.steering.on_device(HELD))
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
-    assert rig.steering.tip_after_ns == rig.now
+    assert rig.steering.intake.after_ns == rig.now
     sent(rig.expose())
 
 
@@ -142,7 +142,7 @@ def test_joints_that_are_heard_late_do_not_show_a_standstill() -> None:
         place = share * step.insertion, share * step.rotation
         rig.steering.on_joints(JointSample(rig.now, *place, sent_ns=answered))
     assert rig.steering.step == 1
-    assert rig.steering.tip_after_ns == rig.now
+    assert rig.steering.intake.after_ns == rig.now
 
 
 def test_answers_to_other_commands_are_not_ours() -> None:

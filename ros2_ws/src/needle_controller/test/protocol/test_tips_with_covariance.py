@@ -113,7 +113,7 @@ def test_a_covariance_of_a_later_tip_says_that_the_tips_own_is_lost() -> None:
     assert "no needle/tip_pose" in logged(actions)
     assert "configured" in logged(actions)
     assert rig.steering.watchdog_trips == 0
-    assert rig.steering.tip_after_ns == rig.now
+    assert rig.steering.intake.after_ns == rig.now
     # The tip of that one is there for the next step.
     sent(rig.expose())
 
