@@ -31,6 +31,8 @@ class DeviceCore:
     on_stop : callable
         Called whenever a fault or emergency stop ends everything.
 
+    Only its own methods change what follows.
+
     Attributes
     ----------
     state, activity : State, Activity
@@ -96,6 +98,14 @@ class DeviceCore:
         """Tell the end of a command."""
         self._events.append(StepResult(stamp_ns, outcome))
 
+    def explain(self, reason: str) -> None:
+        """Take why the device last stopped, refused or waits."""
+        self.reason = reason
+
+    def count_watchdog_trip(self) -> None:
+        """Count a hold, tip or reply that was too old."""
+        self.watchdog_trips += 1
+
     def take_events(self) -> tuple[Event, ...]:
         """Return what happened since the last call."""
         events = tuple(self._events)
@@ -129,10 +139,69 @@ class DeviceCore:
         self.state = next_state(self.state, trigger)
         self.reason = reason
 
-    def start(self, activity: Activity, end: tuple[float, float], duration: float) -> None:
-        """Begin a step or retraction from where the axes are; `duration` at full speed [s]."""
+    def configure(self) -> str:
+        """Set the axes up; return what went wrong."""
+        error = self.order(lambda axis: axis.configure())
+        if error:
+            # The other axis may be set up, and would wait for a computer that says no more.
+            self.order(lambda axis: axis.close())
+            return error
+        self.configured = True
+        self.go(Trigger.CONFIGURE, "configured")
+        return ""
+
+    def let_go(self) -> bool:
+        """Switch the axes off and let go of them; return whether that was from DISABLED."""
+        if self.configured:
+            self.configured = False
+            self.order(lambda axis: axis.close())
+        if self.state is not State.DISABLED:
+            return False
+        self.snapshot = None
+        self.go(Trigger.DECONFIGURE, "deconfigured")
+        return True
+
+    def reset(self, now: float) -> str:
+        """Leave a fault or emergency stop, the axes off; return what is still wrong."""
+        trigger, reason = Trigger.RESET_UNCONFIGURED, "reset"
+        if self.configured:
+            try:
+                self._axes.each(lambda axis: axis.reset())
+                self._axes.each(lambda axis: axis.power(False))
+            except AxisError as error:
+                return str(error)
+            problem = axes_problem(
+                self.poll(now), now, self._limits, powered_wanted=False, homed_wanted=False
+            )
+            if problem is not None:
+                return problem[1]
+            trigger, reason = Trigger.RESET, "reset; enable to go on"
+        self.fault = ""
+        self.go(trigger, reason)
+        return ""
+
+    def start(
+        self,
+        activity: Activity,
+        end: tuple[float, float],
+        duration: float,
+        stamp_ns: int | None = None,
+    ) -> None:
+        """Begin a step or retraction from where the axes are.
+
+        Parameters
+        ----------
+        activity : Activity
+            Which of them.
+        end : tuple of float
+            Insertion [m] and rotation [rad].
+        duration : float
+            At full speed [s].
+        stamp_ns : int, optional
+            Of the command [ns].
+        """
         assert self.snapshot is not None
-        self.activity = activity
+        self.activity, self.step_stamp_ns = activity, stamp_ns
         self._run = MotionRun(
             activity,
             end,

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from needle_common.foreign_text import plain
-from needle_device_driver.axes.axis import Axis, AxisError
+from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.axis_rules import axes_problem
 from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
 from needle_device_driver.supervisor.command_stamps import CommandStamps
 from needle_device_driver.supervisor.device_core import DeviceCore
@@ -133,14 +132,9 @@ class MotionSupervisor:
     def configure(self, now: float) -> Reply:
         """Set the axes up; moves nothing."""
         if self._core.state is not State.UNCONFIGURED:
-            return Reply(False, f"the device is {self._core.state.value}, not UNCONFIGURED")
-        error = self._core.order(lambda axis: axis.configure())
-        if error:
-            # The other axis may be set up, and would wait for a computer that says no more.
-            self._core.order(lambda axis: axis.close())
+            return self._not_in(State.UNCONFIGURED)
+        if error := self._core.configure():
             return Reply(False, error)
-        self._core.configured = True
-        self._core.go(Trigger.CONFIGURE, "configured")
         self.observe(now)
         return Reply(True, "configured")
 
@@ -154,13 +148,8 @@ class MotionSupervisor:
         """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
-        if self._core.configured:
-            self._core.configured = False
-            self._core.order(lambda axis: axis.close())
-        if self._core.state is not State.DISABLED:
+        if not self._core.let_go():
             return Reply(False, f"the device is {self._core.state.value}")
-        self._core.snapshot = None
-        self._core.go(Trigger.DECONFIGURE, "deconfigured")
         return Reply(True, "deconfigured")
 
     def note_time(self, ros_ns: int, now: float) -> None:
@@ -177,7 +166,7 @@ class MotionSupervisor:
             message.sender, rule, known=self._hold.knows(message.sender)
         )
         if text and counting:
-            self._core.reason = text
+            self._core.explain(text)
             self._core.notice(text, rule)
         if self._core.moves_with_hold and self._hold.owner is None:
             self._core.abort("hold released")
@@ -233,12 +222,12 @@ class MotionSupervisor:
             return
         self._needle_out = False
         self._stamps.use(command.stamp_ns)
-        self._core.step_stamp_ns = command.stamp_ns
-        self._core.start(Activity.STEP, (step.insertion, step.rotation), step.duration)
+        end = step.insertion, step.rotation
+        self._core.start(Activity.STEP, end, step.duration, command.stamp_ns)
 
     def count_watchdog_trip(self) -> None:
         """Count a watchdog of the supervisor's owner among its own."""
-        self._core.watchdog_trips += 1
+        self._core.count_watchdog_trip()
 
     # ---- services -----------------------------------------------------------------------------
 
@@ -252,8 +241,7 @@ class MotionSupervisor:
             return self._not_in(State.DISABLED)
         if self._switching():
             return Reply(False, _SWITCHING)
-        error = self._core.power_on()
-        if error:
+        if error := self._core.power_on():
             return Reply(False, error)
         self._hold.require_new_press()
         self._hold_refusals.clear()
@@ -278,8 +266,7 @@ class MotionSupervisor:
             return Reply(False, "confirm first that the needle is out (confirm_needle_out)")
         if self._switching():
             return Reply(False, _SWITCHING)
-        error = self._core.start_homing()
-        if error:
+        if error := self._core.start_homing():
             return Reply(False, error)
         self.observe(now)
         return Reply(True, "homing" if self._core.activity is Activity.HOMING else "homed")
@@ -329,23 +316,11 @@ class MotionSupervisor:
             return Reply(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):
             return Reply(False, "release the hold first")
+        if problem := self._core.reset(now):
+            return Reply(False, problem)
         if not self._core.configured:
-            self._core.fault = ""
-            self._core.go(Trigger.RESET_UNCONFIGURED, "reset")
             return Reply(True, "reset; the device is not configured")
-        try:
-            self._axes.each(lambda axis: axis.reset())
-            self._axes.each(lambda axis: axis.power(False))
-        except AxisError as error:
-            return Reply(False, str(error))
-        problem = axes_problem(
-            self._core.poll(now), now, self._limits, powered_wanted=False, homed_wanted=False
-        )
-        if problem is not None:
-            return Reply(False, problem[1])
-        self._core.fault = ""
-        self._core.go(Trigger.RESET, "reset; enable to go on")
-        return Reply(True, "reset; enable to go on")
+        return Reply(True, self._core.reason)
 
     # ---- the cycle ----------------------------------------------------------------------------
 
@@ -376,12 +351,12 @@ class MotionSupervisor:
         core.notice(text, Rule.HOLD_AGE)
         if self._pause_on_lapse:
             # Simulated time waits too: the same motion goes on later.
-            core.reason = text + ": paused"
+            core.explain(text + ": paused")
             return
-        core.watchdog_trips += moving
         self._hold.require_new_press()
-        core.reason = text + ": release and press again"
+        core.explain(text + ": release and press again")
         if moving:
+            core.count_watchdog_trip()
             core.abort(text)
 
     # ---- answers ------------------------------------------------------------------------------
@@ -400,10 +375,7 @@ class MotionSupervisor:
 
     def _ready_for_step(self, now: float) -> PairSnapshot | Refusal:
         if self._core.state is not State.HOLDING:
-            return Refusal(
-                Rule.COMMAND_STATE,
-                f"the device is {self._core.state.value}, not {State.HOLDING.value}",
-            )
+            return Refusal(Rule.COMMAND_STATE, self._not_in(State.HOLDING).message)
         if self._hold.owner is None:
             return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
         # Not the last cycle's: a stop since then must be known.
@@ -418,9 +390,11 @@ class MotionSupervisor:
 
     def _refuse(self, command: Command, refusal: Refusal) -> None:
         self._commands_refused += 1
-        self._core.watchdog_trips += refusal.rule is Rule.TIP_AGE
-        self._core.reason = f"command refused: {refusal.reason}"
-        self._core.notice(self._core.reason, refusal.rule)
+        if refusal.rule is Rule.TIP_AGE:
+            self._core.count_watchdog_trip()
+        text = f"command refused: {refusal.reason}"
+        self._core.explain(text)
+        self._core.notice(text, refusal.rule)
         # The running step's own stamp would tell its sender that the step has ended.
         if command.stamp_ns != self._core.step_stamp_ns:
             self._core.answer(command.stamp_ns, f"aborted: {refusal.reason}")
