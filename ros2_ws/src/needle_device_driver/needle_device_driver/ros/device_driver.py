@@ -68,7 +68,7 @@ _RETRY = 0.25
 _DESK_LOOK = 0.1
 _HELD_UP = 2.5 * PERIOD
 # From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
-_GRACE = 0.9
+_GRACE = 0.8
 _SLACK = 0.1 * PERIOD
 
 

@@ -162,6 +162,8 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
     assert not reply.success
     assert text in reply.message
     assert "rotation axis" in reply.message
+    # The other axis waits for nobody's heartbeat.
+    assert int.from_bytes(drive_bench.insertion.objects[0x1016, 1], "little") == 0
 
 
 def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> None:
