@@ -166,6 +166,17 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
     assert int.from_bytes(drive_bench.insertion.objects[0x1016, 1], "little") == 0
 
 
+def test_an_axis_whose_neighbour_is_refused_does_not_wait_for_the_computer(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.rotation.missing_objects = {0x1016}
+    assert not bench.supervisor.configure(bench.clock()).success
+    assert bench.written(1, 0x1016, 1) == bytes(4), "its watchdog is released"
+    bench.supervisor.observe(bench.clock())
+    assert "node 2 refuses" in bench.status.fault
+
+
 def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> None:
     drive_bench.insertion.missing_objects = {0x1006, 0x1029, 0x6007, 0x60C2}
     assert drive_bench.supervisor.configure(drive_bench.clock()).success
