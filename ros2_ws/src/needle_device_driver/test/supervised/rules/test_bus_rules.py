@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import can
 import pytest
 
@@ -131,6 +133,69 @@ def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(
             # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
             assert abs(joints.insertion - bench.insertion.position / 20e6) <= 0.0001201
     assert bench.drives.unanswered > 10
+
+
+def staleness(bench: DriveBench, late: Callable[[int], int], cycles: int) -> float:
+    """Insert at 5 mm/s while answers come so many cycles late, between two SYNCs.
+
+    Returns
+    -------
+    float
+        How far the joints were off from where the drive was at the last SYNC at most [m].
+    """
+    bench.ready()
+    bench.cycle(1, holding=True)
+    drive, took, sync = bench.insertion, bench.insertion.take, bench.insertion.sync
+    at, worst = 0, 0.0
+
+    def take(cob_id: int, data: bytes) -> None:
+        # No heartbeat brings an answer.
+        drive.say(0x700, bytes([drive.nmt])) if cob_id == 0x77F else took(cob_id, data)
+
+    def note_sync() -> None:
+        nonlocal at
+        at = drive.position
+        sync()
+
+    drive.take, drive.sync = take, note_sync  # type: ignore[method-assign]
+    for number in range(cycles):
+        drive.answers_late = late(number)
+        if in_state(bench, State.HOLDING):
+            told = [axis.poll(bench.clock()).set_point for axis in bench.axes]
+            step = bench.command(told[0] + 0.002, told[1], bench.ros_ns, 0.4)
+            bench.supervisor.submit(step, bench.clock())
+        bench.cycle(1, holding=True)
+        joints = bench.supervisor.joints(bench.clock())
+        if joints is not None:
+            worst = max(worst, abs(joints.insertion - at / 20e6))
+        drive.held_back = [(count - 1, frames) for count, frames in drive.held_back]
+        drive.answer()
+        bench.bus.flush()
+        if in_state(bench, State.FAULT):
+            break
+    return worst
+
+
+@pytest.mark.parametrize("late", [1, 2, 3, 4])
+def test_reply_age_joints_are_no_older_than_answers_are_late(
+    drive_bench: DriveBench, late: int
+) -> None:
+    assert staleness(drive_bench, lambda _: late, 150) <= late * 0.0001 + 1e-9
+    assert not in_state(drive_bench, State.FAULT)
+    assert drive_bench.drives.unanswered == 150
+
+
+@pytest.mark.parametrize(
+    ("late", "rule"),
+    [(lambda _: 5, Rule.REPLY_AGE), (lambda cycle: cycle // 40, Rule.FOLLOWING_ERROR)],
+    ids=["100 ms", "growing"],
+)
+def test_reply_age_answers_that_are_too_late_end_the_motion(
+    drive_bench: DriveBench, late: Callable[[int], int], rule: Rule
+) -> None:
+    assert staleness(drive_bench, late, 400) <= 0.0006 + 1e-9
+    assert in_state(drive_bench, State.FAULT)
+    assert drive_bench.notices[-1].rule is rule
 
 
 def test_reply_age_one_lost_answer_is_counted_and_holds_nothing_up(
