@@ -52,6 +52,12 @@ def test_no_clock_makes_cycles_faster_than_steady_time(factor: float, tick: floa
         assert between * PERIOD <= last - first + 0.1 * PERIOD + LOOK
 
 
+def test_no_cycle_is_made_up_for_after_a_pause() -> None:
+    paused = ((at + (1.0 if at > 0.1 else 0.0), time_ns) for at, time_ns in ticking(4.0))
+    seen = [at for at, _ in cycles(paused, 2.0) if at > 1.05]
+    assert len(seen) * PERIOD <= 2.0 - 1.1 + 2 * PERIOD
+
+
 def test_two_clocks_apart_are_no_faster_either() -> None:
     both = ((at, time_ns + ahead) for at, time_ns in ticking(1.0) for ahead in (0, 1_000_000_000))
     assert len(cycles(both, 2.0)) <= 2.0 / PERIOD + 1

@@ -146,7 +146,7 @@ class ScriptedDrive:
 
     def command(self, word: int) -> None:
         if self.state == "fault":
-            if word & 0x80 and not self.deaf_to_reset:
+            if word & 0x80 and not self.last_word & 0x80 and not self.deaf_to_reset:
                 self.state = "disabled"
         elif not word & 0x02:
             self.state = "disabled"

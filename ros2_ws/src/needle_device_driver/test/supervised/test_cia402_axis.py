@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.supervisor.states import State
 
 from .drive_bench import DriveBench
@@ -343,3 +344,19 @@ def test_a_pushed_axis_is_retracted_by_hand(make_drive_bench: Callable[..., Driv
     reply = bench.supervisor.retract(bench.clock())
     assert not reply.success
     assert "by hand" in reply.message
+
+
+def test_an_axis_that_is_not_on_takes_no_set_point(drive_bench: DriveBench) -> None:
+    drive_bench.homed()
+    with pytest.raises(AxisError, match="not ready to move"):
+        drive_bench.axes[0].start_move(0.0, 0.001)
+
+
+@pytest.mark.parametrize(("inputs", "outer"), [(1, True), (2, False), (4, True), (0, False)])
+def test_the_outer_end_is_the_negative_limit_switch_or_the_home_switch(
+    drive_bench: DriveBench, inputs: int, outer: bool
+) -> None:
+    drive_bench.configured()
+    drive_bench.insertion.inputs = inputs
+    drive_bench.cycle()
+    assert drive_bench.axes[0].poll(drive_bench.clock()).at_home_switch is outer

@@ -60,8 +60,11 @@ def test_link_loss_is_named_and_reset_opens_the_link_anew(
     assert "cannot open" in reply.message
     assert in_state(bench, State.FAULT)
     bench.no_adapter = False
+    # Nobody knows what happened to the drives meanwhile.
+    bench.insertion.objects[0x1016, 1] = bytes(4)
     recovers(bench)
     assert bench.link.openings == 2
+    assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
 
 
 def test_link_loss_while_nothing_is_sent_is_noticed_by_the_receiver(
@@ -211,6 +214,21 @@ def test_reply_age_one_lost_answer_is_counted_and_holds_nothing_up(
     assert bench.outcomes[-1] == "succeeded"
 
 
+def test_reply_age_two_lost_answers_are_given_up_after_two_cycles_without_sync(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    bench.insertion.loses = 2
+    bench.cycle(3, holding=True)
+    # The third answer may be to the first SYNC: nothing is sent on.
+    waiting = bench.insertion.next_target
+    bench.cycle(2, holding=True)
+    assert bench.insertion.next_target == waiting
+    bench.cycle(60, holding=True)
+    assert bench.outcomes == ["succeeded"]
+
+
 def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fresh(
     drive_bench: DriveBench,
 ) -> None:
@@ -228,7 +246,10 @@ def test_reply_age_heartbeats_of_a_drive_that_left_operational_keep_nothing_fres
 def test_drive_reboot_is_a_fault_and_unhomes(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
+    bench.cycle(20, holding=True)
+    # Deeper than the software limits reach outward: un-homed, they do not count.
     deep = bench.insertion.position
+    assert deep > 20_000
     bench.insertion.reboot()
     bench.bus.flush()
     bench.cycle(1, holding=True)
@@ -253,6 +274,22 @@ def test_drive_reboot_is_a_fault_and_unhomes(drive_bench: DriveBench) -> None:
     # The last that was heard is a cycle old.
     assert bench.insertion.position == pytest.approx(-deep, abs=2000)
     assert "out" in bench.supervisor.retract(bench.clock()).message
+
+
+def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    bench.insertion.reboot()
+    bench.insertion.nmt = 0x05
+    bench.insertion.objects[0x1016, 1] = bytes(4)
+    bench.bus.flush()
+    bench.cycle(1, holding=True)
+    bench.hold(False)
+    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
+    assert not bench.status.homed
 
 
 def test_drive_reboot_a_node_that_left_operational_is_found_by_its_heartbeat(

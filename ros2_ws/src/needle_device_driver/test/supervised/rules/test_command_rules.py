@@ -82,6 +82,7 @@ def test_command_one_publisher(bench: Bench) -> None:
         (("insertion_joint", "roll"), (POINT,)),
         (("insertion_joint", "insertion_joint"), (POINT,)),
         ((*NAMES, "more"), (CommandPoint((0.001, 0.1, 0.0), (), 0.5),)),
+        ((*NAMES, NAMES[0]), (CommandPoint((0.001, 0.1, 0.001), (), 0.5),)),
         (NAMES, ()),
         (NAMES, (POINT, POINT)),
         (NAMES, (CommandPoint((0.001,), (), 0.5),)),
@@ -140,6 +141,17 @@ def test_command_newer_than_the_last(bench: Bench, older_by_ns: int) -> None:
     assert in_state(bench, State.HOLDING)
 
 
+def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted(bench: Bench) -> None:
+    bench.ready()
+    bench.command()
+    bench.cycle(25, holding=True)
+    assert bench.supervisor.reset(bench.now).success
+    bench.hold(False)
+    bench.hold()
+    bench.command(stamp_ns=bench.ros_ns - 40_000_000)
+    assert in_state(bench, State.MOVING)
+
+
 def test_tip_age_on_the_steady_clock_while_ros_time_stands_still(bench: Bench) -> None:
     bench.ready()
     stamp = bench.ros_ns
@@ -190,7 +202,7 @@ def test_forward_only(bench: Bench, length: float) -> None:
 def test_max_depth(make_bench: type[Bench]) -> None:
     bench = make_bench(max_depth=0.0015)
     bench.ready()
-    bench.command(0.0016)
+    bench.command(0.00151)
     refused(bench, Rule.MAX_DEPTH)
     bench.command(0.0015)
     assert in_state(bench, State.MOVING)
@@ -216,6 +228,16 @@ def test_max_rotation_step(bench: Bench) -> None:
     bench.ready()
     bench.command(0.001, -1.21)
     refused(bench, Rule.MAX_ROTATION_STEP)
+
+
+def test_max_rotation_step_counts_from_where_the_rotation_is(bench: Bench) -> None:
+    bench.ready()
+    bench.command(0.001, 1.0)
+    bench.cycle(25, holding=True)
+    bench.command(0.001, -1.21)
+    assert bench.last_rule is Rule.MAX_ROTATION_STEP
+    bench.command(0.001, 1.0)
+    assert in_state(bench, State.MOVING)
 
 
 def test_max_rotation_rate(bench: Bench) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import State
 
@@ -69,6 +70,16 @@ def test_drive_watchdog_is_armed_last_and_read_back(drive_bench: DriveBench) -> 
         assert bench.written(node, 0x605E) == b"\x02\x00"
         writes = [d for c, d in bench.bus.sent if c == 0x600 + node and d[0] & 0xE0 == 0x20]
         assert writes[-1] == bytes.fromhex("2316100164007f00")
+
+
+def test_drive_watchdog_that_a_drive_does_not_keep_refuses_the_drive(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.insertion.stores = lambda index, value: bytes(4) if index == 0x1016 else value
+    reply = bench.supervisor.configure(bench.clock())
+    assert not reply.success
+    assert "0x1016:1 consumer heartbeat time and has 0" in reply.message
 
 
 def test_drive_watchdog_that_tripped_stops_both_and_has_its_name(drive_bench: DriveBench) -> None:
@@ -149,6 +160,25 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(drive_bench: Drive
     assert not reply.success
     assert "0x7121 motor blocked" in reply.message
     assert in_state(bench, State.FAULT)
+    # The edge counts: the order before was one to reset, too.
+    bench.insertion.deaf_to_reset = False
+    assert bench.supervisor.reset(bench.clock()).success
+
+
+def test_drive_emergency_a_drive_in_fault_takes_no_order_to_move(drive_bench: DriveBench) -> None:
+    bench = drive_bench
+    bench.moving()
+    axis = bench.axes[0]
+    bench.insertion.fail(0x2310)
+    bench.bus.flush()
+    orders: tuple[Callable[[], None], ...] = (
+        lambda: axis.power(True),
+        lambda: axis.home(0.001),
+        lambda: axis.start_move(axis.poll(0.0).set_point, 0.001),
+    )
+    for order in orders:
+        with pytest.raises(AxisError, match="over-current"):
+            order()
 
 
 def test_one_fault_stops_both_a_drive_that_switches_itself_off(drive_bench: DriveBench) -> None:

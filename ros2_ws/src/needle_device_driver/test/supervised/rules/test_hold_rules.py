@@ -51,6 +51,33 @@ def test_hold_age_silence_aborts_within_the_timeout_and_takes_a_new_press(bench:
     assert bench.status.hold_owner == "a"
 
 
+def test_hold_age_a_gap_before_a_command_or_a_retraction_counts_all_the_same(bench: Bench) -> None:
+    bench.ready()
+    bench.insertion.position = 0.001
+    bench.now += 0.3
+    bench.command()
+    assert bench.last_rule is Rule.HOLD_TO_RUN
+    bench.hold(False)
+    bench.hold()
+    bench.now += 0.3
+    assert "keep the hold" in bench.supervisor.retract(bench.now).message
+    bench.hold(False)
+    bench.hold()
+    bench.now += 0.3
+    bench.supervisor.observe(bench.now)
+    assert bench.status.hold_owner == ""
+
+
+def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out(bench: Bench) -> None:
+    bench.ready()
+    bench.supervisor.fail("test")
+    bench.hold()
+    assert not bench.supervisor.reset(bench.now).success
+    bench.now += 0.3
+    bench.supervisor.observe(bench.now)
+    assert bench.supervisor.reset(bench.now).success
+
+
 def test_hold_age_a_message_counts_for_a_quarter_of_a_second(bench: Bench) -> None:
     bench.ready()
     bench.command(0.002, 0.1, duration=2.0)
@@ -112,6 +139,27 @@ def test_hold_new_press_one_from_before_does_not_count(bench: Bench, press_befor
     bench.hold(False)
     bench.hold()
     assert bench.status.hold_owner == "a"
+
+
+@pytest.mark.parametrize("how", ["fault", "disable"])
+def test_hold_new_press_a_hold_ends_with_what_it_let_move(bench: Bench, how: str) -> None:
+    bench.ready()
+    if how == "fault":
+        bench.supervisor.fail("test")
+    else:
+        bench.supervisor.enable(False, bench.now)
+    assert bench.status.hold_owner == ""
+
+
+def test_hold_new_press_one_during_homing_does_not_count(bench: Bench) -> None:
+    bench.insertion.position = 0.0005
+    bench.home()
+    bench.hold()
+    bench.cycle(30, holding=True)
+    assert bench.status.homed
+    assert bench.supervisor.enable(True, bench.now).success
+    bench.hold()
+    assert bench.status.hold_owner == ""
 
 
 def test_hold_one_owner_until_released(bench: Bench) -> None:
@@ -180,7 +228,10 @@ def test_speed_scale_outside_0_to_1_is_a_release(bench: Bench, scale: float) -> 
 
 
 def test_speed_scale_slows_and_0_stands_still(bench: Bench) -> None:
-    bench.ready()
+    bench.ready(holding=False)
+    assert bench.status.speed_scale == 0.0
+    bench.hold(scale=0.5)
+    assert bench.status.speed_scale == 0.5
     bench.command()
     bench.cycle(10, holding=True, scale=0.5)
     assert bench.insertion.position == pytest.approx(0.0002)

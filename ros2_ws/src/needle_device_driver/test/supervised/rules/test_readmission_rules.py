@@ -160,6 +160,42 @@ def test_hold_new_press_one_that_was_silent_over_a_reset(bench: Bench) -> None:
     assert has_hold(bench, "a")
 
 
+def test_hold_stamp_increases_what_counts_is_the_highest_stamp_before_a_reset(
+    bench: Bench,
+) -> None:
+    bench.ready(holding=False)
+    bench.hold(False, stamp_ns=1000)
+    bench.hold(False, sender="b", stamp_ns=10)
+    bench.now += 1.0
+    bench.supervisor.observe(bench.now)
+    assert bench.supervisor.reset(bench.now).success
+    bench.hold(stamp_ns=500)
+    assert not has_hold(bench, "a")
+
+
+def test_hold_stamp_increases_a_late_release_after_a_reset_keeps_no_press_out(
+    bench: Bench, hand: Hand
+) -> None:
+    assert bench.supervisor.reset(bench.now).success
+    for behind_ns in (0, 40 * MS):
+        hand.ahead_ns = -behind_ns
+        hand.send(False)
+    hand.ahead_ns = 0
+    hand.send(True)
+    assert has_hold(bench, "a")
+
+
+def test_hold_stamp_increases_a_release_from_after_a_reset_lets_any_press_count(
+    bench: Bench, hand: Hand
+) -> None:
+    assert bench.supervisor.reset(bench.now).success
+    hand.send(False)
+    hand.ahead_ns = 2 * FAR_AHEAD
+    hand.send(False)
+    hand.send(True)
+    assert has_hold(bench, "a")
+
+
 def test_hold_one_owner_reset_forgets_who_is_silent(bench: Bench) -> None:
     bench.ready(holding=False)
     for number in range(300):

@@ -36,10 +36,12 @@ def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it
     bench = make_drive_bench(retraction_speed=0.005)
     bench.ready()
     bench.insertion.left_over = left_over
+    # As much as its tolerance has room for.
+    bench.rotation.left_over = left_over // 10
     bench.cycle(1, holding=True)
     for number in (1, 2):
         # As far and as fast as may be, from where the last step was to end.
-        target = Bench.step_command(0.002 * number, 0.1 * number, bench.ros_ns, 0.4)
+        target = Bench.step_command(0.002 * number, 1.1999 * number, bench.ros_ns, 0.4)
         bench.supervisor.submit(target, bench.clock())
         bench.cycle(30, holding=True)
     assert bench.outcomes == ["succeeded", "succeeded"]
@@ -52,9 +54,11 @@ def test_look_ahead_counts_from_the_last_set_point_where_a_motor_rests_beside_it
 def test_look_ahead_refuses_a_set_point_that_is_further(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
-    at = bench.axes[0].poll(0.0).position
+    told = bench.axes[0].poll(0.0).set_point
+    bench.axes[0].start_move(told + 0.0001, 0.005)
+    # A cycle's way at 5 mm/s, 1 % and a count.
     with pytest.raises(Exception, match="ahead in a cycle") as caught:
-        bench.axes[0].start_move(at + 0.0005, 0.025)
+        bench.axes[0].start_move(told + 0.0002012, 0.005)
     assert getattr(caught.value, "rule", None) is Rule.LOOK_AHEAD
 
 
@@ -120,6 +124,27 @@ def test_software_limits_in_the_drives_come_with_homing(drive_bench: DriveBench)
     assert (lower, upper) == (-20_000, 4_020_000)
 
 
+def test_software_limits_in_the_drives_end_while_they_are_homed_again(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.homed()
+    assert bench.supervisor.home(bench.clock()).success
+    for node in (INSERTION, ROTATION):
+        assert bench.written(node, 0x607D, 1) == bytes.fromhex("00000080")
+
+
+@pytest.mark.parametrize("limit", ["00000080", "ffffff7f"], ids=["lower", "upper"])
+def test_software_limits_that_a_drive_does_not_keep_refuse_the_drive(
+    drive_bench: DriveBench, limit: str
+) -> None:
+    bench = drive_bench
+    bench.insertion.stores = lambda index, value: (
+        bytes(4) if index == 0x607D and value == bytes.fromhex(limit) else value
+    )
+    assert "and has 0" in bench.supervisor.configure(bench.clock()).message
+
+
 def test_software_limits_in_the_driver_refuse_a_set_point(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.ready()
@@ -143,6 +168,14 @@ def test_following_error_of_a_blocked_motor(drive_bench: DriveBench) -> None:
     bench.cycle(10, holding=True)
     assert bench.positions == at, "a motor that comes free has no power to go on"
     recovers(bench)
+
+
+def test_following_error_that_a_drive_reports(drive_bench: DriveBench) -> None:
+    bench = drive_bench
+    bench.moving()
+    bench.rotation.STATES = {**bench.rotation.STATES, "enabled": 0x2237}
+    bench.cycle(1, holding=True)
+    failed(bench, Rule.FOLLOWING_ERROR, "the drive reports a following error")
 
 
 def test_following_error_counts_from_the_set_point_that_was_due(
