@@ -214,8 +214,8 @@ class Cia402Axis(Axis):
             powered=not self.actuated or machine.powered,
             homed=self._homed and not self.monitor.rebooted,
             moving=self._homing is not None,
-            at_home_switch=bool(machine.at.inputs & self._outer_switches),
-            at_inner_switch=bool(machine.at.inputs & self._inner_switch),
+            at_home_switch=bool(machine.at.inputs & self._settings.outer_switches),
+            at_inner_switch=bool(machine.at.inputs & self._settings.inner_switch),
             fault="" if fault is None else fault[1],
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
@@ -323,17 +323,6 @@ class Cia402Axis(Axis):
     @property
     def _rest_counts(self) -> int:
         return self._settings.magnitude(self._settings.tolerance)
-
-    @property
-    def _outer_switches(self) -> int:
-        # Outward is the drive's positive direction where it counts in reverse.
-        limit = od.POSITIVE_LIMIT_SWITCH if self._settings.reverse else od.NEGATIVE_LIMIT_SWITCH
-        return limit | od.HOME_SWITCH
-
-    @property
-    def _inner_switch(self) -> int:
-        reverse = self._settings.reverse
-        return od.NEGATIVE_LIMIT_SWITCH if reverse else od.POSITIVE_LIMIT_SWITCH
 
     @property
     def _fault(self) -> Fault | None:

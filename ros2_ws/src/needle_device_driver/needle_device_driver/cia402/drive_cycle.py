@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from needle_device_driver.axes.axis import AxisError
@@ -12,6 +13,8 @@ from needle_device_driver.link.objects import SYNC
 # How long a pause for answers that are late lasts, in cycles without any, and each of them [s].
 _PAUSE = 2
 _PAUSE_WAIT = 0.015
+# Longer than this between two looks [s], and the process was held up; its drives speak up within.
+_HELD_UP, _HEARD_WITHIN = 0.05, 0.04
 
 
 class DriveCycle:
@@ -36,6 +39,7 @@ class DriveCycle:
         self.unanswered = 0
         self._outstanding = 0
         self._paused = 0
+        self._looked_at = math.inf
 
     @property
     def missing_optional_objects(self) -> tuple[str, ...]:
@@ -70,11 +74,20 @@ class DriveCycle:
             except LinkError:
                 return
 
-    def hear(self, since: float, wait: float) -> None:
-        """Wait, at most so long [s], until every drive was heard `since` then [s]."""
+    def hear_first(self, now: float) -> None:
+        """After a hold-up of this process, hear every drive anew before it is judged.
+
+        Parameters
+        ----------
+        now : float
+            Time of this call, one of each cycle [s].
+        """
+        before, self._looked_at = self._looked_at, now
+        if now - before <= _HELD_UP:
+            return
         with self._link.arrival:
             self._link.arrival.wait_for(
-                lambda: all(axis.monitor.fresh_time >= since for axis in self._axes), wait
+                lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
             )
 
     def collect(self) -> None:

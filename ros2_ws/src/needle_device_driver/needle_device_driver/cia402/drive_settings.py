@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_device_driver.link import objects as od
 
 # Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
 HERE = (35, 37)
@@ -107,3 +108,15 @@ class DriveSettings:
         """Software limits in counts, lower first."""
         limits = sorted((self.counts(self.lower), self.counts(self.upper)))
         return limits[0], limits[1]
+
+    @property
+    def outer_switches(self) -> int:
+        """Bits of the digital inputs that end the way out."""
+        # Outward is the drive's positive direction where it counts in reverse.
+        limit = od.POSITIVE_LIMIT_SWITCH if self.reverse else od.NEGATIVE_LIMIT_SWITCH
+        return limit | od.HOME_SWITCH
+
+    @property
+    def inner_switch(self) -> int:
+        """Bit of the digital inputs that ends the way in."""
+        return od.NEGATIVE_LIMIT_SWITCH if self.reverse else od.POSITIVE_LIMIT_SWITCH

@@ -66,7 +66,6 @@ PERIOD = PERIOD_NS / NANOSECONDS
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 _DESK_LOOK = 0.1
-_HELD_UP = 2.5 * PERIOD
 # From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
 _GRACE = 0.8
 _SLACK = 0.1 * PERIOD
@@ -115,7 +114,6 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
-        self._timed_at: float | None = None
         self._told_unanswered = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
@@ -174,18 +172,11 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._sim_time:
             # Simulated time may stand still; watchdogs do not.
             self._drives.beat()
-            self._hear_first()
+            self._drives.hear_first(time.monotonic())
             self._supervisor.observe(time.monotonic())
             self._device.report()
             return
         self._cycle(self.get_clock().now().nanoseconds, _REPLY_WAIT)
-
-    def _hear_first(self) -> None:
-        """After a hold-up of this process, hear what has come meanwhile before judging by it."""
-        now, before = time.monotonic(), self._timed_at
-        self._timed_at = now
-        if before is not None and now - before > _HELD_UP:
-            self._drives.hear(now, 2.0 * PERIOD)
 
     def _on_clock(self, message: Clock) -> None:
         if self._supervisor.state is State.UNCONFIGURED:
