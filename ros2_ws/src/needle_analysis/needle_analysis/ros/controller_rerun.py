@@ -15,9 +15,10 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import to_nanoseconds, values_of
 from needle_controller.protocol.heard_messages import HeardMessage
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, PublishUpdate, SendStep, SteeringState
-from needle_controller.ros import conversions
+from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SteeringState
+from needle_controller.ros.conversions import TARGET_PLANE, to_joint_sample
 from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.ros.steering_messages import SteeringMessages, output_messages
 
 _STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6
@@ -59,7 +60,8 @@ class ControllerStage:
     ) -> None:
         self._parameters = parameters
         self._node = node
-        self._steering = parameters.make_steering()
+        self._messages = SteeringMessages(parameters)
+        self._steering = self._messages.steering
         self._ends = ends
         self._unheard = unheard
         self._steady = 0.0
@@ -68,14 +70,9 @@ class ControllerStage:
         self.tips = 0
         self.notes: list[str] = []
         self._takers: dict[str, Callable[[Any, int], Iterable[Action]]] = {
-            "joint_states": self._take_joints,
-            "needle/tip": lambda m, _: self._steering.on_tip(conversions.to_tip(m)),
-            "needle/tip_pose": lambda m, _: self._steering.on_tip_pose(
-                conversions.to_tip_covariance(m)
-            ),
+            **{topic: row.take for topic, row in self._messages.inputs.items()},
             "device/result": self._take_result,
-            "device/status": lambda m, _: self._steering.on_device(conversions.to_device_status(m)),
-            "target_plane": self._take_plane,
+            TARGET_PLANE: self._take_plane,
             "needle/controller_status": self._take_status,
             "/parameter_events": self._take_parameters,
         }
@@ -91,42 +88,26 @@ class ControllerStage:
             return []
         outputs = []
         for action in self._takers[topic](message, sent.time):
-            stamp, messages = 0, {}
-            if isinstance(action, SendStep):
-                stamp = action.stamp_ns
-                messages = {"device/joint_trajectory": conversions.to_trajectory(action)}
-            elif isinstance(action, PublishUpdate):
-                self.tips += 1
-                stamp = action.stamp_ns
-                messages = _messages(action)
+            if isinstance(action, Log):
+                continue
+            self.tips += isinstance(action, PublishUpdate)
             outputs += [
-                Output(name, sent.log_time, stamp, stored(content))
-                for name, content in messages.items()
+                Output(name, sent.log_time, action.stamp_ns, stored(content))
+                for name, content in output_messages(action)
             ]
         return outputs
-
-    def _take_joints(self, message: Any, sent_ns: int) -> Iterable[Action]:
-        try:
-            sample = conversions.to_joint_sample(message, sent_ns)
-        except UserError:
-            return ()
-        return self._steering.on_joints(sample)
 
     def _take_result(self, message: Any, sent_ns: int) -> Iterable[Action]:
         stamp = to_nanoseconds(message.stamp)
         if (end := self._ends.get(stamp)) is not None:
             self._steering.on_recorded_step(stamp, end)
-        return self._steering.on_result(stamp, message.frame_id, sent_ns)
+        return self._messages.inputs["device/result"].take(message, sent_ns)
 
-    def _take_plane(self, message: Any, _: int) -> Iterable[Action]:
-        try:
-            plane = conversions.to_plane(message)
-            self._parameters.check_plane(plane)
-        except UserError as error:
-            self.notes.append(f"target_plane refused: {error}")
-            return ()
-        self._steering.control.plane = plane
-        return ()
+    def _take_plane(self, message: Any, sent_ns: int) -> Iterable[Action]:
+        actions = self._messages.inputs[TARGET_PLANE].take(message, sent_ns)
+        if self._messages.plane_complaint:
+            self.notes.append(f"target_plane refused: {self._messages.plane_complaint}")
+        return actions
 
     def _take_status(self, message: Any, _: int) -> Iterable[Action]:
         """Start, stop and lose patience where the recorded controller did.
@@ -172,7 +153,7 @@ class ControllerStage:
             self.notes.append(f"change of parameters refused: {error}")
             return ()
         if values != self._parameters:
-            values.change_steering(self._steering, self._parameters)
+            self._messages.change_parameters(values)
             self._parameters = values
         return ()
 
@@ -193,17 +174,7 @@ def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
             answered.append(to_nanoseconds(message.stamp))
             continue
         with contextlib.suppress(UserError):
-            sample = conversions.to_joint_sample(message, sent.time)
+            sample = to_joint_sample(message, sent.time)
             ends.update(dict.fromkeys(answered, sample))
             answered.clear()
     return ends
-
-
-def _messages(action: PublishUpdate) -> dict[str, Any]:
-    update, stamp, estimate = action.update, action.stamp_ns, action.update.estimate
-    return {
-        "needle/estimate": conversions.to_pose(estimate, stamp),
-        "needle/reduced_state": conversions.to_vector(estimate.reduced, stamp),
-        "needle/linearized_state": conversions.to_vector(estimate.linearized, stamp),
-        "needle/control_input": conversions.to_control_input(update, stamp),
-    }

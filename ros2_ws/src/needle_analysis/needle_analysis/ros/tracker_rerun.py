@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from needle_analysis.rerun.bag_pass import Output, stored
-from needle_bags.reading.bag_images import SIDES, TOPICS, plain_image
+from needle_bags.reading.bag_images import TOPICS, plain_image
 from needle_bags.reading.bag_order import SentMessage
-from needle_common.ros.conversions import to_nanoseconds
-from needle_tracker.answers.pair_answers import Answer, PairAnswers
+from needle_tracker.answers.pair_answers import Answer
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.ros import conversions
 from needle_tracker.ros.parameters import StereoTrackerParameters
+from needle_tracker.ros.tracker_messages import TrackerMessages, image_topic, output_messages
 
 
 class TrackerStage:
@@ -34,21 +33,13 @@ class TrackerStage:
     """
 
     def __init__(self, calibration: StereoCalibration, parameters: StereoTrackerParameters) -> None:
-        self._cameras = {"left": calibration.left, "right": calibration.right}
-        self._answers = PairAnswers(
-            calibration,
-            parameters.tracker_settings(calibration.phantom),
-            parameters.answering_settings(),
-        )
+        self._messages = TrackerMessages(calibration, parameters)
         self.pairs = 0
+        rows = {**self._messages.inputs, **self._messages.images}
         self._takers: dict[str, Callable[[Any, float], Iterable[Answer]]] = {
-            "joint_states": self._take_joints,
+            **{topic: row.take for topic, row in rows.items()},
             **{topic: self._taker_of(side) for topic, side in TOPICS.items()},
-            **{f"stereo/{side}/camera_info": self._info_taker_of(side) for side in SIDES},
         }
-        if parameters.heading_from_estimate:
-            self._takers["needle/estimate"] = self._take_estimate
-            self._takers["target_plane"] = self._take_plane
 
     @property
     def topics(self) -> frozenset[str]:
@@ -62,51 +53,18 @@ class TrackerStage:
 
     def finish(self, log_time: int) -> list[Output]:
         """Answer what still waits for joints at the bag's end."""
-        return self._publish(self._answers.ready(np.inf), log_time)
+        return self._publish(self._messages.answers.ready(np.inf), log_time)
 
     def _taker_of(self, side: str) -> Callable[[Any, float], Iterable[Answer]]:
-        def take(message: Any, now: float) -> Iterable[Answer]:
-            frame = conversions.to_frame(plain_image(message), side, self._cameras[side])
-            return self._answers.add_image(side, to_nanoseconds(message.header.stamp), frame, now)
-
-        return take
-
-    def _info_taker_of(self, side: str) -> Callable[[Any, float], Iterable[Answer]]:
-        def take(message: Any, _: float) -> Iterable[Answer]:
-            problem = conversions.other_resolution(message, side, self._cameras[side])
-            self._answers.add_contradiction(side, problem)
-            return ()
-
-        return take
-
-    def _take_joints(self, message: Any, now: float) -> Iterable[Answer]:
-        insertion = conversions.insertion_of(message)
-        if insertion is None:
-            return ()
-        return self._answers.add_insertion(to_nanoseconds(message.header.stamp), insertion, now)
-
-    def _take_estimate(self, message: Any, _: float) -> Iterable[Answer]:
-        rotation = conversions.rotation_of(message.pose.pose)
-        if rotation is not None:
-            sigma = conversions.roll_sigma_of(message.pose.covariance, rotation[:, 2])
-            self._answers.add_roll(to_nanoseconds(message.header.stamp), rotation, sigma)
-        return ()
-
-    def _take_plane(self, message: Any, _: float) -> Iterable[Answer]:
-        rotation = conversions.rotation_of(message.pose)
-        if rotation is not None:
-            self._answers.add_plane(rotation)
-        return ()
+        take = self._messages.images[image_topic(side)].take
+        return lambda message, now: take(plain_image(message), now)
 
     def _publish(self, answers: Iterable[Answer], log_time: int) -> list[Output]:
         outputs = []
         for answer in answers:
-            stamp, tip = answer.pair.stamp, answer.measured.tip
             self.pairs += 1
-            messages = {} if tip is None else {"needle/tip": conversions.to_tip(tip, stamp)}
-            messages["needle/tip_pose"] = conversions.to_tip_pose(answer.tip, stamp)
             outputs += [
-                Output(topic, log_time, stamp, stored(message))
-                for topic, message in messages.items()
+                Output(topic, log_time, answer.pair.stamp, stored(message))
+                for topic, message in output_messages(answer)
             ]
         return outputs

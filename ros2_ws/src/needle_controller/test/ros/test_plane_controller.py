@@ -87,7 +87,7 @@ class Bench:
         self.insertion = self.rotation = 0.0
         publishers = (self._joints, self._tips, self._results, self._device, self._planes)
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        commands = self.node._commands
+        commands = self.node._outputs["device/joint_trajectory"]
         self.until(lambda: commands.get_subscription_count() > 0)
         self.until(lambda: bool(self.received["needle/controller_status"]))
 

@@ -10,41 +10,29 @@ from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
-from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, Image, JointState
+from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.conversions import (
-    IMAGES,
-    IMAGES_BEST_EFFORT,
-    JOINT_STATES,
-    LATCHED,
-    RELIABLE,
-    to_nanoseconds,
-)
+from needle_common.ros.conversions import IMAGES, LATCHED, RELIABLE
 from needle_common.ros.discovery import AnsweringNodes, unpublished, unrecorded
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.annotation import annotate
-from needle_tracker.answers.health import Health
-from needle_tracker.answers.pair_answers import Answer, PairAnswers
+from needle_tracker.answers.pair_answers import Answer
 from needle_tracker.optics.calibration import SIDES, calibration_from, read_calibration
-from needle_tracker.ros.conversions import (
-    camera_info_problem,
-    insertion_of,
-    other_resolution,
-    roll_sigma_of,
-    rotation_of,
-    to_frame,
-    to_image,
-    to_tip,
-    to_tip_pose,
-)
+from needle_tracker.ros.conversions import to_image
 from needle_tracker.ros.parameters import StereoTrackerParameters
+from needle_tracker.ros.tracker_messages import (
+    OUTPUTS,
+    TrackerMessages,
+    image_topic,
+    output_messages,
+)
 from needle_tracker.tracking.track import TrackState
 
 HELP = """
@@ -59,7 +47,7 @@ _CHECK_PERIOD = 0.05  # [s]
 
 
 class StereoTrackerNode(WholeNode):
-    """The ROS shell of `pair_answers.PairAnswers`: converts, calls, publishes, reports.
+    """The ROS shell of `TrackerMessages`: hears, publishes, reports.
 
     Parameters
     ----------
@@ -79,39 +67,25 @@ class StereoTrackerNode(WholeNode):
         path = Path(parameters.calibration_file or default)
         text = read_calibration(path)
         calibration = calibration_from(text, path)
-        self._cameras = {"left": calibration.left, "right": calibration.right}
-        self._answers = PairAnswers(
-            calibration,
-            parameters.tracker_settings(calibration.phantom),
-            parameters.answering_settings(),
-        )
+        self._messages = TrackerMessages(calibration, parameters)
+        self._answers, self._health = self._messages.answers, self._messages.health
         rate = parameters.annotated_rate
         self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
         self._annotated_at = -math.inf
-        self._health = Health()
         # What every start begins with is not worth a warning in the log.
         self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
 
-        self._tip = self.create_publisher(PointStamped, "needle/tip", RELIABLE)
-        self._tip_pose = self.create_publisher(
-            PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE
-        )
+        self._outputs = {
+            topic: self.create_publisher(kind, topic, RELIABLE) for topic, kind in OUTPUTS.items()
+        }
         self._annotated = self.create_publisher(Image, "~/annotated_image", IMAGES)
         # So that whatever records the graph has what the tips were measured with.
         self._calibration = self.create_publisher(String, "~/calibration", LATCHED)
         self._calibration.publish(String(data=text))
         self._diagnostics = DiagnosticsPublisher(self)
-        self._sources: list[Subscription[Any]] = [
-            self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
-        ]
-        if parameters.heading_from_estimate:
-            estimates = self.create_subscription(
-                PoseWithCovarianceStamped, "needle/estimate", self._on_estimate, RELIABLE
-            )
-            self._sources.append(estimates)
-            self.create_subscription(PoseStamped, "target_plane", self._on_target, LATCHED)
+        sources = {row.topic: self._hear(row) for row in self._messages.inputs.values()}
+        self._sources = [heard for topic, heard in sources.items() if topic != "target_plane"]
         self._partners = AnsweringNodes(self)
-        self._image_quality = IMAGES if parameters.reliable_images else IMAGES_BEST_EFFORT
         self._hears_images = False
         if not parameters.wait_for_recorder:
             self._hear_images()
@@ -126,57 +100,33 @@ class StereoTrackerNode(WholeNode):
         self._report()
 
     def _waits_for(self) -> list[str]:
-        missing = unpublished(self, self._sources)
-        missing += [
-            f"publisher of {topic}"
-            for side in SIDES
-            if not self.count_publishers(topic := self.resolve_topic_name(_image_of(side)))
+        images = map(self.resolve_topic_name, map(image_topic, SIDES))
+        return [
+            *unpublished(self, self._sources),
+            *(f"publisher of {topic}" for topic in images if not self.count_publishers(topic)),
         ]
-        return missing
+
+    def _hear(self, row: TopicInput[Answer]) -> Subscription[Any]:
+        """Subscribe to a topic."""
+        return self.create_subscription(
+            row.kind,
+            row.topic,
+            lambda message: self._publish(row.take(message, time.monotonic())),
+            row.qos,
+        )
 
     def _hear_images(self) -> None:
         """Subscribe to the images."""
         self._hears_images = True
-        for side in SIDES:
-            self.create_subscription(
-                Image,
-                _image_of(side),
-                lambda message, side=side: self._on_image(side, message),
-                self._image_quality,
-            )
-            self.create_subscription(
-                CameraInfo,
-                f"stereo/{side}/camera_info",
-                lambda message, side=side: self._on_camera_info(side, message),
-                self._image_quality,
-            )
-
-    def _on_camera_info(self, side: str, message: CameraInfo) -> None:
-        camera = self._cameras[side]
-        self._health.camera_info[side] = camera_info_problem(message, side, camera)
-        self._answers.add_contradiction(side, other_resolution(message, side, camera))
-
-    def _on_joints(self, message: JointState) -> None:
-        insertion = insertion_of(message)
-        if insertion is None:
-            self._health.joints_without_insertion += 1
-            return
-        stamp = to_nanoseconds(message.header.stamp)
-        self._publish(self._answers.add_insertion(stamp, insertion, time.monotonic()))
-
-    def _on_image(self, side: str, message: Image) -> None:
-        now = time.monotonic()
-        self._health.image_came(side, now)
-        frame = to_frame(message, side, self._cameras[side])
-        stamp = to_nanoseconds(message.header.stamp)
-        self._publish(self._answers.add_image(side, stamp, frame, now))
+        for row in self._messages.images.values():
+            self._hear(row)
 
     def _check(self) -> None:
         # An answer that is sent before the recorder listens is not in the bag; a joint state that
         # is sent before its publisher knows this node comes never.
         if not (
             self._hears_images
-            or unrecorded(self, (self._tip, self._tip_pose))
+            or unrecorded(self, self._outputs.values())
             or self._partners.unaware_sources(self._sources)
         ):
             self._hear_images()
@@ -185,28 +135,14 @@ class StereoTrackerNode(WholeNode):
 
     def _publish(self, answers: Iterable[Answer]) -> None:
         for answer in answers:
-            stamp, measured = answer.pair.stamp, answer.measured
-            if measured.tip is not None:
-                self._tip.publish(to_tip(measured.tip, stamp))
-            self._tip_pose.publish(to_tip_pose(answer.tip, stamp))
+            for topic, message in output_messages(answer):
+                self._outputs[topic].publish(message)
             self._annotate(answer)
             now = time.monotonic()
             if answer.refused:
                 self._health.pair_refused(answer.refused, now)
-            self._health.pair_done(answer.arrival, now, measured)
+            self._health.pair_done(answer.arrival, now, answer.measured)
             self._report()
-
-    def _on_estimate(self, message: PoseWithCovarianceStamped) -> None:
-        rotation = rotation_of(message.pose.pose)
-        if rotation is None:
-            return
-        sigma = roll_sigma_of(message.pose.covariance, rotation[:, 2])
-        self._answers.add_roll(to_nanoseconds(message.header.stamp), rotation, sigma)
-
-    def _on_target(self, message: PoseStamped) -> None:
-        rotation = rotation_of(message.pose)
-        if rotation is not None:
-            self._answers.add_plane(rotation)
 
     def _annotate(self, answer: Answer) -> None:
         now = time.monotonic()
@@ -236,10 +172,6 @@ class StereoTrackerNode(WholeNode):
         if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
             self.get_logger().warning(f"{part}: {diagnostic.message}")
         self._told[part] = kind
-
-
-def _image_of(side: str) -> str:
-    return f"stereo/{side}/image_raw"
 
 
 def main() -> int:

@@ -83,7 +83,7 @@ class Bench:
         self._infos = outside.create_publisher(CameraInfo, "stereo/left/camera_info", IMAGES)
         publishers = [self._joints, self._infos, *self._images.values()]
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        answers = (self.node._tip, self.node._tip_pose)
+        answers = self.node._outputs.values()
         self.until(lambda: all(p.get_subscription_count() for p in answers))
 
     def close(self) -> None:
@@ -192,13 +192,13 @@ def test_no_image_is_taken_before_the_recorder_listens(context: Context) -> None
 
     try:
         recorder.create_subscription(PointStamped, "needle/tip", lambda _: None, RELIABLE)
-        spin_until(lambda: node._tip.get_subscription_count() == 1)
+        spin_until(lambda: node._outputs["needle/tip"].get_subscription_count() == 1)
         node._check()
         assert node.count_subscribers("stereo/left/image_raw") == 0
         recorder.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", lambda _: None, RELIABLE
         )
-        spin_until(lambda: node._tip_pose.get_subscription_count() == 1)
+        spin_until(lambda: node._outputs["needle/tip_pose"].get_subscription_count() == 1)
         node._check()
         # Nor before those who publish joints and estimates know this node.
         assert node.count_subscribers("stereo/left/image_raw") == 0

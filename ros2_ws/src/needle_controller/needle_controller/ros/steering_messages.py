@@ -1,0 +1,126 @@
+"""What each message does to the controller and what it makes of that: for the node and `rerun`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    Vector3Stamped,
+)
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from trajectory_msgs.msg import JointTrajectory
+
+from needle_common.errors import UserError
+from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds
+from needle_common.ros.topic_input import TopicInput
+from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendStep
+from needle_controller.ros import conversions
+from needle_controller.ros.parameters import PlaneControllerParameters
+
+OUTPUTS: Mapping[str, type[Any]] = {
+    "device/joint_trajectory": JointTrajectory,
+    "needle/estimate": PoseWithCovarianceStamped,
+    "needle/reduced_state": Vector3Stamped,
+    "needle/linearized_state": Vector3Stamped,
+    "needle/control_input": Vector3Stamped,
+}
+"""Relative topic to message class of what `output_messages` returns; all are sent RELIABLE."""
+
+
+class SteeringMessages:
+    """The step protocol behind messages: one row of `inputs` per topic.
+
+    Parameters
+    ----------
+    parameters : PlaneControllerParameters
+        The node's.
+
+    Attributes
+    ----------
+    steering : Steering
+        The protocol.
+    inputs : mapping of str to TopicInput
+        By relative topic; `take` gets the time of sending [ns].
+    bad_joints : int
+        Joint states refused.
+    joints_complaint, plane_complaint : str
+        What is wrong with the latest; empty where nothing is.
+    """
+
+    def __init__(self, parameters: PlaneControllerParameters) -> None:
+        self._parameters = parameters
+        self.steering = parameters.make_steering()
+        self.bad_joints = 0
+        self.joints_complaint = ""
+        self.plane_complaint = ""
+        self.inputs: dict[str, TopicInput[Action]] = {
+            row.topic: row
+            for row in (
+                TopicInput("joint_states", JointState, JOINT_STATES, self._take_joints),
+                TopicInput("device/status", DiagnosticStatus, LATCHED, self._take_device),
+                TopicInput("device/result", Header, RELIABLE, self._take_result),
+                TopicInput("needle/tip", PointStamped, RELIABLE, self._take_tip),
+                TopicInput(
+                    "needle/tip_pose", PoseWithCovarianceStamped, RELIABLE, self._take_tip_pose
+                ),
+                TopicInput("target_plane", PoseStamped, LATCHED, self._take_plane),
+            )
+        }
+
+    def change_parameters(self, parameters: PlaneControllerParameters) -> None:
+        """Take over other parameters while it runs."""
+        parameters.change_steering(self.steering, self._parameters)
+        self._parameters = parameters
+
+    def _take_joints(self, message: JointState, sent_ns: int) -> Iterable[Action]:
+        try:
+            sample = conversions.to_joint_sample(message, sent_ns)
+        except UserError as error:
+            self.bad_joints += 1
+            self.joints_complaint = str(error)
+            return [Log("warning", str(error), "joints")]
+        self.joints_complaint = ""
+        return self.steering.on_joints(sample)
+
+    def _take_device(self, message: DiagnosticStatus, _: int) -> Iterable[Action]:
+        return self.steering.on_device(conversions.to_device_status(message))
+
+    def _take_result(self, message: Header, sent_ns: int) -> Iterable[Action]:
+        return self.steering.on_result(to_nanoseconds(message.stamp), message.frame_id, sent_ns)
+
+    def _take_tip(self, message: PointStamped, _: int) -> Iterable[Action]:
+        return self.steering.on_tip(conversions.to_tip(message))
+
+    def _take_tip_pose(self, message: PoseWithCovarianceStamped, _: int) -> Iterable[Action]:
+        return self.steering.on_tip_pose(conversions.to_tip_covariance(message))
+
+    def _take_plane(self, message: PoseStamped, _: int) -> Iterable[Action]:
+        try:
+            plane = conversions.to_plane(message)
+            self._parameters.check_plane(plane)
+        except UserError as error:
+            self.plane_complaint = f"{error}; the last plane stays"
+            return [Log("warning", self.plane_complaint)]
+        self.plane_complaint = ""
+        self.steering.control.plane = plane
+        return [Log("info", f"target_plane at offset {plane.offset:g} m")]
+
+
+def output_messages(action: SendStep | PublishUpdate) -> list[tuple[str, Any]]:
+    """Return the messages of an action, each with its relative topic, in the order of sending."""
+    stamp = action.stamp_ns
+    if isinstance(action, SendStep):
+        return [("device/joint_trajectory", conversions.to_trajectory(action))]
+    estimate = action.update.estimate
+    return [
+        ("needle/estimate", conversions.to_pose(estimate, stamp)),
+        ("needle/reduced_state", conversions.to_vector(estimate.reduced, stamp)),
+        ("needle/linearized_state", conversions.to_vector(estimate.linearized, stamp)),
+        ("needle/control_input", conversions.to_control_input(action.update, stamp)),
+    ]
