@@ -236,25 +236,28 @@ def _progress_stream() -> TextIO:
     return os.fdopen(int(descriptor), "w", encoding="utf-8", buffering=1)
 
 
+def _spin(node: Node, end: EndRequest) -> int:
+    """Run the operator until its run is over; returns its exit code."""
+    assert isinstance(node, OperatorNode)
+    executor = executor_of(node)
+    try:
+        while not node.ended:
+            if end.wanted:
+                node.interrupt()
+            executor.spin_once(timeout_sec=0.05)
+        code = node.finish(executor)
+    finally:
+        executor.shutdown()
+    # Others end on the same signal: a run that failed for want of them was interrupted.
+    return EXIT_INTERRUPTED if end.wanted and code == EXIT_MISSED else code
+
+
 def main() -> int:
     """Run the operator; returns its exit code."""
-
-    def spin(node: Node, end: EndRequest) -> int:
-        assert isinstance(node, OperatorNode)
-        executor = executor_of(node)
-        try:
-            while not node.ended:
-                if end.wanted:
-                    node.interrupt()
-                executor.spin_once(timeout_sec=0.05)
-            return node.finish(executor)
-        finally:
-            executor.shutdown()
-
     return run_node(
         OperatorNode,
         help_text=HELP,
         parameters=OperatorParameters,
-        spin=spin,
+        spin=_spin,
         interrupted=EXIT_INTERRUPTED,
     )

@@ -182,6 +182,19 @@ def test_a_fault_ends_it_with_the_reason_in_one_line(scene: Scene) -> None:
     assert lines == ["operator: plane_controller FAULT: the needle is gone"]
 
 
+def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(scene: Scene) -> None:
+    rig = scene.rig
+    scene.until(lambda: rig.asked == STARTED)
+    # No answer comes: the operator waits for it while the signal comes.
+    rig.mute = {"device/enable"}
+    rig.tell_controller("FAULT", 7, "the device is gone")
+    scene.until(lambda: rig.asked[-1] == "device/enable False")
+    scene.operator.send_signal(signal.SIGINT)
+    code, said = scene.end()
+    assert code == 130, said
+    assert "the device is gone" in said
+
+
 @pytest.mark.parametrize("mute", STARTED)
 def test_an_answer_that_is_lost_is_asked_for_again(scene: Scene, mute: str) -> None:
     rig = scene.rig
