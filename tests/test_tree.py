@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from code_lines import ROOT, code_lines, modules
+from pytest_stages import LONG_FILES
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
@@ -55,3 +56,7 @@ def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
         if number > MOST_MODULES
     }
     assert not full
+
+
+def test_the_test_files_that_are_run_first_are_there() -> None:
+    assert [name for name in LONG_FILES if not (ROOT / "ros2_ws" / "src" / name).is_file()] == []

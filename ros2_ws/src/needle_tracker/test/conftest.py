@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable
@@ -70,13 +71,19 @@ def draw_line(
     shape: tuple[int, int], points: np.ndarray, width: float, level: float, background: float
 ) -> np.ndarray:
     """Return a float image with an anti-aliased polyline with square ends, by distance."""
-    image = np.full(shape, background)
     coverage = np.zeros(shape)
+    cover_line(coverage, points, width)
+    return background + (level - background) * coverage
+
+
+def cover_line(coverage: np.ndarray, points: np.ndarray, width: float) -> None:
+    """Raise the coverage of pixels, 0 to 1, to that of a polyline, about its pieces only."""
+    shape = coverage.shape
     last = len(points) - 2
     for i, (first, second) in enumerate(itertools.pairwise(points)):
         low = np.maximum(np.floor(np.minimum(first, second) - width), 0).astype(int)
         high = np.ceil(np.maximum(first, second) + width).astype(int) + 1
-        v, u = np.mgrid[low[1] : min(high[1], shape[0]), low[0] : min(high[0], shape[1])]
+        v, u = np.ogrid[low[1] : min(high[1], shape[0]), low[0] : min(high[0], shape[1])]
         length = float(np.linalg.norm(second - first))
         along_axis = (second - first) / length
         along = (u - first[0]) * along_axis[0] + (v - first[1]) * along_axis[1]
@@ -87,7 +94,6 @@ def draw_line(
         cover = cover * np.clip(along + (0.5 if i == 0 else 1.0), 0, 1)
         block = coverage[low[1] : high[1], low[0] : high[0]]
         np.maximum(block, cover, out=block)
-    return image + (level - background) * coverage
 
 
 def arc(length: float, curvature: float, roll: float, pitch: float = 0.0) -> np.ndarray:
@@ -109,33 +115,45 @@ def arc(length: float, curvature: float, roll: float, pitch: float = 0.0) -> np.
     )
 
 
+def _light_and_dark(view: RefractedCamera) -> tuple[np.ndarray, np.ndarray]:
+    """Return the background of a view, and how far sheath and entry hole cover its pixels."""
+    shape = (view.camera.height, view.camera.width)
+    v, u = np.mgrid[0 : shape[0], 0 : shape[1]]
+    hole = view.project(np.zeros(3))
+    dark = (np.hypot(u - hole[0], v - hole[1]) < 6.0).astype(float)
+    cover_line(dark, view.project(np.array([[0.0, 0.0, -0.02], [0.0, 0.0, 0.0]])), 14.0)
+    return 150.0 + 30.0 * np.sin(u / 300.0) + 25.0 * np.cos(v / 250.0), dark
+
+
+@functools.lru_cache(maxsize=2)
+def _grain(shapes: tuple[tuple[int, int], ...], seed: int, noise: float) -> list[np.ndarray]:
+    """Return the images' noise; most tests draw one pair after another with the same."""
+    rng = np.random.default_rng(seed)
+    return [rng.normal(0.0, noise, shape) for shape in shapes]
+
+
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
 
 
 @pytest.fixture(scope="session")
 def draw_pair(views: tuple[RefractedCamera, RefractedCamera]) -> Drawer:
     """Return a function that draws a needle, its sheath and the entry hole into both views."""
+    empty = [_light_and_dark(view) for view in views]
 
     def draw(
         path: np.ndarray | None, seed: int = 0, noise: float = 3.0, bright: bool = False
     ) -> tuple[np.ndarray, np.ndarray]:
-        rng = np.random.default_rng(seed)
         images = []
-        for view in views:
-            camera = view.camera
-            shape = (camera.height, camera.width)
-            v, u = np.mgrid[0 : shape[0], 0 : shape[1]]
-            light = 150.0 + 30.0 * np.sin(u / 300.0) + 25.0 * np.cos(v / 250.0)
-            dark = np.zeros(shape)
-            sheath = view.project(np.array([[0.0, 0.0, -0.02], [0.0, 0.0, 0.0]]))
-            dark += draw_line(shape, sheath, 14.0, 1.0, 0.0)
-            hole = view.project(np.zeros(3))
-            dark = np.maximum(dark, np.hypot(u - hole[0], v - hole[1]) < 6.0)
+        for view, (light, always_dark), grain in zip(
+            views, empty, _grain(tuple(light.shape for light, _ in empty), seed, noise), strict=True
+        ):
+            dark = always_dark.copy()
             if path is not None:
-                dark = np.maximum(dark, draw_line(shape, view.project(path), 4.6, 1.0, 0.0))
-            sign = 1.0 if bright else -1.0
-            image = light + sign * 90.0 * dark + rng.normal(0.0, noise, shape)
-            images.append(np.clip(np.round(image), 0, 255).astype(np.uint8))
+                cover_line(dark, view.project(path), 4.6)
+            dark *= 90.0 if bright else -90.0
+            dark += light
+            dark += grain
+            images.append(np.clip(np.round(dark, out=dark), 0, 255, out=dark).astype(np.uint8))
         return images[0], images[1]
 
     return draw

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import fcntl
+import functools
 import os
 import tempfile
 from collections import Counter
@@ -25,6 +26,8 @@ from needle_common.files.plain_yaml import load_plain
 METADATA_FILE: Final = "metadata.yaml"
 METADATA_LIMIT: Final = 2**24
 _NEWEST_VERSION: Final = 9
+# Parsing a definition takes 10 ms: a bag of every topic of a rig is parsed once.
+_TYPES_KEPT: Final = 128
 
 
 class SentMessage(NamedTuple):
@@ -223,11 +226,9 @@ class BagDirectory:
         for topic in self.topics.values():
             # A text that is no definition, or another type's, makes its own messages unreadable.
             with contextlib.suppress(Exception):
-                types = parsed_types(topic.encoding, topic.definition, topic.type_name)
-                alone = get_typestore(Stores.EMPTY)
-                alone.register(types)
-                if topic.type_hash in ("", alone.hash_rihs01(topic.type_name)):
-                    store.register(types)
+                of_text = (topic.encoding, topic.definition, topic.type_name)
+                if topic.type_hash in ("", _definition_hash(*of_text)):
+                    store.register(parsed_types(*of_text))
         return store
 
     def deserialize(self, store: Typestore, message: SentMessage) -> Any:
@@ -314,10 +315,11 @@ class BagDirectory:
             )
 
 
+@functools.lru_cache(maxsize=_TYPES_KEPT)
 def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, Any]:
-    """Return the types that a schema's text defines; none for a text that is none."""
+    """Return the types that a schema's text defines, to be read; none for a text that is none."""
     if encoding == "ros2msg":
-        return dict(get_types_from_msg(definition, type_name))
+        return get_types_from_msg(definition, type_name)
     if encoding not in ("ros2idl", "omgidl"):
         return {}
     separator = "=" * 80 + "\n"
@@ -326,3 +328,10 @@ def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, An
     for part in parts:
         found.update(get_types_from_idl(part.partition("\n")[2] if len(parts) > 1 else part))
     return found
+
+
+@functools.lru_cache(maxsize=_TYPES_KEPT)
+def _definition_hash(encoding: str, definition: str, type_name: str) -> str:
+    store = get_typestore(Stores.EMPTY)
+    store.register(parsed_types(encoding, definition, type_name))
+    return store.hash_rihs01(type_name)

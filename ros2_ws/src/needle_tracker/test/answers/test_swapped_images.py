@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,7 +24,13 @@ from needle_tracker.tracking.tracker_settings import default_settings
 Pair = tuple[float, np.ndarray, np.ndarray]
 
 
-def pairs(path: Path, scenario: str, seed: int, last_mm: int = 40) -> Iterator[Pair]:
+@functools.lru_cache(maxsize=1)
+def pairs(path: Path, scenario: str, seed: int, last_mm: int = 40) -> list[Pair]:
+    """Draw what the cameras see; tests of one scenario follow each other."""
+    return list(drawn(path, scenario, seed, last_mm))
+
+
+def drawn(path: Path, scenario: str, seed: int, last_mm: int) -> Iterator[Pair]:
     renderer = StereoRenderer(load_stereo_rig(path), seed, scenario=find_scenario(scenario))
     plant = NeedlePlant(initial_pose(math.radians(1.0 + seed), 0.5 * seed), curvature=8.2)
     for mm in range(1, last_mm + 1):
