@@ -121,16 +121,16 @@ class OperatorNode(WholeNode):
             for _ in range(RELEASES - 1):
                 executor.spin_once(timeout_sec=0.02)
                 self._send_hold(pressed=False)
-        timeout = DISABLE_TIMEOUT_INTERRUPTED if outcome.interrupted else DISABLE_TIMEOUT
-        deadline = time.monotonic() + timeout
-        while disabled is not None and not disabled.done() and time.monotonic() < deadline:
-            executor.spin_once(timeout_sec=0.05)
         line = f"operator: {outcome.reason}"
         supervised = self._progress.stream is not sys.stderr
         # Whoever supervises knows why it interrupts, and says so.
         self._progress.close("" if supervised and outcome.interrupted else line)
         if supervised:
             print(line, file=sys.stderr)
+        timeout = DISABLE_TIMEOUT_INTERRUPTED if outcome.interrupted else DISABLE_TIMEOUT
+        deadline = time.monotonic() + timeout
+        while disabled is not None and not disabled.done() and time.monotonic() < deadline:
+            executor.spin_once(timeout_sec=0.05)
         if outcome.interrupted:
             return EXIT_INTERRUPTED
         if not outcome.prepared:
