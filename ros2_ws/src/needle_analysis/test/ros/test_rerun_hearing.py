@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 from collections import defaultdict, deque
 from itertools import chain
@@ -42,22 +43,36 @@ ROOM = 10
 OUTPUTS = {f"/{topic}" for topic in TYPES if topic not in DELAYS}
 
 
+@functools.cache
+def settings() -> PlaneControllerParameters:
+    run = read_run(BAG)
+    names = PlaneControllerParameters.__dataclass_fields__
+    known = {n: run.parameter("plane_controller", n) for n in names}
+    values: dict[str, Any] = {
+        n: tuple(v) if isinstance(v, list) else v for n, v in known.items() if v is not None
+    }
+    return PlaneControllerParameters(**values)
+
+
+@functools.cache
+def ends() -> dict[int, Any]:
+    return step_ends(BAG, "/")
+
+
+@functools.cache
+def recorded() -> tuple[list[SentMessage], int]:
+    """What the controller did not send, and when it was started."""
+    kept = read_contents(BAG).topics.keys() - OUTPUTS - {STATUS}
+    messages = list(raw_as_sent(BAG, kept.__contains__, lambda _: False))
+    statuses = raw_as_sent(BAG, STATUS.__eq__, lambda _: False)
+    return messages, next(status.time for status in statuses if b"STEERING" in status.data)
+
+
 class LateController:
     """Hears a bag's messages late, and writes what it does to a copy of the bag."""
 
     def __init__(self) -> None:
-        run = read_run(BAG)
-        names = PlaneControllerParameters.__dataclass_fields__
-        known = {n: run.parameter("plane_controller", n) for n in names}
-        values: dict[str, Any] = {
-            n: tuple(v) if isinstance(v, list) else v for n, v in known.items() if v is not None
-        }
-        self.stage = ControllerStage(
-            PlaneControllerParameters(**values),
-            "/plane_controller",
-            step_ends(BAG, "/"),
-            frozenset(),
-        )
+        self.stage = ControllerStage(settings(), "/plane_controller", ends(), frozenset())
         self.heard = HeardMessages()
         self.said: Any = None
         self.sent: list[tuple[int, str, bytes]] = []
@@ -90,11 +105,8 @@ def late_bag(folder: Path, source: random.Random) -> Path:
     """A copy of the committed bag, as if its controller had been slow and had hung at times."""
     contents = read_contents(BAG)
     copy = BagCopy(folder, contents.distribution, contents.custom_data)
-    kept = contents.topics.keys() - OUTPUTS - {STATUS}
-    messages = list(raw_as_sent(BAG, kept.__contains__, lambda _: False))
+    messages, start = recorded()
     controller = LateController()
-    statuses = raw_as_sent(BAG, STATUS.__eq__, lambda _: False)
-    start = next(status.time for status in statuses if b"STEERING" in status.data)
     is_started = False
     for time, message in heard(messages, source):
         if time > start and not is_started:

@@ -26,8 +26,8 @@ from needle_common.files.plain_yaml import load_plain
 METADATA_FILE: Final = "metadata.yaml"
 METADATA_LIMIT: Final = 2**24
 _NEWEST_VERSION: Final = 9
-# Parsing a definition takes 10 ms: a bag of every topic of a rig is parsed once.
-_TYPES_KEPT: Final = 128
+# A rig's definitions take 0.2 s to be understood, and a bag is read several times.
+_STORES_KEPT: Final = 4
 
 
 class SentMessage(NamedTuple):
@@ -219,17 +219,14 @@ class BagDirectory:
                     yield SentMessage(sent, log_time, topic, type_name, plain)
 
     def typestore(self) -> Typestore:
-        """Return the types that the bag defines; Jazzy's if it defines none."""
-        if not any(topic.definition for topic in self.topics.values()):
-            return get_typestore(Stores.ROS2_JAZZY)
-        store = get_typestore(Stores.EMPTY)
-        for topic in self.topics.values():
-            # A text that is no definition, or another type's, makes its own messages unreadable.
-            with contextlib.suppress(Exception):
-                of_text = (topic.encoding, topic.definition, topic.type_name)
-                if topic.type_hash in ("", _definition_hash(*of_text)):
-                    store.register(parsed_types(*of_text))
-        return store
+        """Return the types that the bag defines, to be read; Jazzy's if it defines none."""
+        return _typestore(
+            tuple(
+                (topic.encoding, topic.definition, topic.type_name, topic.type_hash)
+                for topic in self.topics.values()
+                if topic.definition
+            )
+        )
 
     def deserialize(self, store: Typestore, message: SentMessage) -> Any:
         """Return a message's content.
@@ -315,11 +312,10 @@ class BagDirectory:
             )
 
 
-@functools.lru_cache(maxsize=_TYPES_KEPT)
 def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, Any]:
-    """Return the types that a schema's text defines, to be read; none for a text that is none."""
+    """Return the types that a schema's text defines; none for a text that is none."""
     if encoding == "ros2msg":
-        return get_types_from_msg(definition, type_name)
+        return dict(get_types_from_msg(definition, type_name))
     if encoding not in ("ros2idl", "omgidl"):
         return {}
     separator = "=" * 80 + "\n"
@@ -330,8 +326,18 @@ def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, An
     return found
 
 
-@functools.lru_cache(maxsize=_TYPES_KEPT)
-def _definition_hash(encoding: str, definition: str, type_name: str) -> str:
+@functools.lru_cache(maxsize=_STORES_KEPT)
+def _typestore(definitions: tuple[tuple[str, str, str, str], ...]) -> Typestore:
+    """Return the types of definitions, each its encoding, text, type and hash."""
+    if not definitions:
+        return get_typestore(Stores.ROS2_JAZZY)
     store = get_typestore(Stores.EMPTY)
-    store.register(parsed_types(encoding, definition, type_name))
-    return store.hash_rihs01(type_name)
+    for encoding, text, type_name, type_hash in definitions:
+        # A text that is no definition, or another type's, makes its own messages unreadable.
+        with contextlib.suppress(Exception):
+            types = parsed_types(encoding, text, type_name)
+            alone = get_typestore(Stores.EMPTY)
+            alone.register(types)
+            if type_hash in ("", alone.hash_rihs01(type_name)):
+                store.register(types)
+    return store
