@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import BagTopic, OfferedQos
+from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
 from needle_bags.format.bag_writer import BagWriter
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -79,14 +80,14 @@ class SyntheticBag:
     def put(self, topic: str, type_name: str, content: Any, *, latched: bool = False) -> None:
         name = topic if topic.startswith("/") else self.namespace + topic
         if name not in self.channels:
-            durability = "transient_local" if latched else "volatile"
+            durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
             self.channels[name] = self.bag.add_topic(
                 BagTopic(
                     name,
                     type_name,
                     STORE.generate_msgdef(type_name, ros_version=2)[0],
                     STORE.hash_rihs01(type_name),
-                    (OfferedQos(durability=durability),),
+                    (USUAL_QOS._replace(durability=durability),),
                 )
             )
         data = bytes(STORE.serialize_cdr(content, type_name))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import BagTopic, OfferedQos
+from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
 from needle_bags.format.bag_writer import BagWriteError, BagWriter
 from needle_common.errors import UserError
 
@@ -19,7 +19,7 @@ _STORE = get_typestore(Stores.ROS2_JAZZY)
 def standard_topic(name: str, type_name: str) -> BagTopic:
     """Return a topic of a standard type, for messages that the bag did not have."""
     definition, _ = _STORE.generate_msgdef(type_name, ros_version=2)
-    return BagTopic(name, type_name, definition, _STORE.hash_rihs01(type_name), (OfferedQos(),))
+    return BagTopic(name, type_name, definition, _STORE.hash_rihs01(type_name), (USUAL_QOS,))
 
 
 def standard_text(text: str) -> bytes:

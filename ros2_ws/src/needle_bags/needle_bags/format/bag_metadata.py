@@ -8,6 +8,15 @@ from pathlib import Path
 from typing import Any, Final
 
 import yaml
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
 
 from needle_common.files.bag_directory import METADATA_FILE
 from needle_common.files.file_access import replace_file
@@ -16,99 +25,22 @@ from needle_common.files.plain_yaml import load_plain
 METADATA_VERSION: Final = 9
 # Name of the MCAP metadata records that rosbag2 writes.
 METADATA_RECORD: Final = "rosbag2"
-INFINITE_NS: Final = 2**63 - 1
-_NANOSECONDS: Final = 1_000_000_000
-# rmw's enumerations: up to version 8 policies are written as these numbers.
-_HISTORIES: Final = ("system_default", "keep_last", "keep_all", "unknown")
-_RELIABILITIES: Final = ("system_default", "reliable", "best_effort", "unknown", "best_available")
-_DURABILITIES: Final = (
-    "system_default",
-    "transient_local",
-    "volatile",
-    "unknown",
-    "best_available",
-)
-_LIVELINESSES: Final = (
-    "system_default",
-    "automatic",
-    "manual_by_node",
-    "manual_by_topic",
-    "unknown",
-    "best_available",
+_NO_LIMIT: Final = QosTime(*divmod(2**63 - 1, 10**9))
+# What a publisher offers of which nothing else is known.
+USUAL_QOS: Final = Qos(
+    QosHistory.UNKNOWN,
+    0,
+    QosReliability.RELIABLE,
+    QosDurability.VOLATILE,
+    _NO_LIMIT,
+    _NO_LIMIT,
+    QosLiveliness.AUTOMATIC,
+    _NO_LIMIT,
+    False,
 )
 
 
-@dataclasses.dataclass(frozen=True)
-class OfferedQos:
-    """Quality of service that one publisher offers, in rosbag2's words.
-
-    Attributes
-    ----------
-    history, reliability, durability, liveliness : str
-        Names of rmw's policies in lower case, e.g. `keep_last`, `transient_local`.
-    depth : int
-        Queue length; 0 where DDS does not tell it.
-    deadline, lifespan, lease_duration : int
-        Durations in ns; `INFINITE_NS` for none.
-    """
-
-    history: str = "unknown"
-    depth: int = 0
-    reliability: str = "reliable"
-    durability: str = "volatile"
-    deadline: int = INFINITE_NS
-    lifespan: int = INFINITE_NS
-    liveliness: str = "automatic"
-    lease_duration: int = INFINITE_NS
-
-    def as_rosbag2(self) -> dict[str, Any]:
-        """Return the profile as metadata.yaml has it from version 9 on."""
-
-        def duration(nanoseconds: int) -> dict[str, int]:
-            return {"sec": nanoseconds // _NANOSECONDS, "nsec": nanoseconds % _NANOSECONDS}
-
-        return {
-            "history": self.history,
-            "depth": self.depth,
-            "reliability": self.reliability,
-            "durability": self.durability,
-            "deadline": duration(self.deadline),
-            "lifespan": duration(self.lifespan),
-            "liveliness": self.liveliness,
-            "liveliness_lease_duration": duration(self.lease_duration),
-            "avoid_ros_namespace_conventions": False,
-        }
-
-    @classmethod
-    def from_rosbag2(cls, profile: Mapping[str, Any]) -> OfferedQos:
-        """Return the profile that metadata.yaml or an MCAP channel has, of any version.
-
-        Raises
-        ------
-        KeyError, TypeError, ValueError, IndexError
-            If it is none.
-        """
-
-        def duration(key: str) -> int:
-            return int(profile[key]["sec"]) * _NANOSECONDS + int(profile[key]["nsec"])
-
-        def policy(key: str, names: Sequence[str]) -> str:
-            value = profile[key]
-            return names[value] if isinstance(value, int) else str(value).lower()
-
-        return cls(
-            history=policy("history", _HISTORIES),
-            depth=int(profile["depth"]),
-            reliability=policy("reliability", _RELIABILITIES),
-            durability=policy("durability", _DURABILITIES),
-            deadline=duration("deadline"),
-            lifespan=duration("lifespan"),
-            liveliness=policy("liveliness", _LIVELINESSES),
-            lease_duration=duration("liveliness_lease_duration"),
-        )
-
-
-def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[OfferedQos, ...]:
+def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, ...]:
     """Return the profiles that metadata.yaml or an MCAP channel has; none if it has other things.
 
     Parameters
@@ -117,9 +49,17 @@ def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Offer
         As they are from version 9 on, or as YAML text.
     """
     try:
-        found = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
-        return tuple(OfferedQos.from_rosbag2(profile) for profile in found)
-    except (ValueError, TypeError, KeyError, IndexError):
+        found: Any = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
+        return tuple(
+            qos._replace(
+                depth=int(qos.depth),
+                deadline=QosTime(*map(int, qos.deadline)),
+                lifespan=QosTime(*map(int, qos.lifespan)),
+                liveliness_lease_duration=QosTime(*map(int, qos.liveliness_lease_duration)),
+            )
+            for qos in parse_qos(found)
+        )
+    except (ValueError, TypeError, KeyError, AttributeError):
         return ()
 
 
@@ -137,7 +77,7 @@ class BagTopic:
         Full definition text (`message_definitions.full_definition`).
     type_hash : str
         `RIHS01_...` as the publishers announce it, or an empty text.
-    offered_qos : tuple of OfferedQos
+    offered_qos : tuple of Qos
         One for each publisher.
     """
 
@@ -145,11 +85,16 @@ class BagTopic:
     type_name: str
     definition: str
     type_hash: str = ""
-    offered_qos: tuple[OfferedQos, ...] = ()
+    offered_qos: tuple[Qos, ...] = ()
+
+    @property
+    def is_latched(self) -> bool:
+        """Whether late joiners get a publisher's last messages."""
+        return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in self.offered_qos)
 
     def channel_metadata(self) -> dict[str, str]:
         """Return what an MCAP channel says about the topic."""
-        profiles = [qos.as_rosbag2() for qos in self.offered_qos]
+        profiles = dump_qos_v9(list(self.offered_qos))
         return {
             "offered_qos_profiles": to_yaml(profiles).strip() if profiles else "",
             "topic_type_hash": self.type_hash,
@@ -251,7 +196,7 @@ def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
         "name": topic.name,
         "type": topic.type_name,
         "serialization_format": "cdr",
-        "offered_qos_profiles": [qos.as_rosbag2() for qos in topic.offered_qos],
+        "offered_qos_profiles": dump_qos_v9(list(topic.offered_qos)),
         "type_description_hash": topic.type_hash,
     }
 

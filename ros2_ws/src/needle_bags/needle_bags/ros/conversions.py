@@ -12,8 +12,14 @@ from rclpy.qos import (
     ReliabilityPolicy,
 )
 from rclpy.topic_endpoint_info import TopicEndpointInfo
-
-from needle_bags.format.bag_metadata import OfferedQos
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 
 IMAGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage")
 # DDS does not tell a publisher's depth. What late joiners get of a latched topic; and what a
@@ -23,22 +29,23 @@ UNKNOWN_IMAGE_DEPTH = 30
 UNKNOWN_DEPTH = 500
 
 
-def offered_qos(offer: TopicEndpointInfo) -> OfferedQos:
+def offered_qos(offer: TopicEndpointInfo) -> Qos:
     """Return what a publisher of the graph offers."""
     qos = offer.qos_profile
 
-    def nanoseconds(duration: Duration) -> int:
-        return int(duration.nanoseconds)
+    def time(duration: Duration) -> QosTime:
+        return QosTime(*divmod(int(duration.nanoseconds), 10**9))
 
-    return OfferedQos(
-        history=qos.history.name.lower(),
-        depth=int(qos.depth),
-        reliability=qos.reliability.name.lower(),
-        durability=qos.durability.name.lower(),
-        deadline=nanoseconds(qos.deadline),
-        lifespan=nanoseconds(qos.lifespan),
-        liveliness=qos.liveliness.name.lower(),
-        lease_duration=nanoseconds(qos.liveliness_lease_duration),
+    return Qos(
+        QosHistory[qos.history.name],
+        int(qos.depth),
+        QosReliability[qos.reliability.name],
+        QosDurability[qos.durability.name],
+        time(qos.deadline),
+        time(qos.lifespan),
+        QosLiveliness[qos.liveliness.name],
+        time(qos.liveliness_lease_duration),
+        False,
     )
 
 
@@ -57,7 +64,7 @@ def strictest_request(offers: Sequence[TopicEndpointInfo], depth: int) -> QoSPro
     )
 
 
-def recorded_offer(type_name: str, offers: Sequence[OfferedQos]) -> QoSProfile:
+def recorded_offer(type_name: str, offers: Sequence[Qos]) -> QoSProfile:
     """Return the offer that serves whoever was served by the recorded ones.
 
     One recorded offer is given as it was. Of several, the stronger of each policy: it matches
@@ -66,9 +73,9 @@ def recorded_offer(type_name: str, offers: Sequence[OfferedQos]) -> QoSProfile:
     unknown_depth = UNKNOWN_IMAGE_DEPTH if type_name in IMAGE_TYPES else UNKNOWN_DEPTH
     if not offers:
         return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=unknown_depth)
-    keep_all = any(offer.history == "keep_all" for offer in offers)
-    reliable = any(offer.reliability != "best_effort" for offer in offers)
-    latched = any(offer.durability == "transient_local" for offer in offers)
+    keep_all = any(offer.history == QosHistory.KEEP_ALL for offer in offers)
+    reliable = any(offer.reliability != QosReliability.BEST_EFFORT for offer in offers)
+    latched = any(offer.durability == QosDurability.TRANSIENT_LOCAL for offer in offers)
     if latched:
         unknown_depth = UNKNOWN_LATCHED_DEPTH
     return QoSProfile(
@@ -76,6 +83,10 @@ def recorded_offer(type_name: str, offers: Sequence[OfferedQos]) -> QoSProfile:
         depth=max(offer.depth for offer in offers) or unknown_depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        lifespan=Duration(nanoseconds=max(offer.lifespan for offer in offers)),
-        deadline=Duration(nanoseconds=min(offer.deadline for offer in offers)),
+        lifespan=_duration(max(offer.lifespan for offer in offers)),
+        deadline=_duration(min(offer.deadline for offer in offers)),
     )
+
+
+def _duration(time: QosTime) -> Duration:
+    return Duration(seconds=time.sec, nanoseconds=time.nsec)

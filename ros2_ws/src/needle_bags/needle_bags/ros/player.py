@@ -204,11 +204,7 @@ class Player(WholeNode):
 
     def _publish_latched(self, before: int) -> None:
         """Publish what late joiners would have got at a time of recording [ns]."""
-        latched = {
-            name
-            for name, topic in self._topics.items()
-            if any(offer.durability == "transient_local" for offer in topic.offered_qos)
-        }
+        latched = {name for name, topic in self._topics.items() if topic.is_latched}
         if before == self._contents.start or not latched:
             return
         last: dict[str, Message] = {}

@@ -145,8 +145,7 @@ class Recorder(WholeNode):
 
     def _take_topic(self, topic: BagTopic) -> None:
         self.recording.add_topic(topic)
-        latched = any(offer.durability == "transient_local" for offer in topic.offered_qos)
-        if self._recent is not None and latched:
+        if self._recent is not None and topic.is_latched:
             self._recent.latch(topic.name)
 
     def _take(self, message: Received) -> None:

@@ -10,11 +10,11 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import QosDurability, QosHistory, QosReliability
+from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from needle_bags.format.bag_metadata import BagTopic, OfferedQos
+from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
 from needle_bags.recording.recording import WAITING_LIMIT, Received, Recording
@@ -63,8 +63,12 @@ def pose(number: int) -> bytes:
 def write_poses(directory: Path, count: int) -> None:
     bag = BagWriter(directory, chunk_size=4096)
     qos = (
-        OfferedQos(history="keep_last", depth=10),
-        OfferedQos(reliability="best_effort", durability="transient_local", lifespan=10**10 + 7),
+        USUAL_QOS._replace(history=QosHistory.KEEP_LAST, depth=10),
+        USUAL_QOS._replace(
+            reliability=QosReliability.BEST_EFFORT,
+            durability=QosDurability.TRANSIENT_LOCAL,
+            lifespan=QosTime(10, 7),
+        ),
     )
     topic = BagTopic("/needle/tip_pose", TYPE, full_definition(TYPE), STORE.hash_rihs01(TYPE), qos)
     channel = bag.add_topic(topic)

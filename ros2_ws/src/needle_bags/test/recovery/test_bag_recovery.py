@@ -11,7 +11,7 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 
 from needle_analysis.report import report
-from needle_bags.format.bag_metadata import BagTopic, OfferedQos
+from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.reading.bag_files import raw_messages, read_contents
 from needle_bags.reading.bag_reader import read_run
@@ -23,7 +23,7 @@ MakeRun = Callable[..., Path]
 TYPE = "std_msgs/msg/String"
 DEFINITION = "string data\n"
 HASH = "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
-LATCHED = OfferedQos(durability="transient_local")
+LATCHED = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
 
 
 def write(path: Path, count: int = 300, **how: int | str) -> Path:

@@ -23,13 +23,14 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
+from rosbags.interfaces import Qos, QosDurability, QosReliability
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool, Int32, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_bags.format.bag_metadata import BagTopic, OfferedQos
+from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition, type_hash
 from needle_bags.ros import player as player_node
@@ -37,6 +38,7 @@ from needle_common.process.ros_domain import own_domain
 
 PATIENCE = 30.0
 START = 1_700_000_000_000_000_000
+KEPT = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 BEST_EFFORT = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
 GUARDED = {
@@ -102,16 +104,12 @@ class Bag:
         self.writer = BagWriter(path)
         self.topics: dict[str, int] = {}
 
-    def put(
-        self, topic: str, message: Any, seconds: float, offer: OfferedQos | None = None
-    ) -> None:
+    def put(self, topic: str, message: Any, seconds: float, offer: Qos = USUAL_QOS) -> None:
         if topic not in self.topics:
             package, kind = type(message).__module__.split(".")[0], type(message).__name__
             name = f"{package}/msg/{kind}"
             definition = full_definition(name)
-            known = BagTopic(
-                topic, name, definition, type_hash(name, definition), (offer or OfferedQos(),)
-            )
+            known = BagTopic(topic, name, definition, type_hash(name, definition), (offer,))
             self.topics[topic] = self.writer.add_topic(known)
         time_ns = START + round(seconds * 1e9)
         self.writer.write(self.topics[topic], serialize_message(message), time_ns, time_ns)
@@ -119,11 +117,21 @@ class Bag:
 
 def make_bag(path: Path, count: int = 50, period: float = 0.01) -> Path:
     bag = Bag(path)
-    bag.put("/plane", String(data="latched"), 0.0, OfferedQos(durability="transient_local"))
+    bag.put(
+        "/plane",
+        String(data="latched"),
+        0.0,
+        USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL),
+    )
     for number in range(count):
         seconds = number * period
         bag.put("/numbered", Int32(data=number), seconds)
-        bag.put("/noisy", Int32(data=number), seconds, OfferedQos(reliability="best_effort"))
+        bag.put(
+            "/noisy",
+            Int32(data=number),
+            seconds,
+            USUAL_QOS._replace(reliability=QosReliability.BEST_EFFORT),
+        )
         bag.put("/clock", Clock(), seconds)
         for topic, kind in GUARDED.items():
             bag.put(topic, kind(), seconds)
