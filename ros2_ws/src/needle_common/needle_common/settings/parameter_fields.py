@@ -41,43 +41,15 @@ class ParameterSpec:
     texts: bool = False
 
 
-def parameter(
-    default: Any,
-    *,
-    unit: str,
-    description: str,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    choices: tuple[str, ...] = (),
-    read_only: bool = False,
-    texts: bool = False,
-) -> Any:
-    """Declare a field of a parameter dataclass; the arguments are those of `ParameterSpec`."""
-    spec = ParameterSpec(unit, description, lower, upper, choices, read_only, texts)
-    return dataclasses.field(default=default, metadata={_METADATA_KEY: spec})
+def parameter(default: Any, **spec: Any) -> Any:
+    """Declare a field of a parameter dataclass; the keywords are those of `ParameterSpec`."""
+    return dataclasses.field(default=default, metadata={_METADATA_KEY: ParameterSpec(**spec)})
 
 
-def fixed_parameter(
-    default: Any,
-    unit: str,
-    description: str,
-    lower: float = -math.inf,
-    upper: float = math.inf,
-    *,
-    choices: tuple[str, ...] = (),
-    texts: bool = False,
-) -> Any:
-    """Declare a field whose value is fixed once the node runs; otherwise as `parameter`."""
-    return parameter(
-        default,
-        unit=unit,
-        description=description,
-        lower=lower,
-        upper=upper,
-        choices=choices,
-        read_only=True,
-        texts=texts,
-    )
+def fixed_parameter(default: Any, *spec: Any, **more: Any) -> Any:
+    """Declare a field whose value is fixed once the node runs, by the arguments of the spec."""
+    fixed = dataclasses.replace(ParameterSpec(*spec, **more), read_only=True)
+    return dataclasses.field(default=default, metadata={_METADATA_KEY: fixed})
 
 
 def specs(parameters: Any) -> Iterator[tuple[str, ParameterSpec, Any]]:
