@@ -21,6 +21,7 @@ from typing import Any
 
 import pytest
 
+import setup_progress
 import setup_workspace
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -328,7 +329,7 @@ def test_a_moved_checkout_gets_a_new_environment(
     workspace.main()
     commands.names.clear()
     monkeypatch.setattr(workspace, "ROOT", Path("/elsewhere"))
-    monkeypatch.setattr(workspace, "check_space", lambda: None)
+    monkeypatch.setattr(workspace, "check_space", lambda _folder: None)
     monkeypatch.setattr(workspace, "exclusive", lambda: contextlib.nullcontext(-1))
     assert workspace.main() == 0
     assert commands.names == FIRST
@@ -489,7 +490,7 @@ def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Wor
 def test_a_phase_shows_that_it_goes_on(
     workspace: Workspace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(workspace, "TICK_OF_LINES", 0.01)
+    monkeypatch.setattr(setup_progress, "TICK_OF_LINES", 0.01)
     with workspace.Phase("unpacking"):
         said = capsys.readouterr().err
         while said.count("\n") < 3:

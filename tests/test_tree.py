@@ -10,7 +10,7 @@ from pytest_stages import LONG_FILES
 LONGEST_MODULE = 400
 MOST_MODULES = 15
 # How many are longer today; it only ever becomes less.
-LONG_MODULES = 18
+LONG_MODULES = 12
 SOURCE = '''"""A docstring.
 
 Of three lines.

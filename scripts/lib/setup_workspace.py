@@ -5,9 +5,7 @@ from __future__ import annotations
 import argparse
 import configparser
 import contextlib
-import errno
 import fcntl
-import hashlib
 import os
 import platform
 import re
@@ -16,11 +14,16 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
+
+# Python runs this without the folder of scripts on its path.
+sys.path.insert(0, str(Path(__file__).parent))
+
+from setup_errors import SetupError, check_machine, check_space, describe, explain
+from setup_files import digest, read, requirement, runnable, write
+from setup_progress import Phase, say
 
 ROOT = Path(__file__).resolve().parents[2]
 VENV = ROOT / ".venv"
@@ -33,87 +36,14 @@ LOG = WORKSPACE / "log" / "setup.log"
 STAND_IN = Path(__file__).with_name("ros2_standin.py")
 
 LOCKS = {"wheels": ROOT / "requirements.lock", "ros": ROOT / "requirements-ros.lock"}
-# The environment itself, and pip's downloads until they are unpacked.
-NEEDED_BYTES = 1_800_000_000
-# PyPI's ROS wheels are built for manylinux_2_28.
-OLDEST_GLIBC = (2, 28)
-# Linux cuts a script's first line off after this many bytes (127 before 5.1).
-LONGEST_SHEBANG = 127
-
 COLCON = "import sys; from colcon_core.command import main; sys.exit(main())"
 IMPORT_CHECK = (
     "import canopen, cv2, matplotlib, mcap, numpy, rclpy, rosbags, scipy, sensor_msgs.msg, yaml"
 )
 
 
-class SetupError(Exception):
-    """Something is missing; the message is the one line that says what."""
-
-
 class CommandFailedError(Exception):
     """A command ended with an error; its output is in the log."""
-
-
-def say(text: str) -> None:
-    """Print one line of progress."""
-    print(f"setup: {text}", file=sys.stderr, flush=True)
-
-
-# How often progress is shown on a terminal, and where each time is a line of its own [s].
-TICK = 1.0
-TICK_OF_LINES = 30.0
-
-
-class Phase:
-    """One line of progress, updated in place on a terminal, within a `with` block."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-        self._start = time.monotonic()
-        self._live = sys.stderr.isatty()
-        self._detail = ""
-        self._over = threading.Event()
-        self._ticks = threading.Thread(target=self._tick, daemon=True)
-
-    def __enter__(self) -> Phase:
-        self._print(" ...", "" if self._live else "\n")
-        self._ticks.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, _: BaseException | None, __: TracebackType | None
-    ) -> None:
-        self._over.set()
-        self._ticks.join()
-        if kind is None:
-            self._print(f": {self._seconds()} s", "\n")
-        elif self._live:
-            # The line stays as it is, before something else is printed.
-            print(file=sys.stderr)
-
-    def update(self, detail: str) -> None:
-        """Show how far it is."""
-        self._detail = detail
-        if self._live:
-            self._show()
-
-    def _tick(self) -> None:
-        """Show that it goes on while pip and compilers are silent, for minutes on slow machines."""
-        while not self._over.wait(TICK if self._live else TICK_OF_LINES):
-            self._show()
-
-    def _show(self) -> None:
-        self._print(
-            " ... " + ", ".join(filter(None, (self._detail, f"{self._seconds()} s"))),
-            "" if self._live else "\n",
-        )
-
-    def _seconds(self) -> str:
-        return f"{time.monotonic() - self._start:.0f}"
-
-    def _print(self, rest: str, end: str = "") -> None:
-        start = "\r\033[K" if self._live else ""
-        print(f"{start}setup: {self._text}{rest}", end=end, file=sys.stderr, flush=True)
 
 
 def run(
@@ -195,15 +125,6 @@ def exclusive() -> Iterator[int]:
         os.close(lock)
 
 
-def digest(*parts: str | bytes) -> str:
-    """Return a hash of the parts."""
-    total = hashlib.sha256()
-    for part in parts:
-        total.update(part if isinstance(part, bytes) else part.encode())
-        total.update(b"\0")
-    return total.hexdigest()
-
-
 def packages() -> list[Path]:
     """Return the folders of the workspace's packages."""
     return sorted(path.parent for path in (WORKSPACE / "src").glob("*/package.xml"))
@@ -257,55 +178,6 @@ def stamp_text(mode: str) -> str:
     return f"{mode} {environment_key(mode)} {install_key(mode)}"
 
 
-def read(path: Path) -> str:
-    """Return a file's text, or nothing where it does not exist."""
-    try:
-        return path.read_text("utf-8").strip()
-    except (FileNotFoundError, NotADirectoryError):
-        return ""
-
-
-def write(path: Path, text: str) -> None:
-    """Write a file in one piece: it is complete, or not there."""
-    draft = path.with_name(path.name + ".new")
-    draft.write_text(text + "\n", encoding="utf-8")
-    draft.replace(path)
-
-
-def check_machine(mode: str) -> None:
-    """Refuse a C library that the wheels cannot run on.
-
-    Raises
-    ------
-    SetupError
-        If there is no glibc, or an old one.
-    """
-    if mode == "ros":
-        return
-    name, version = platform.libc_ver()
-    found = tuple(int(part) for part in re.findall(r"\d+", version)[:2])
-    if name != "glibc" or found < OLDEST_GLIBC:
-        raise SetupError(
-            "the wheels need glibc {}.{} or newer".format(*OLDEST_GLIBC)
-            + f"; this system has {f'{name} {version}' if name else 'another C library'}"
-        )
-
-
-def check_space() -> None:
-    """Refuse to begin what cannot end.
-
-    Raises
-    ------
-    SetupError
-        If the file system has too little space.
-    """
-    free = shutil.disk_usage(ROOT).free
-    if free < NEEDED_BYTES:
-        raise SetupError(
-            f"disk full: {ROOT} has {free / 1e9:.1f} GB free, needs {NEEDED_BYTES / 1e9:.1f} GB"
-        )
-
-
 def venv_environment(mode: str) -> dict[str, str]:
     """Return the environment in which pip and colcon run."""
     env = dict(os.environ)
@@ -333,7 +205,7 @@ def install(mode: str, lock: int) -> None:
     SetupError
         If a package cannot be had or does not work.
     """
-    check_space()
+    check_space(ROOT)
     fits = read(INSTALL_STAMP).split()[:2] == [mode, environment_key(mode)]
     # Without its stamp, an environment that is half changed is replaced by the next set-up.
     INSTALL_STAMP.unlink(missing_ok=True)
@@ -348,7 +220,7 @@ def install(mode: str, lock: int) -> None:
             try:
                 run([sys.executable, "-I", "-m", "venv", *options, VENV], env=env, lock=lock)
             except CommandFailedError as error:
-                raise SetupError(explain("could not make the virtual environment")) from error
+                raise SetupError(explain("could not make the virtual environment", LOG)) from error
     scratch = VENV / "tmp"
     scratch.mkdir(exist_ok=True)
     env["TMPDIR"] = str(scratch)
@@ -378,42 +250,10 @@ def install(mode: str, lock: int) -> None:
             phase.update("checking")
             run([VENV_PYTHON, "-c", IMPORT_CHECK], env=env, lock=lock)
         except CommandFailedError as error:
-            raise SetupError(explain("could not install the packages")) from error
+            raise SetupError(explain("could not install the packages", LOG)) from error
         finally:
             shutil.rmtree(scratch, ignore_errors=True)
     write(INSTALL_STAMP, stamp_text(mode))
-
-
-def requirement(text: str, name: str) -> str:
-    """Return one package's lines of a lock."""
-    found = re.search(rf"^{name}==(.*\\\n)*.*$", text, flags=re.MULTILINE)
-    if found is None:
-        raise SetupError(f"no {name} in the lock; renew it with scripts/lib/lock.py")
-    return found.group() + "\n"
-
-
-SYMPTOMS = (
-    (r"No space left on device|Disk quota exceeded", "disk full"),
-    (r"DO NOT MATCH THE HASHES", "the index serves another file than the lock pins"),
-    (
-        r"Retrying \(Retry|ConnectionError|Name or service not known|failure in name|timed out",
-        "no network: the package index cannot be reached",
-    ),
-    (r"No matching distribution found for (\S+)", "the package index has no {}"),
-    (r"ensurepip.*(returned non-zero|No module)", "no working ensurepip: install python3-venv"),
-    (r"(?m)^((?:ModuleNotFound|Import)Error: .*)$", "{}"),
-)
-
-
-def explain(what: str) -> str:
-    """Return one line on a failed command, with the cause where the log shows a known one."""
-    last = read(LOG).rpartition("\n$ ")[2]
-    for pattern, cause in SYMPTOMS:
-        found = re.search(pattern, last)
-        if found:
-            what += f": {cause.format(*found.groups())}"
-            break
-    return f"{what}; all output is in {LOG}"
 
 
 def build(mode: str, lock: int) -> None:
@@ -441,7 +281,7 @@ def build(mode: str, lock: int) -> None:
         try:
             run([*command, "build", "--symlink-install"], env=venv_environment(mode), lock=lock)
         except CommandFailedError as error:
-            raise SetupError(explain("colcon build failed")) from error
+            raise SetupError(explain("colcon build failed", LOG)) from error
         for name in sorted(names):
             tidy_executables(name)
     write(BUILD_STAMP, key)
@@ -449,14 +289,14 @@ def build(mode: str, lock: int) -> None:
 
 def compile_key(mode: str) -> str:
     """Return what the compiled code depends on: its sources, their place, packages' versions."""
-    digest = hashlib.sha256(LOCKS[mode].read_bytes() + str(ROOT).encode())
+    parts: list[str | bytes] = [LOCKS[mode].read_bytes(), str(ROOT)]
     for path in sorted((WORKSPACE / "src").glob("needle_*/needle_*/**/*.py")):
         source = path.read_bytes()
         marks = rb"^(@compiled|@inlined|# Read by compiled code\.)$"
         # compiled.py says where the outcome is kept
         if path.name == "compiled.py" or re.search(marks, source, re.MULTILINE):
-            digest.update(source)
-    return digest.hexdigest()
+            parts.append(source)
+    return digest(*parts)
 
 
 def is_compiled(mode: str) -> bool:
@@ -489,12 +329,9 @@ def tidy_executables(name: str) -> None:
         if path.name not in declared:
             path.unlink()
             continue
-        first, _, rest = path.read_text("utf-8").partition("\n")
-        if "python" in first and (" " in first or len(first) > LONGEST_SHEBANG):
-            python = shlex.quote(str(VENV_PYTHON))
-            # sh runs the second line; to Python it is a string.
-            first = f"#!/bin/sh\n'''exec' {python} \"$0\" \"$@\"\n'''"
-            path.write_text(f"{first}\n{rest}", encoding="utf-8")
+        script = path.read_text("utf-8")
+        if (mended := runnable(script, VENV_PYTHON)) != script:
+            path.write_text(mended, encoding="utf-8")
 
 
 def place_stand_in(mode: str) -> None:
@@ -548,14 +385,8 @@ def main() -> int:
     signal.signal(signal.SIGHUP, interrupt)
     try:
         set_up(options.mode, options.quiet)
-    except SetupError as error:
-        say(str(error))
-        return 2
-    except OSError as error:
-        if error.errno in (errno.ENOSPC, errno.EDQUOT):
-            say(f"disk full: {error.filename or ROOT}")
-        else:
-            say(f"cannot write {error.filename or ROOT}: {error.strerror}")
+    except (SetupError, OSError) as error:
+        say(describe(error, ROOT) if isinstance(error, OSError) else str(error))
         return 2
     except KeyboardInterrupt:
         print(file=sys.stderr)

@@ -1,0 +1,54 @@
+"""Files of scripts/setup: stamps that are complete or not there, hashes, a lock's entries."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import shlex
+from pathlib import Path
+
+from setup_errors import SetupError
+
+# Linux cuts a script's first line off after this many bytes (127 before 5.1).
+LONGEST_SHEBANG = 127
+
+
+def digest(*parts: str | bytes) -> str:
+    """Return a hash of the parts."""
+    total = hashlib.sha256()
+    for part in parts:
+        total.update(part if isinstance(part, bytes) else part.encode())
+        total.update(b"\0")
+    return total.hexdigest()
+
+
+def read(path: Path) -> str:
+    """Return a file's text, or nothing where it does not exist."""
+    try:
+        return path.read_text("utf-8").strip()
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+
+
+def write(path: Path, text: str) -> None:
+    """Write a file in one piece: it is complete, or not there."""
+    draft = path.with_name(path.name + ".new")
+    draft.write_text(text + "\n", encoding="utf-8")
+    draft.replace(path)
+
+
+def requirement(text: str, name: str) -> str:
+    """Return one package's lines of a lock."""
+    found = re.search(rf"^{name}==(.*\\\n)*.*$", text, flags=re.MULTILINE)
+    if found is None:
+        raise SetupError(f"no {name} in the lock; renew it with scripts/lib/lock.py")
+    return found.group() + "\n"
+
+
+def runnable(script: str, python: Path) -> str:
+    """Return a script whose first line can be run, whatever the path to its Python."""
+    first, _, rest = script.partition("\n")
+    if "python" not in first or (" " not in first and len(first) <= LONGEST_SHEBANG):
+        return script
+    # sh runs the second line; to Python it is a string.
+    return f"#!/bin/sh\n'''exec' {shlex.quote(str(python))} \"$0\" \"$@\"\n'''\n{rest}"
