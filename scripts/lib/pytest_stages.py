@@ -21,10 +21,13 @@ RUN = os.environ.get("NEEDLE_TEST_RUN", "")
 FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").split(",") if name]
 # These take half a minute and more: begun last, one of them would hold up the end of the run.
 LONG_FILES = (
-    "needle_bringup/test/graph/test_graph_run.py",
-    "needle_verification/test/checks/test_check_driver.py",
-    "needle_bringup/test/graph/test_graph_interrupt.py",
-    "needle_verification/test/checks/test_check_bags.py",
+    "tests/test_documents.py",
+    "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
+    "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
+    "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
+    "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
+    "ros2_ws/src/needle_analysis/test/ros/test_rerun.py",
+    "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
 )
 _left: list[str] = []
 _reserved = contextlib.ExitStack()
@@ -46,11 +49,7 @@ def pytest_unconfigure() -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected."""
     places = {file: place for place, file in enumerate(LONG_FILES)}
-
-    def place_of(item: pytest.Item) -> int:
-        return places.get("/".join(item.path.parts[-4:]), len(places))
-
-    items.sort(key=place_of)
+    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
 
 
 def in_lane(config: pytest.Config) -> bool:
