@@ -41,6 +41,29 @@ def test_interrupted_while_it_steers(tmp_path: Path, number: int) -> None:
     assert not (bag / "summary.json").exists()
 
 
+# Whatever makes the report takes long to load.
+SLOW = """
+import sys, time
+from needle_bringup.simulation import simulate
+def load():
+    print("loading", flush=True)
+    time.sleep(600)
+simulate._import_report = load
+sys.exit(simulate.main())
+"""
+
+
+def test_interrupted_while_it_loads_what_makes_the_report(tmp_path: Path) -> None:
+    bag = tmp_path / "bag"
+    started = Workbench([sys.executable, "-c", SLOW], tmp_path).start(bag.name, "--level", "tip")
+    started.wait_until_said("loading")
+    os.kill(started.process.pid, signal.SIGINT)
+    finished = started.wait(LIMIT)
+    assert finished.code == 130, finished.output
+    check_nothing_left(finished)
+    assert unreadable(bag) == ""
+
+
 def test_interrupted_while_the_nodes_start(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
     started = start(bag, *STEERS)
