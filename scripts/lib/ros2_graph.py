@@ -1,4 +1,4 @@
-"""What the small `ros2` can do in a running graph: topic, service, param and node.
+"""Commands of the small `ros2` in a running graph: topic, service, param and node.
 
 The syntax and the output are those of ROS 2's own command line, as far as it goes.
 """

@@ -1,4 +1,4 @@
-"""What the parts of the small `ros2` share: waiting for the graph, and giving up in one line."""
+"""Common part of the small `ros2`: waiting for the graph, and giving up in one line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ANSWER = 10.0
 
 
 class GraphError(Exception):
-    """What cannot be done, in one line."""
+    """A refusal, in one line."""
 
 
 def spin_until(node: Node, condition: Callable[[], Any], timeout: float) -> bool:

@@ -47,7 +47,7 @@ LOOK = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Block:
-    """What a page says to type.
+    """A block of a page, to be typed.
 
     Attributes
     ----------

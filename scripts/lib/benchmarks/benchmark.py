@@ -74,7 +74,7 @@ class Row:
 
     @property
     def ratio(self) -> float:
-        """How many times the reference is the value."""
+        """Ratio of the value to the reference."""
         return self.reference / self.value
 
 

@@ -31,7 +31,7 @@ Message = tuple[int, int, bytes]
 
 @dataclass(frozen=True)
 class Speeds:
-    """How fast each way takes the same messages to the disk [MB/s]."""
+    """Speed of each way to take the same messages to the disk [MB/s]."""
 
     megabytes: float
     recorder: float

@@ -38,7 +38,7 @@ class Way:
 
 
 class PlainTracker:
-    """What is written first: undistort the images, subtract the empty one, farthest pixel, rays.
+    """Track as is written first: undistort, subtract the empty image, farthest pixel, rays.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""What a bag tells: rerun, report, and the figures of a run."""
+"""Analysis of bags: rerun, report, and the figures of a run."""

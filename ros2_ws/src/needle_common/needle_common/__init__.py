@@ -1,1 +1,1 @@
-"""What every node and command of the rig shares: parameters, diagnostics, error exits."""
+"""Common ground of all nodes and commands of the rig: parameters, diagnostics, error exits."""

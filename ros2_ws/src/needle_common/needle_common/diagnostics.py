@@ -1,4 +1,4 @@
-"""What a part of the rig has to say about its health, as data."""
+"""Health of a part of the rig, as data."""
 
 from __future__ import annotations
 

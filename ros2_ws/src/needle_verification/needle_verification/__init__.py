@@ -1,1 +1,1 @@
-"""What the rig's software must be able to show; no rig needs it."""
+"""Proof of what the rig's software must be able to do; no rig needs it."""

@@ -1,4 +1,4 @@
-"""What the steps of the project must show: how a check is run and what it finds."""
+"""Checks: how one is run, and what it finds."""
 
 from __future__ import annotations
 
@@ -140,7 +140,7 @@ class StartedRun:
 
     @property
     def output(self) -> str:
-        """What it has written so far."""
+        """Text that it has written so far."""
         return self._output.read_text("utf-8", errors="replace")
 
     def domain(self, timeout: float = 60.0) -> int:
@@ -199,7 +199,7 @@ class StartedRun:
 
 
 class Workbench:
-    """Where checks run what they look at.
+    """Place in which checks run what they look at.
 
     Parameters
     ----------

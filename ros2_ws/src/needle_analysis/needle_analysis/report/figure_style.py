@@ -1,4 +1,4 @@
-"""How all figures of a run look, and the units that people read."""
+"""Style of all figures of a run, and the units that people read."""
 
 from __future__ import annotations
 

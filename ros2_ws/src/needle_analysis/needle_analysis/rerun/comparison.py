@@ -25,7 +25,7 @@ ORIENTATION = "orientation"
 
 @dataclasses.dataclass(frozen=True)
 class Tolerance:
-    """What two values of one kind may differ by: `absolute + relative * |recorded|`."""
+    """Allowed difference of two values of one kind: `absolute + relative * |recorded|`."""
 
     unit: str
     absolute: float
@@ -112,7 +112,7 @@ class Record:
 
 @dataclasses.dataclass(frozen=True)
 class FieldResult:
-    """How one field of one topic compares.
+    """Comparison of one field of one topic.
 
     Attributes
     ----------
@@ -155,7 +155,7 @@ class Comparison:
 
     @property
     def changed(self) -> bool:
-        """Whether anything differs."""
+        """Tell whether anything differs."""
         return any(t.missing or t.extra for t in self.topics) or any(
             field.differing for field in self.fields
         )

@@ -1,4 +1,4 @@
-"""What a rerun found, as a person reads it and as flat JSON."""
+"""Findings of a rerun, as a person reads them and as flat JSON."""
 
 from __future__ import annotations
 

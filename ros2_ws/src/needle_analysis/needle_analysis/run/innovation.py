@@ -1,4 +1,4 @@
-"""How far each measured tip was from where it was expected, and from what would refuse it."""
+"""Distance of each measured tip from where it was expected, and from what would refuse it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class Innovations:
 
 @dataclasses.dataclass(frozen=True)
 class GateRoom:
-    """How near every measured tip came to being refused by where a needle can be.
+    """Room that every measured tip had left before it was refused by where a needle can be.
 
     Attributes
     ----------

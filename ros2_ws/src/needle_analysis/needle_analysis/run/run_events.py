@@ -1,4 +1,4 @@
-"""What went wrong in a run, and when; without what every start begins with."""
+"""Troubles of a run, with their times; without what every start begins with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How long each stage of a step took, by when its messages were sent."""
+"""Duration of each stage of a step, by when its messages were sent."""
 
 from __future__ import annotations
 

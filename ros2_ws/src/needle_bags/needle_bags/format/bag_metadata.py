@@ -1,4 +1,4 @@
-"""What rosbag2's metadata.yaml (version 9) says about a bag, as data, and the file itself."""
+"""Metadata of a bag, as rosbag2's metadata.yaml (version 9) has them, and the file itself."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, 
 
 @dataclasses.dataclass(frozen=True)
 class BagTopic:
-    """What a bag says about a topic, beside its messages.
+    """A topic of a bag, beside its messages.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class BagTopic:
 
     @property
     def is_latched(self) -> bool:
-        """Whether late joiners get a publisher's last messages."""
+        """Tell whether late joiners get a publisher's last messages."""
         return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in self.offered_qos)
 
     def channel_metadata(self) -> dict[str, str]:
@@ -103,7 +103,7 @@ class BagTopic:
 
 @dataclasses.dataclass
 class DataFile:
-    """What one of the bag's data files holds.
+    """Contents of one of the bag's data files.
 
     Attributes
     ----------

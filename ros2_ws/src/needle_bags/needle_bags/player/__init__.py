@@ -1,1 +1,1 @@
-"""What of a bag is played, when, and under which names."""
+"""Choice, times and names of what is played of a bag."""

@@ -1,4 +1,4 @@
-"""When each message of a bag is due, and reading ahead of it."""
+"""Times at which a bag's messages are due, and reading ahead of them."""
 
 from __future__ import annotations
 

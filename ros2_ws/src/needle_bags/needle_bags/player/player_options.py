@@ -46,7 +46,7 @@ MAX_RATE = 1000.0
 
 @dataclasses.dataclass(frozen=True)
 class PlayerOptions:
-    """What to play, and how.
+    """Options of the player.
 
     Attributes
     ----------

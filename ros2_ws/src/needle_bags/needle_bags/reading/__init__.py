@@ -1,1 +1,1 @@
-"""What a recorded run says, straight from its bag."""
+"""Recorded runs, straight from their bags."""

@@ -1,4 +1,4 @@
-"""What a bag says about itself, and its messages, for all tools that read bags."""
+"""Contents of a bag, and its messages, for all tools that read bags."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_common.files.bag_directory import BagDirectory
 
 @dataclasses.dataclass(frozen=True)
 class BagContents:
-    """What a bag says about itself.
+    """Contents of a bag, as it tells them itself.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ Stamps = npt.NDArray[np.int64]
 
 @dataclasses.dataclass(frozen=True)
 class PlainImage:
-    """What a sensor_msgs/Image has, of an image that was compressed."""
+    """Fields of a sensor_msgs/Image, of an image that was compressed."""
 
     header: Any
     height: int

@@ -158,7 +158,7 @@ class Run:
 
     @property
     def first_command(self) -> int | None:
-        """When the first step was commanded, system clock [ns]."""
+        """Time of the first command of a step, system clock [ns]."""
         return int(self.commands.received.min()) if len(self.commands) else None
 
     def insertion_at(self, stamps: Stamps) -> Floats:

@@ -1,4 +1,4 @@
-"""How much room is left on a bag's disk, and when the recording has to end."""
+"""Room left on a bag's disk, and the end of a recording for want of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What came from outside and made no sense: counted by where it came from."""
+"""Data from outside that made no sense, counted by where they came from."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What made a run: versions of the code and of what it stands on."""
+"""Versions of the code that made a run, and of what it stands on."""
 
 from __future__ import annotations
 

@@ -10,7 +10,7 @@ _NANOSECONDS = 1e9
 
 
 class RecentMessages:
-    """What was received in the last seconds; older messages go, but for the last of a latched one.
+    """Messages of the last seconds; older ones go, but for the last of a latched topic.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class RecentMessages:
 
     @property
     def seconds(self) -> float:
-        """How far back they go [s]."""
+        """Time from the oldest to the newest [s]."""
         if not self._messages:
             return 0.0
         return (self._messages[-1].log_time - self._messages[0].log_time) / _NANOSECONDS

@@ -1,4 +1,4 @@
-"""How a recording is going: what its node says in /diagnostics."""
+"""Health of a recording, as its node tells it in /diagnostics."""
 
 from __future__ import annotations
 

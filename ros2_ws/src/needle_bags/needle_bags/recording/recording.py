@@ -60,7 +60,7 @@ class Received:
 
     @property
     def memory(self) -> int:
-        """What it takes [B]."""
+        """Size [B]."""
         return len(self.data) + OVERHEAD
 
 
@@ -130,7 +130,7 @@ class Recording:
 
     @property
     def bytes_waiting(self) -> int:
-        """What they take in memory [B]."""
+        """Size in memory [B]."""
         return self.bytes_received - self._bytes_done + OVERHEAD * self.messages_waiting
 
     def add_topic(self, topic: BagTopic) -> None:

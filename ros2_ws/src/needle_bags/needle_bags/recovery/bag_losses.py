@@ -1,4 +1,4 @@
-"""What a damaged bag has lost, to the message, by topic, as far as anything tells."""
+"""Losses of a damaged bag, to the message, by topic, as far as anything tells."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _NUMBER: Final = re.compile(r"^(.*_)(\d+)(\.mcap)$")
 
 @dataclasses.dataclass(frozen=True)
 class Losses:
-    """What was recorded and cannot be read.
+    """Losses: messages that were recorded and cannot be read.
 
     Attributes
     ----------

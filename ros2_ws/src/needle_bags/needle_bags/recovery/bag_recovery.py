@@ -62,7 +62,7 @@ Progress = Callable[[Path, int], None]
 
 @dataclasses.dataclass(frozen=True)
 class BagRecovery:
-    """What became of a bag.
+    """Outcome of a recovery.
 
     Attributes
     ----------

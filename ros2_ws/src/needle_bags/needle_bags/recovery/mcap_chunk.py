@@ -50,7 +50,7 @@ class StoredChunk:
 
     @property
     def is_vouched(self) -> bool:
-        """Whether a checksum says that its content is what was written."""
+        """Tell whether a checksum says that its content is what was written."""
         return bool(self.crc)
 
     def records(self, data: Any) -> list[McapRecord]:

@@ -1,4 +1,4 @@
-"""What a damaged MCAP file holds, and its records by themselves."""
+"""Contents of a damaged MCAP file, and its records by themselves."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Loose:
 
 @dataclasses.dataclass
 class McapScan:
-    """What a file holds.
+    """Contents of a file.
 
     Attributes
     ----------

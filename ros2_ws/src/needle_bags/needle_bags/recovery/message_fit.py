@@ -1,4 +1,4 @@
-"""Whether bytes are a message of their topic's type: what vouches where there is no checksum."""
+"""Fit of bytes to their topic's type: what vouches for a message where there is no checksum."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 class _Bar:
-    """How much of the bag has been read; shown only where it takes a while, on a terminal."""
+    """Share of the bag that has been read; shown only where it takes a while, on a terminal."""
 
     def __init__(self) -> None:
         self._bar: tqdm[None] | None = None

@@ -95,7 +95,7 @@ class GraphTopics:
 
     @property
     def lost(self) -> dict[str, int]:
-        """How many messages of which topic did not arrive."""
+        """Messages that did not arrive, by topic."""
         return {name: topic.lost for name, topic in self._topics.items() if topic.lost}
 
     def poll(self) -> None:

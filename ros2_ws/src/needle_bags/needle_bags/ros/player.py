@@ -60,7 +60,7 @@ Message = tuple[str, int, bytes]
 
 @dataclasses.dataclass(frozen=True)
 class PlayerParameters:
-    """What can be set while it plays; the rest are options."""
+    """Parameters that can be set while it plays; the rest are options."""
 
     rate: float = parameter(
         1.0, unit="-", description="How many times faster.", lower=MIN_RATE, upper=MAX_RATE

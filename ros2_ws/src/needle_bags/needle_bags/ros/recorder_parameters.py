@@ -17,7 +17,7 @@ PARAMETERS_OF = "parameters_of"
 
 @dataclasses.dataclass(frozen=True)
 class RecorderParameters:
-    """What the recorder can be told."""
+    """Parameters of the recorder."""
 
     bag: str = fixed_parameter("", "-", "The bag's directory; empty: a new time-stamped one here.")
     topics: tuple[str, ...] = fixed_parameter(
@@ -83,7 +83,7 @@ class RecorderParameters:
 
     @property
     def recent(self) -> RecentMessages | None:
-        """What keeps the last seconds, empty; None where everything is written."""
+        """Empty store of the last seconds; None where everything is written."""
         if not self.snapshot_seconds:
             return None
         return RecentMessages(self.snapshot_seconds, self.snapshot_size)

@@ -1,1 +1,1 @@
-"""What the operator stand-in does, in which order."""
+"""Order of what the operator stand-in does."""

@@ -1,4 +1,4 @@
-"""What the operator stand-in does, in which order, and when it gives up: no ROS."""
+"""Order of what the operator stand-in does, and when it gives up: no ROS."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ RELEASE_TIME = 0.25
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How the run ended.
+    """End of a run.
 
     Attributes
     ----------
@@ -123,7 +123,7 @@ class OperatorSequence:
 
     @property
     def steering(self) -> bool:
-        """Whether the preparation is over and the run is not."""
+        """Tell whether the preparation is over and the run is not."""
         return self._prepared == len(PREPARATION) and self.outcome is None
 
     def hold(self, now: float) -> bool:
@@ -132,7 +132,7 @@ class OperatorSequence:
 
     @property
     def touched(self) -> bool:
-        """Whether the drives may have been enabled, so that they must be disabled."""
+        """Tell whether the drives may have been enabled, so that they must be disabled."""
         return self._prepared >= 2
 
     def see_missing(self, missing: Sequence[str]) -> None:
@@ -247,7 +247,7 @@ class OperatorSequence:
             self._end(f"plane_controller stopped: {_why(values)}")
 
     def _called(self, call: ServiceCall) -> bool:
-        """Whether `call` has been made and its success is not known yet."""
+        """Tell whether `call` has been made and its success is not known yet."""
         return self.outcome is None and self._asked and PREPARATION[self._prepared] == call
 
     def interrupt(self) -> None:
@@ -275,7 +275,7 @@ class OperatorSequence:
 
     @property
     def _may_act(self) -> bool:
-        """Whether the only device that is there has said that it is simulated."""
+        """Tell whether the only device that is there has said that it is simulated."""
         return self._simulated and list(self._devices) == [self._speaker]
 
     def hangs(self) -> str:

@@ -1,4 +1,4 @@
-"""How far the needle is in, shown to the person at the terminal."""
+"""Progress of the insertion, shown to the person at the terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What both launch files share; the one module that needs `launch`, which PyPI does not have."""
+"""Common part of both launch files, the one module that needs `launch`: PyPI does not have it."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ class OperatorNode(WholeNode):
 
     @property
     def ended(self) -> bool:
-        """Whether the run is over, by success, failure or signal."""
+        """Tell whether the run is over, by success, failure or signal."""
         return self._sequence.outcome is not None
 
     def interrupt(self) -> None:

@@ -1,4 +1,4 @@
-"""Where the workspace's packages keep their executables and files, as `ros2 run` finds them."""
+"""Places of the workspace's executables and files, as `ros2 run` finds them."""
 
 from __future__ import annotations
 

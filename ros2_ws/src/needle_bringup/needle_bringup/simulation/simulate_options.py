@@ -55,7 +55,7 @@ CONTROLLERS = (
 
 @dataclasses.dataclass(frozen=True)
 class SimulateOptions:
-    """What one run of `simulate` was asked for; mm and degrees, as the user writes them."""
+    """Options of one run of `simulate`; mm and degrees, as the user writes them."""
 
     level: str = "camera"
     controller: str = "best"

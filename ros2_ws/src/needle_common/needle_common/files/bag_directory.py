@@ -52,7 +52,7 @@ class SentMessage(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class RecordedTopic:
-    """What metadata.yaml says about a topic, and the definition that the data have.
+    """A topic as metadata.yaml has it, with the definition that the data have.
 
     Attributes
     ----------

@@ -74,7 +74,7 @@ class LooseMessage(NamedTuple):
 
 @dataclasses.dataclass
 class Summary:
-    """What the end of a file says is in it."""
+    """Contents of a file, as its end tells them."""
 
     statistics: Statistics | None = None
     schemas: dict[int, Schema] = dataclasses.field(default_factory=dict)

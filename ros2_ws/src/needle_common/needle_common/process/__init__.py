@@ -1,1 +1,1 @@
-"""What a process has of the machine: its end, its names, its folders, its ROS domain."""
+"""A process' share of the machine: its end, its names, its folders, its ROS domain."""

@@ -1,4 +1,4 @@
-"""Who reaches a node: the processes of this machine, unless the user asks for a network."""
+"""Reach of a node: the processes of this machine, unless the user asks for a network."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What the rig's nodes share of ROS."""
+"""Common ground of the rig's nodes in ROS."""

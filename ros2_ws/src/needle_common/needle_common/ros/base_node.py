@@ -1,4 +1,4 @@
-"""How every node of the rig starts, reports its health and ends."""
+"""Start, health and end of every node of the rig."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the nodes that this one works with have found it: what is sent before is lost.
+"""Tell whether the nodes that this one works with have found it: what is sent before is lost.
 
 Two nodes learn of each other one after the other. A subscription that its publisher does not know
 yet gets nothing, and neither side can tell. So whoever makes things happen asks first.

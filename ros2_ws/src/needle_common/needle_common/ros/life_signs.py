@@ -1,4 +1,4 @@
-"""What a node says while it has nothing to do: that it lives, what it waits for, who else is it."""
+"""Signs of life of a node that has nothing to do: what it waits for, and who else is it."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _SIM_TIME = "use_sim_time"
 _TYPES = frozenset(kind.value for kind in Parameter.Type)
 _LONGEST_NAME = 100
 OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
-"""How the names of parameters begin that every rclpy node declares for itself."""
+"""Beginnings of the names of parameters that every rclpy node declares for itself."""
 
 
 class NodeParameters(Generic[P]):

@@ -14,7 +14,7 @@ _METADATA_KEY = "needle_parameter"
 
 @dataclasses.dataclass(frozen=True)
 class ParameterSpec:
-    """What a parameter is, beside its value.
+    """Description of a parameter, beside its value.
 
     Attributes
     ----------

@@ -23,7 +23,7 @@ NODES = (
     "operator",
     "player",
 )
-"""What the rig's nodes are called."""
+"""Names of the rig's nodes."""
 _SECTION = "ros__parameters"
 _CLOSE = 0.7  # names that have so much in common are one, misspelt
 

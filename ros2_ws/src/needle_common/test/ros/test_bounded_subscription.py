@@ -14,7 +14,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from needle_common.ros.bounded_subscription import LONGEST, listen
 from needle_common.ros.conversions import ESTOPS_HEARD, RELIABLE
-from needle_common.ros.own_context import own_context
+from own_context import own_context
 
 LIMIT = 20.0
 

@@ -23,9 +23,9 @@ from std_srvs.srv import Trigger
 from needle_common.errors import UserError
 from needle_common.ros.base_node import DiagnosticsPublisher, executor_of
 from needle_common.ros.conversions import RELIABLE, to_nanoseconds, to_stamp, values_of
-from needle_common.ros.own_context import own_context
 from needle_common.ros.parameters import NodeParameters
 from needle_common.settings.parameter_fields import parameter
+from own_context import own_context
 
 LIMIT = 20.0
 NO_TYPE = 11

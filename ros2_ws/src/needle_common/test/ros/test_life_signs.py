@@ -16,7 +16,7 @@ from needle_common.ros import life_signs
 from needle_common.ros.base_node import DiagnosticsPublisher
 from needle_common.ros.conversions import RELIABLE
 from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.own_context import own_context
+from own_context import own_context
 
 LIMIT = 20.0
 

@@ -17,10 +17,10 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.own_context import own_context
 from needle_common.ros.parameter_desk import ParameterDesk
 from needle_common.ros.parameters import NodeParameters
 from needle_common.settings.parameter_fields import fixed_parameter
+from own_context import own_context
 
 LIMIT = 30.0
 

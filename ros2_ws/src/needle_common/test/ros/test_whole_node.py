@@ -11,8 +11,8 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 
 from needle_common.errors import UserError
-from needle_common.ros.own_context import own_context
 from needle_common.ros.whole_node import WholeLifecycleNode, WholeNode
+from own_context import own_context
 
 LIMIT = 20.0
 

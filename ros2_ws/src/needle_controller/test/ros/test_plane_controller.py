@@ -38,10 +38,10 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.ros.own_context import own_context
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.ros.conversions import to_tip_covariance
 from needle_controller.ros.plane_controller import PlaneControllerNode, main
+from own_context import own_context
 
 LIMIT = 20.0
 TICK = 20_000_000

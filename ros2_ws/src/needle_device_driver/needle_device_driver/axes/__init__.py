@@ -1,1 +1,1 @@
-"""What the motion supervisor asks of the axes, whatever moves them."""
+"""Interface of the motion supervisor to the axes, whatever moves them."""

@@ -1,4 +1,4 @@
-"""What the motion supervisor asks of an axis, whatever moves it."""
+"""Interface of the motion supervisor to an axis, whatever moves it."""
 
 from __future__ import annotations
 

@@ -18,22 +18,22 @@ class PairSnapshot:
 
     @property
     def homed(self) -> bool:
-        """Whether both axes are homed."""
+        """Tell whether both axes are homed."""
         return self.insertion.homed and self.rotation.homed
 
     @property
     def powered(self) -> bool:
-        """Whether both axes are able to move."""
+        """Tell whether both axes are able to move."""
         return self.insertion.powered and self.rotation.powered
 
     @property
     def ready(self) -> bool:
-        """Whether both axes would begin to move at once."""
+        """Tell whether both axes would begin to move at once."""
         return self.insertion.ready and self.rotation.ready
 
     @property
     def answered(self) -> bool:
-        """Whether both axes have answered to all that they were asked."""
+        """Tell whether both axes have answered to all that they were asked."""
         return self.insertion.answered and self.rotation.answered
 
     def age(self, now: float) -> float:

@@ -7,7 +7,7 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True)
 class SetPoint:
-    """Where the joints shall be after the next period, and how fast they go there.
+    """Set-point: places of the joints after the next period, and their speeds.
 
     Attributes
     ----------
@@ -44,7 +44,7 @@ class CoordinatedMotion:
 
     @property
     def complete(self) -> bool:
-        """Whether the last set-point was given."""
+        """Tell whether the last set-point was given."""
         return self._progress >= 1.0
 
     def advance(self, period: float, speed_scale: float) -> SetPoint:

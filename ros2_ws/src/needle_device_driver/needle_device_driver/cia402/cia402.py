@@ -7,7 +7,7 @@ from collections import deque
 
 
 class DriveState(enum.Enum):
-    """What the statusword says: its value under its mask."""
+    """States of the statusword: its value under its mask."""
 
     NOT_READY_TO_SWITCH_ON = (0x4F, 0x00)
     SWITCH_ON_DISABLED = (0x4F, 0x40)
@@ -20,7 +20,7 @@ class DriveState(enum.Enum):
 
 
 class DriveCommand(enum.IntEnum):
-    """What the controlword orders, as it is sent in RPDO1."""
+    """Orders of the controlword, as it is sent in RPDO1."""
 
     DISABLE_VOLTAGE = 0x00
     QUICK_STOP = 0x02
@@ -38,7 +38,7 @@ class Mode(enum.IntEnum):
 
 
 class Goal(enum.Enum):
-    """What the driver wants of a drive."""
+    """Goals that the driver has for a drive."""
 
     OFF = "off"
     ON = "on"

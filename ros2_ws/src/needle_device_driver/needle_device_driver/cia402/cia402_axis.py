@@ -248,7 +248,7 @@ class Cia402Axis(Axis):
 
     @property
     def needs_cycles(self) -> bool:
-        """Whether the drive is on its way to where it was ordered, apart from set-points."""
+        """Tell whether the drive is on its way to where it was ordered, apart from set-points."""
         if not self.actuated or self._fault is not None:
             return False
         return self._machine.switching or self._homing is not None

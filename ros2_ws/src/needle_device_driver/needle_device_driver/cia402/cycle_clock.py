@@ -1,4 +1,4 @@
-"""When simulated time lets the next cycle go by: with steady time at most, outside lock step."""
+"""Clock of cycles in simulated time: with steady time at most, outside lock step."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class CycleClock:
 
     @property
     def waits(self) -> bool:
-        """Whether simulated time is ahead, and a cycle waits for steady time."""
+        """Tell whether simulated time is ahead, and a cycle waits for steady time."""
         return self._next_ns is not None
 
     def wait(self, now: float) -> float:

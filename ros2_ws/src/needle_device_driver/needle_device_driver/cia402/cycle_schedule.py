@@ -1,4 +1,4 @@
-"""When the next cycle is due."""
+"""Times at which cycles are due."""
 
 from __future__ import annotations
 

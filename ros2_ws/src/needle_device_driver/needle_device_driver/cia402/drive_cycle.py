@@ -43,7 +43,7 @@ class DriveCycle:
 
     @property
     def missing_optional_objects(self) -> tuple[str, ...]:
-        """What the drives lack that they could be set up without."""
+        """Objects that the drives lack and could be set up without."""
         return tuple(
             f"{axis.name} drive {text}"
             for axis in self._axes
@@ -52,7 +52,7 @@ class DriveCycle:
 
     @property
     def needs_cycles(self) -> bool:
-        """Whether a drive is on its way to where it was ordered, apart from set-points."""
+        """Tell whether a drive is on its way to where it was ordered, apart from set-points."""
         return any(axis.needs_cycles for axis in self._axes)
 
     def probe(self) -> str:

@@ -1,4 +1,4 @@
-"""What is the matter with a drive, and the rule behind it."""
+"""Fault of a drive, and the rule behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a drive says that it is."""
+"""Identity of a drive, as it tells it."""
 
 from __future__ import annotations
 

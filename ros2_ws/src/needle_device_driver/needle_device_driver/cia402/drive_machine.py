@@ -25,7 +25,7 @@ _LONGEST_REENABLE = 10
 
 
 class DriveMachine:
-    """What the drive is wanted to be, what it says it is, and the command in between.
+    """Wanted and told state of a drive, and the command in between.
 
     Parameters
     ----------
@@ -54,17 +54,17 @@ class DriveMachine:
 
     @property
     def goal(self) -> Goal:
-        """What is wanted."""
+        """Goal."""
         return self._goal
 
     @property
     def state(self) -> DriveState | None:
-        """What the drive said last; None: nothing that CiA 402 has."""
+        """State that the drive told last; None: nothing that CiA 402 has."""
         return drive_state(self.at.statusword)
 
     @property
     def ready(self) -> bool:
-        """Whether a set-point would be followed."""
+        """Tell whether a set-point would be followed."""
         return (
             self._goal is Goal.ON
             and not self._stopping
@@ -74,14 +74,14 @@ class DriveMachine:
 
     @property
     def powered(self) -> bool:
-        """Whether the drive is on by the present order, stopped or not."""
+        """Tell whether the drive is on by the present order, stopped or not."""
         # One that is still on from before, on its way off or to another mode, is not.
         on = self.state in POWERED and self.at.mode == self.mode
         return self._goal is not Goal.OFF and (on or self._recovering)
 
     @property
     def switching(self) -> bool:
-        """Whether the drive is on its way to the goal."""
+        """Tell whether the drive is on its way to the goal."""
         if self._goal is Goal.ON:
             return not self.ready
         if self._goal is Goal.STOPPED:

@@ -1,4 +1,4 @@
-"""What one drive sends by itself, each frame with the time of its arrival."""
+"""Frames that one drive sends by itself, each with the time of its arrival."""
 
 from __future__ import annotations
 
@@ -96,19 +96,19 @@ class DriveMonitor:
 
     @property
     def fresh_time(self) -> float:
-        """When the drive last said where it is, steady clock [s]."""
+        """Time at which the drive last said where it is, steady clock [s]."""
         with self._lock:
             return self._age_base()
 
     @property
     def left_operational(self) -> bool:
-        """Whether the node's own heartbeat says that it no longer exchanges process data."""
+        """Tell whether the node's own heartbeat says that it no longer exchanges process data."""
         with self._lock:
             return self._watching and self._nmt_state != NMT_OPERATIONAL
 
     @property
     def heartbeats(self) -> int:
-        """How many heartbeats came since the last set-up began."""
+        """Number of heartbeats since the last set-up began."""
         with self._lock:
             return self._heartbeats
 
@@ -119,7 +119,7 @@ class DriveMonitor:
 
     @property
     def outstanding(self) -> int:
-        """How many SYNCs are unanswered, if too many before the last are; else 0."""
+        """Number of unanswered SYNCs, if too many before the last are; else 0."""
         with self._lock:
             return self._syncs - min(self._received.values()) if self._is_behind() else 0
 

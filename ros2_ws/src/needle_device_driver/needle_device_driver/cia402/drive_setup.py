@@ -1,4 +1,4 @@
-"""How a drive is set up over SDO: limits, reactions, process data, watchdog."""
+"""Set-up of a drive over SDO: limits, reactions, process data, watchdog."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at 
 
 
 class _Need(enum.Enum):
-    """How much hangs on an entry that a drive need not have; one that it has is set."""
+    """Weight of an entry that a drive need not have; one that it has is set."""
 
     # A drive that refuses keeps its own.
     WISH = enum.auto()

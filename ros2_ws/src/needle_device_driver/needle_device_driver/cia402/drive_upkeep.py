@@ -1,4 +1,4 @@
-"""What a drive is told around its set-up: started, watched over, its fault acknowledged."""
+"""Upkeep of a drive around its set-up: started, watched over, its fault acknowledged."""
 
 from __future__ import annotations
 

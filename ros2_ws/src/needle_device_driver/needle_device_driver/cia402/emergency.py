@@ -1,4 +1,4 @@
-"""What a drive's emergency message (EMCY, CiA 301 and CiA 402) says in words."""
+"""Meaning of a drive's emergency message (EMCY, CiA 301 and CiA 402), in words."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ _INSTANT = 5
 
 
 class HomingStep(enum.Enum):
-    """How far a homing is."""
+    """Stages of a homing."""
 
     PREPARING = "preparing"
     RUNNING = "running"

@@ -1,4 +1,4 @@
-"""How a drive's process data objects are set up over SDO."""
+"""Set-up of a drive's process data objects over SDO."""
 
 from __future__ import annotations
 

@@ -188,19 +188,19 @@ class CanLink:
 
     @property
     def is_open(self) -> bool:
-        """Whether the adapter is open, as far as anybody knows."""
+        """Tell whether the adapter is open, as far as anybody knows."""
         return self._bus is not None and not self.lost
 
     @property
     def errors(self) -> int:
-        """How many error frames, lines that are no frame and refused frames there were."""
+        """Number of error frames, lines that are no frame, and refused frames."""
         bus = self._bus
         own = bus.malformed if isinstance(bus, SlcanBus | SocketcandBus) else 0
         return self.error_frames + own + self.refused
 
     @property
     def refused(self) -> int:
-        """How many commands and frames the adapter did not take; slcan only."""
+        """Number of commands and frames that the adapter did not take; slcan only."""
         return self._bus.refused if isinstance(self._bus, SlcanBus) else 0
 
     def open(self) -> None:

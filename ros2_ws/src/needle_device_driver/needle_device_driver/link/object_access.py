@@ -34,7 +34,7 @@ class DriveRefusalError(DriveError):
 
     @property
     def object_is_missing(self) -> bool:
-        """Whether the drive does not have the entry at all."""
+        """Tell whether the drive does not have the entry at all."""
         return self.code in _NO_SUCH_OBJECT
 
 

@@ -33,7 +33,7 @@ class Entry:
 
     @property
     def size(self) -> int:
-        """How many bytes it has."""
+        """Size in bytes."""
         return struct.calcsize(self.format)
 
     @property

@@ -156,7 +156,7 @@ class DeviceInterface:
 
     @property
     def others(self) -> str:
-        """Who else is a device on the same topics, as far as discovery tells; empty: nobody."""
+        """Names of other devices on the same topics, as far as discovery tells; empty: nobody."""
         if self._node.count_publishers(self._topic) <= 1:
             return ""
         names = publishers_of(self._node, self._topic)

@@ -1,4 +1,4 @@
-"""What is wrong with the axes, if anything."""
+"""Rules that the axes' replies may break."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Command:
 
 @dataclasses.dataclass(frozen=True)
 class CommandContext:
-    """What the rules need to know beside the command.
+    """Circumstances of a command that the rules need to know.
 
     Attributes
     ----------

@@ -79,12 +79,12 @@ class DeviceCore:
 
     @property
     def moves_with_hold(self) -> bool:
-        """Whether something is under way that the hold lets go on."""
+        """Tell whether something is under way that the hold lets go on."""
         return self.activity in (Activity.STEP, Activity.RETRACTION)
 
     @property
     def way_out(self) -> float:
-        """How far the needle may be drawn out at most [m]; none without a snapshot."""
+        """Longest way that the needle may be drawn out [m]; none without a snapshot."""
         if self.snapshot is None:
             return 0.0
         insertion = self.snapshot.insertion

@@ -69,7 +69,7 @@ class Hold:
 
     @property
     def owner(self) -> str | None:
-        """Who holds; None: nobody whose press counts."""
+        """Name of the holder; None without a press that counts."""
         return self._owner
 
     @property
@@ -212,7 +212,7 @@ class Hold:
 
 
 class HoldRefusals:
-    """What there is to say of holds that do not count: each thing once, until it changes."""
+    """Notices of holds that do not count: each once, until it changes."""
 
     def __init__(self) -> None:
         # Those whose name is not known share one entry.

@@ -1,4 +1,4 @@
-"""How much of what goes wrong again and again is said in the log."""
+"""Limit of what the log says of what goes wrong again and again."""
 
 from __future__ import annotations
 

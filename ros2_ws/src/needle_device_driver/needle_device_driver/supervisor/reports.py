@@ -1,4 +1,4 @@
-"""What the motion supervisor has to say: answers, results, status."""
+"""Reports of the motion supervisor: answers, results, status."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Reply:
 
 @dataclasses.dataclass(frozen=True)
 class DeviceStatus:
-    """What device/status tells.
+    """Content of device/status.
 
     Attributes
     ----------

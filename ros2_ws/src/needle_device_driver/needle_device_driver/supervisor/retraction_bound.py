@@ -1,4 +1,4 @@
-"""How far the needle may be drawn out, also when its depth is no longer known."""
+"""Bound of a retraction, also when the needle's depth is no longer known."""
 
 from __future__ import annotations
 

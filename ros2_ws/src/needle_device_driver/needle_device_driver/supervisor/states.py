@@ -6,7 +6,7 @@ import enum
 
 
 class State(enum.Enum):
-    """What the device may do; only MOVING moves anything."""
+    """States of the device; only MOVING moves anything."""
 
     UNCONFIGURED = "UNCONFIGURED"
     DISABLED = "DISABLED"
@@ -17,7 +17,7 @@ class State(enum.Enum):
 
 
 class Trigger(enum.Enum):
-    """What leads from one state to another."""
+    """Events that lead from one state to another."""
 
     CONFIGURE = "configure"
     ENABLE = "enable"
@@ -34,7 +34,7 @@ class Trigger(enum.Enum):
 
 
 class Activity(enum.Enum):
-    """What moves in state MOVING."""
+    """Kinds of motion in state MOVING."""
 
     NONE = "none"
     STEP = "step"

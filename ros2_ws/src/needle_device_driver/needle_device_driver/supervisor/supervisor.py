@@ -1,4 +1,4 @@
-"""Who may move the needle, when, where to and how fast: every safety rule of the rig, once."""
+"""Safety rules of the rig, each once: who may move the needle, when, where to and how fast."""
 
 from __future__ import annotations
 
@@ -74,12 +74,12 @@ class MotionSupervisor:
 
     @property
     def state(self) -> State:
-        """What the device may do."""
+        """State of the device."""
         return self._core.state
 
     @property
     def activity(self) -> Activity:
-        """What moves."""
+        """Kind of the motion under way."""
         return self._core.activity
 
     def take_events(self) -> tuple[Event, ...]:

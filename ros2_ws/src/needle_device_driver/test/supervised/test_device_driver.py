@@ -24,8 +24,8 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import LATCHED, RELIABLE, to_nanoseconds
-from needle_common.ros.own_context import own_context
 from needle_device_driver.ros import device_driver as device_driver_node
+from own_context import own_context
 
 from .node_bench import Rig
 

@@ -39,7 +39,7 @@ class NetworkState(enum.IntEnum):
 
 
 class CanopenDevice:
-    """What every device does; what it is for is in `dictionary` and the callbacks.
+    """Behaviour of every device; what it is for is in `dictionary` and the callbacks.
 
     Frames that it sends collect in `outbox`. All times are readings of one steady clock [s].
 

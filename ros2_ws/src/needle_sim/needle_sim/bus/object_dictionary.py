@@ -51,7 +51,7 @@ class Kind(enum.Enum):
 
     @property
     def signed(self) -> bool:
-        """Whether it has a sign."""
+        """Tell whether it has a sign."""
         return self.value[1]
 
     @property
@@ -62,7 +62,7 @@ class Kind(enum.Enum):
 
 
 class Access(enum.Enum):
-    """What an SDO client may do."""
+    """Rights of an SDO client."""
 
     READ = "ro"
     READ_WRITE = "rw"

@@ -21,7 +21,7 @@ _EVENT_DRIVEN = 254
 
 
 class _Pdo:
-    """What both directions have in common: COB-ID, transmission type, mapping.
+    """Common part of both directions: COB-ID, transmission type, mapping.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ class _Pdo:
 
     @property
     def transmission_type(self) -> int:
-        """When it is sent or applied: 0..240 with SYNC, 254 and 255 at once."""
+        """Transmission type: 0..240 with SYNC, 254 and 255 at once."""
         return self._dictionary.value(self._parameters, 2)
 
     @property

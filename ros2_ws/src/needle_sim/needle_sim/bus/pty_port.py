@@ -43,12 +43,12 @@ class PtyPort:
 
     @property
     def filenos(self) -> list[int]:
-        """What to wait for input at; nothing while unplugged."""
+        """File descriptors to wait for input at; none while unplugged."""
         return [self._master] if self._master >= 0 else []
 
     @property
     def path(self) -> str:
-        """What the computer opens."""
+        """Path that the computer opens."""
         if self._link is not None:
             return str(self._link)
         return os.ttyname(self._slave) if self._slave >= 0 else ""

@@ -23,7 +23,7 @@ _MOST_DATA = 8
 
 @dataclasses.dataclass(frozen=True)
 class SlcanInput:
-    """What a stretch of bytes from the computer came to.
+    """Outcome of a stretch of bytes from the computer.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class SlcanAdapter:
 
     @property
     def is_open(self) -> bool:
-        """Whether the computer has opened the channel."""
+        """Tell whether the computer has opened the channel."""
         return self._open
 
     def feed(self, data: bytes) -> SlcanInput:

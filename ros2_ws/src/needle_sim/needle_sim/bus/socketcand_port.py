@@ -40,7 +40,7 @@ class SocketcandPort:
 
     @property
     def filenos(self) -> list[int]:
-        """What to wait for input at; nothing while unplugged."""
+        """File descriptors to wait for input at; none while unplugged."""
         return [s.fileno() for s in (self._server, self._client) if s is not None]
 
     def plug_in(self) -> None:

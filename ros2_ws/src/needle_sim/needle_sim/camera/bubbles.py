@@ -42,7 +42,7 @@ class BubbleCloud:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class BubbleImage:
-    """What bubbles do to one camera's image; all of the image's shape.
+    """Effect of bubbles on one camera's image; all of the image's shape.
 
     Attributes
     ----------

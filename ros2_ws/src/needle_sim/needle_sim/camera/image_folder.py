@@ -30,7 +30,7 @@ _PNG_OPTIONS = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Truth:
-    """Where the needle's end really is; angles as everywhere: asin(d_x), atan2(-d_y, d_z).
+    """True place of the needle's end; angles as everywhere: asin(d_x), atan2(-d_y, d_z).
 
     Attributes
     ----------

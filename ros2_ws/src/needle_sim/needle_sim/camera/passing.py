@@ -1,4 +1,4 @@
-"""What moves over the phantom: a cable, the needle's shadow on its floor, hands and covers."""
+"""Things moving over the phantom: a cable, the needle's shadow on its floor, hands and covers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a camera in air sees a point inside the phantom: Snell's law at its flat top surface."""
+"""Projection of points inside the phantom to a camera in air: Snell's law at its flat top."""
 
 from __future__ import annotations
 

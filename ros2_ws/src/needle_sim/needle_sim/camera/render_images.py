@@ -39,7 +39,7 @@ exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
 
 @dataclasses.dataclass(frozen=True)
 class RenderOptions:
-    """What was asked for; SI."""
+    """Options of `render_images`; SI."""
 
     output: Path
     scenario: Scenario

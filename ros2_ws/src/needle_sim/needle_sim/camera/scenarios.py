@@ -1,4 +1,4 @@
-"""What troubles the simulated cameras: named scenarios, from clean images to blocked cameras.
+"""Troubles of the simulated cameras: named scenarios, from clean images to blocked cameras.
 
 A scenario is data. What stands where and when follows from it, the seed and the exposure's number.
 """
@@ -57,7 +57,7 @@ class Glints:
 
 @dataclasses.dataclass(frozen=True)
 class Lighting:
-    """How far the light is from even and steady.
+    """Unevenness and unsteadiness of the light.
 
     Attributes
     ----------

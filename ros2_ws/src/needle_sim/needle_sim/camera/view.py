@@ -50,7 +50,7 @@ _HAND_ROUND_PX = 45.0
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Moment:
-    """What one exposure shows, in `rig`; the same for both cameras.
+    """Content of one exposure, in `rig`; the same for both cameras.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where a drive wants its motor to be: set-points, trapezoids and ramps, in counts and seconds."""
+"""Demand of a drive to its motor: set-points, trapezoids and ramps, in counts and seconds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Demand:
 
     @property
     def at_rest(self) -> bool:
-        """Whether nothing is under way."""
+        """Tell whether nothing is under way."""
         return self.velocity == 0.0 and self._segment_left <= 0.0
 
     def hold(self, position: float) -> None:

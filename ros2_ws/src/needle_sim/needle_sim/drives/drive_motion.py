@@ -1,4 +1,4 @@
-"""What a powered drive does with its motor: its modes, ramps, limits and following error."""
+"""Motion of a powered drive: its modes, ramps, limits and following error."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _NO_WINDOW = 0xFFFFFFFF
 
 
 class LimitAction(enum.Enum):
-    """What a drive does with a target beyond its software limits (0x607D)."""
+    """Answers of a drive to a target beyond its software limits (0x607D)."""
 
     CLAMP = "clamp"
     FAULT = "fault"
@@ -147,12 +147,12 @@ class DriveMotion:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the demand stands, whatever the motor does."""
+        """Tell whether the demand stands, whatever the motor does."""
         return self._demand.at_rest
 
     @property
     def settled(self) -> bool:
-        """Whether time alone would change nothing."""
+        """Tell whether time alone would change nothing."""
         return (
             self._demand.at_rest
             and self._motor.position == self._demand.position
@@ -242,7 +242,7 @@ class DriveMotion:
         return bool(self._word & HALT)
 
     def _is_blocked(self, way: float) -> bool:
-        """Whether a limit switch lies in that direction."""
+        """Tell whether a limit switch lies in that direction."""
         return (way < 0.0 and self._motor.at_negative_switch) or (
             way > 0.0 and self._motor.at_positive_switch
         )

@@ -16,7 +16,7 @@ class Port(Protocol):
 
     @property
     def filenos(self) -> list[int]:
-        """What to wait for input at."""
+        """File descriptors to wait for input at."""
 
     def plug_in(self) -> None:
         """Appear."""

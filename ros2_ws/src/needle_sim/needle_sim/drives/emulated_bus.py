@@ -12,7 +12,7 @@ from needle_sim.drives.emulated_drive import DriveSettings, EmulatedDrive
 
 
 class MotionClock(enum.Enum):
-    """What lets the motors move on."""
+    """Time that lets the motors move on."""
 
     # One SYNC period with every SYNC: the same commands give the same positions, to the count.
     SYNC = "sync"
@@ -22,7 +22,7 @@ class MotionClock(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class AxisState:
-    """Where a motor really is.
+    """True place of a motor.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class EmulatedBus:
 
     @property
     def moves(self) -> bool:
-        """Whether a motor turns or is about to."""
+        """Tell whether a motor turns or is about to."""
         return any(drive.moves for drive in self.drives.values())
 
     # ---- faults -------------------------------------------------------------------------------

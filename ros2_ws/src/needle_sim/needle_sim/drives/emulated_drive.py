@@ -42,7 +42,7 @@ _THEN_DISABLE = (1, 2)
 
 @dataclasses.dataclass(frozen=True)
 class DriveSettings:
-    """What a drive is.
+    """Settings of an emulated drive.
 
     Attributes
     ----------
@@ -159,7 +159,7 @@ class EmulatedDrive:
 
     @property
     def moves(self) -> bool:
-        """Whether the motor turns or is about to."""
+        """Tell whether the motor turns or is about to."""
         return self.motor.velocity != 0.0 or (self.state in _ON and not self._settled)
 
     def advance(self, steps: int) -> None:
@@ -173,7 +173,7 @@ class EmulatedDrive:
 
     @property
     def _settled(self) -> bool:
-        """Whether time alone would change nothing."""
+        """Tell whether time alone would change nothing."""
         if self._leaving is not None or self.state is PowerState.FAULT_REACTION:
             return False
         if self.state is PowerState.QUICK_STOP_ACTIVE and self._quick_stop_option in _THEN_DISABLE:
@@ -235,7 +235,7 @@ class EmulatedDrive:
             self._motion.switch_off()
 
     def _slows_down_before(self, state: PowerState) -> bool:
-        """Whether the motor brakes before it gets no more power."""
+        """Tell whether the motor brakes before it gets no more power."""
         at_once = order_of(self._word) is Order.DISABLE_VOLTAGE or self._motion.at_rest
         if state in _ON or at_once:
             return False

@@ -29,7 +29,7 @@ _WORDS = {
 
 
 class PlugOrder(enum.Enum):
-    """What a command does to the adapter."""
+    """Effects of a command on the adapter."""
 
     OUT = "out"
     IN = "in"

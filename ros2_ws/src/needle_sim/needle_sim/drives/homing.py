@@ -54,7 +54,7 @@ class Homing:
 
     @property
     def done(self) -> bool:
-        """Whether the axis stands and `home_position` (true counts) is known."""
+        """Tell whether the axis stands and `home_position` (true counts) is known."""
         return self._phase is _Phase.DONE
 
     def advance(self, demand: Demand, period: float) -> None:

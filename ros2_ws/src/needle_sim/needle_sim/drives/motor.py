@@ -11,7 +11,7 @@ _BEYOND = 0.003
 
 @dataclasses.dataclass(frozen=True)
 class MotorSettings:
-    """What the mechanics are like; counts and seconds.
+    """Mechanics of an axis; counts and seconds.
 
     Attributes
     ----------
@@ -55,12 +55,12 @@ class Motor:
 
     @property
     def at_negative_switch(self) -> bool:
-        """Whether the negative limit switch is touched; its edge is position 0."""
+        """Tell whether the negative limit switch is touched; its edge is position 0."""
         return self._has_switches and self.position < 0.0
 
     @property
     def at_positive_switch(self) -> bool:
-        """Whether the positive limit switch is touched."""
+        """Tell whether the positive limit switch is touched."""
         return self._has_switches and self.position > self._settings.travel
 
     @property

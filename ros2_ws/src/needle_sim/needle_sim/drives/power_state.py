@@ -19,7 +19,7 @@ class PowerState(enum.Enum):
 
 
 class Order(enum.Enum):
-    """What a controlword asks of the power state: (mask, value)."""
+    """Orders of a controlword to the power state: (mask, value)."""
 
     DISABLE_VOLTAGE = (0x02, 0x00)
     QUICK_STOP = (0x06, 0x02)

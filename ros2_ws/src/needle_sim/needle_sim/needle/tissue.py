@@ -1,4 +1,4 @@
-"""What the tissue does to the needle and the imaging to its tip: torsion, measurement noise."""
+"""Effects of the tissue on the needle and of the imaging on its tip: torsion, measurement noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When a tick of simulated time is over at level drive: both sides have answered, all is heard."""
+"""End of a tick of simulated time at level drive: both sides have answered, all is heard."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class DrivenTick:
 
     @property
     def answered(self) -> bool:
-        """Whether both sides have answered; what they said before may still be on its way."""
+        """Tell whether both sides have answered; what they said before may still be on its way."""
         return self._driver_is_done and self._drives_moved
 
     @property
     def silent(self) -> str:
-        """Who has not answered."""
+        """Names of those who have not answered."""
         names = [
             name
             for name, done in (

@@ -1,4 +1,4 @@
-"""When simulated time goes on, and when an exposure is due, if nobody waits for real time."""
+"""Progress of simulated time and times of exposures, if nobody waits for real time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MAX_WITHOUT_STEP = 60
 
 
 class Action(enum.Enum):
-    """What the simulation does next."""
+    """Next step of the simulation."""
 
     TICK = "tick"
     EXPOSE = "expose"

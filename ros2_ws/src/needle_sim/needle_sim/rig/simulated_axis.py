@@ -29,7 +29,7 @@ class SimulatedAxis(Axis):
 
     @property
     def position(self) -> float:
-        """Where the axis truly is [m or rad]."""
+        """True position of the axis [m or rad]."""
         return self._position
 
     def configure(self) -> None:

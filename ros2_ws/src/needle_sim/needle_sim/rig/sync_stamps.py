@@ -28,12 +28,12 @@ class SyncStamps:
 
     @property
     def waits(self) -> bool:
-        """Whether a SYNC waits for its time."""
+        """Tell whether a SYNC waits for its time."""
         return self._waiting > 0
 
     @property
     def new_times(self) -> int:
-        """How many new times were heard since the last SYNC that got one."""
+        """Number of new times heard since the last SYNC that got one."""
         return self._new_times
 
     def hear(self, time_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""What sim_rig publishes, as messages."""
+"""Messages of sim_rig."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class DriveEmulatorNode(WholeNode):
 
     @property
     def new_times(self) -> int:
-        """How many new simulated times were heard since positions were told."""
+        """Number of new simulated times heard since positions were told."""
         return self._stamps.new_times
 
     def _on_clock(self, message: Clock) -> None:

@@ -82,12 +82,12 @@ class DriveFollower:
 
     @property
     def publishers(self) -> list[Publisher[Any]]:
-        """What partners must listen to."""
+        """Topics that partners must listen to."""
         return []
 
     @property
     def subscriptions(self) -> list[Subscription[Any]]:
-        """What partners must publish."""
+        """Topics that partners must publish."""
         return self._subscriptions
 
     def missing(self) -> list[str]:
@@ -131,7 +131,7 @@ class DriveFollower:
 
     @property
     def patience(self) -> float:
-        """How long to wait for callbacks while a tick is under way [s]."""
+        """Longest wait for callbacks while a tick is under way [s]."""
         return 0.0 if self._tick.answered else _PATIENCE
 
     def idle(self, _time_ns: int, _now: float, *, repeat: bool) -> None:

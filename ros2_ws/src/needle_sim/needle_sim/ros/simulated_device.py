@@ -77,13 +77,13 @@ class SimulatedDevice:
 
     @property
     def publishers(self) -> list[Publisher[Any]]:
-        """What partners must listen to."""
+        """Topics that partners must listen to."""
         interface = self._interface
         return [interface.joint_states, interface.results, interface.statuses]
 
     @property
     def subscriptions(self) -> list[Subscription[Any]]:
-        """What partners must publish."""
+        """Topics that partners must publish."""
         return [self._interface.commands, self._interface.holds]
 
     def missing(self) -> list[str]:
@@ -131,7 +131,7 @@ class SimulatedDevice:
 
     @property
     def patience(self) -> float:
-        """How long to wait for callbacks while a tick is under way [s]: it never is."""
+        """Longest wait for callbacks while a tick is under way [s]: it never is."""
         return 0.0
 
     def idle(self, time_ns: int, now: float, *, repeat: bool) -> None:

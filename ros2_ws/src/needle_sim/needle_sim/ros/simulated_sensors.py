@@ -1,4 +1,4 @@
-"""What sim_rig exposes: the measured tip at level tip, images of the needle at the others."""
+"""Exposures of sim_rig: the measured tip at level tip, images of the needle at the others."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class SimulatedTips:
     """
 
     surface_height = math.inf
-    """Where the phantom ends, either way [m]: without cameras nowhere."""
+    """Ends of the phantom, either way [m]: none without cameras."""
 
     def __init__(self, node: Node, bench: SimulatedBench, values: SimRigParameters) -> None:
         self._bench = bench
@@ -59,12 +59,12 @@ class SimulatedTips:
 
     @property
     def heard(self) -> list[Publisher[Any]]:
-        """What partners must listen to."""
+        """Topics that partners must listen to."""
         return [self._tip]
 
     @property
     def subscriptions(self) -> list[Subscription[Any]]:
-        """What partners must publish."""
+        """Topics that partners must publish."""
         return []
 
     def expose(self, number: int, stamp: Time) -> None:
@@ -130,12 +130,12 @@ class SimulatedCameras:
 
     @property
     def heard(self) -> list[Publisher[Any]]:
-        """What partners must listen to."""
+        """Topics that partners must listen to."""
         return [image_raw for image_raw, _ in self._views]
 
     @property
     def subscriptions(self) -> list[Subscription[Any]]:
-        """What partners must publish."""
+        """Topics that partners must publish."""
         return [self._answers]
 
     def expose(self, number: int, stamp: Time) -> None:

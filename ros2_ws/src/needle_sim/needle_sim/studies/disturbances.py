@@ -1,4 +1,4 @@
-"""What goes wrong in a study: with the measured tips, and with the tissue's curvature.
+"""Disturbances of a study: of the measured tips, and of the tissue's curvature.
 
 The controller is told of none of it.
 """
@@ -16,7 +16,7 @@ from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 
 OUTLIER_SIZE = (0.005, 0.010)
-"""How far an outlier is off [m]."""
+"""Distance by which an outlier is off [m]."""
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature stays the same [m]."""
 

@@ -1,4 +1,4 @@
-"""How well a study's runs went: one row for each run, and the figures over all of them."""
+"""Outcome of a study: one row for each run, and the figures over all of them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ BoolArray = NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True)
 class Outcomes:
-    """What became of each run; all of it from the true tips.
+    """Outcome of each run, from the true tips.
 
     Attributes
     ----------
@@ -47,17 +47,17 @@ class Outcomes:
 
     @property
     def converged_at_end(self) -> BoolArray:
-        """Whether |x| <= 1 mm at the end."""
+        """Tell whether |x| <= 1 mm at the end."""
         return np.asarray(np.abs(self.x_end) <= BAND)
 
     @property
     def converged_last_steps(self) -> BoolArray:
-        """Whether |x| <= 1 mm after each of the last steps."""
+        """Tell whether |x| <= 1 mm after each of the last steps."""
         return np.asarray(np.all(np.abs(self.x_last) <= BAND, axis=1))
 
     @property
     def diverged(self) -> BoolArray:
-        """Whether a run that missed ended farther off than it started, and still moved away."""
+        """Tell whether a run that missed ended farther off than it started, still moving away."""
         end = np.abs(self.x_end)
         away = (end > np.abs(self.x_start)) & (end > np.abs(self.x_last[:, 0]))
         return np.asarray(~self.converged_at_end & away)

@@ -1,4 +1,4 @@
-"""Where the needles of a study start: the grid of [KC09] IV-A, in either convention, or random."""
+"""Starts of the needles of a study: the grid of [KC09] IV-A, in either convention, or random."""
 
 from __future__ import annotations
 

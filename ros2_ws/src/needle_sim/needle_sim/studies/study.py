@@ -27,7 +27,7 @@ CHUNK = 10_000
 
 
 class Controller(Protocol):
-    """What steers some needles; everything has their number as its leading axis.
+    """Controller of some needles; everything has their number as its leading axis.
 
     Attributes
     ----------
@@ -65,7 +65,7 @@ class Controller(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class StudySettings:
-    """What every needle of a study has in common.
+    """Common settings of every needle of a study.
 
     Attributes
     ----------

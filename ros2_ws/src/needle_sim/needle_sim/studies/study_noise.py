@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, PITCH = range(7)
-"""What random numbers are for."""
+"""Purposes of random numbers."""
 PER_NEEDLE = 4
 """Numbers for each needle and draw: two needles share one block of the generator."""
 

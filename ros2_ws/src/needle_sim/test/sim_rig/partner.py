@@ -29,7 +29,7 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.ros.own_context import own_context
+from own_context import own_context
 
 from .bench import SimRigBench
 

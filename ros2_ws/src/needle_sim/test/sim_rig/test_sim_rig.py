@@ -19,8 +19,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE, to_nanoseconds
-from needle_common.ros.own_context import own_context
 from needle_sim.ros.sim_rig import SimRigNode
+from own_context import own_context
 
 from .bench import LIMIT
 from .partner import Rig, running

@@ -26,7 +26,7 @@ from needle_common.ros.conversions import (
     to_nanoseconds,
     to_stamp,
 )
-from needle_common.ros.own_context import own_context
+from own_context import own_context
 
 from .bench import SimRigBench
 

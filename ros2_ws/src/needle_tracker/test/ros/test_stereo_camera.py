@@ -23,7 +23,6 @@ from sensor_msgs.msg import CameraInfo, Image
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import IMAGES, RELIABLE, to_nanoseconds
-from needle_common.ros.own_context import own_context
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.ros.stereo_camera import StereoCameraNode
 from needle_tracker.sources.stereo_source import (
@@ -35,6 +34,7 @@ from needle_tracker.sources.stereo_source import (
     StereoSource,
     open_source,
 )
+from own_context import own_context
 
 LIMIT = 20.0
 SIZES = {"left": (64, 48), "right": (64, 48)}

@@ -31,8 +31,8 @@ from needle_common.ros.conversions import (
     to_nanoseconds,
     to_stamp,
 )
-from needle_common.ros.own_context import own_context
 from needle_tracker.ros.stereo_tracker import StereoTrackerNode
+from own_context import own_context
 
 LIMIT = 20.0
 INSERTION = 0.05

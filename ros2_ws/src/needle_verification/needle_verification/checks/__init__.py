@@ -1,1 +1,1 @@
-"""What the steps of the project must show, at full size."""
+"""Checks of what the steps of the project must show, at full size."""

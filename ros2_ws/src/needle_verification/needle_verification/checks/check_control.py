@@ -44,7 +44,7 @@ MEMORY_SLACK = 10.0 * MEGABYTE
 
 @dataclasses.dataclass(frozen=True)
 class Size:
-    """How much of everything is run.
+    """Sizes of everything that is run.
 
     Attributes
     ----------

@@ -33,7 +33,7 @@ SAMPLING = 0.04
 
 @dataclasses.dataclass(frozen=True)
 class Bound:
-    """How long a motion may go on at its speed after a fault, docs/safety.md.
+    """Bound of a motion that goes on at its speed after a fault, docs/safety.md.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What [KC09] section IV says, run again: the trials, the studies, and the figures from them."""
+"""Results of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ SUMMARY = "summary.json"
 
 
 class Laboratory:
-    """Where trials and studies are run, each once.
+    """Place in which trials and studies are run, each once.
 
     Parameters
     ----------

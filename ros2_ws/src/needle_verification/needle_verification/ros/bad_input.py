@@ -28,7 +28,7 @@ LEFT_IMAGE = "left_image"
 
 @dataclasses.dataclass(frozen=True)
 class BadInputParameters:
-    """What to send."""
+    """Parameters of the publisher."""
 
     kinds: tuple[str, ...] = fixed_parameter(
         ("not_finite",), "-", "What is bad; several take turns.", choices=(*TIPS, LEFT_IMAGE)

@@ -39,7 +39,7 @@ CASES: dict[str, dict[str, Any]] = {
     "flips with preset paper": {"preset": "paper", "flip_depths": [0.05]},
     "one bad value among good ones": {"tip_margin": 0.005, "preset": "best_of_all"},
 }
-"""What each case sets; every one must be refused as a whole."""
+"""Values that each case sets; every one must be refused as a whole."""
 FAR_PLANE = 0.09
 _LIMIT = 20.0
 

@@ -39,7 +39,7 @@ _PATIENCE = 20.0
 
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """Where the motors really were [m], [rad], at their time [ns], heard at steady time [s]."""
+    """True places of the motors [m], [rad], at their time [ns], heard at steady time [s]."""
 
     stamp_ns: int
     heard_at: float

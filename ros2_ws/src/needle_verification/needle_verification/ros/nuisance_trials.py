@@ -1,4 +1,4 @@
-"""What others send while a step is under way: how long it holds the driver's cycle up."""
+"""Nuisances from others while a step is under way, and how long they hold the driver's cycle up."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ _SPIN: Final = 0.002
 
 @dataclasses.dataclass(frozen=True)
 class LoadParameters:
-    """How much to send."""
+    """Parameters of the load."""
 
     duration: float = fixed_parameter(60.0, "s", "How long to send.", 0.1, 3600.0)
     images: bool = fixed_parameter(True, "-", "Whether to send images too.")
@@ -102,7 +102,7 @@ class RecordingLoad(WholeNode):
         ]
 
     def waits_for_recorder(self) -> bool:
-        """Whether a topic is not recorded yet."""
+        """Tell whether a topic is not recorded yet."""
         return bool(unrecorded(self, (stream.publisher for stream in self.streams)))
 
     def run(self, end: EndRequest) -> None:

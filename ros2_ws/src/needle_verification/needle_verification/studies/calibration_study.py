@@ -1,4 +1,4 @@
-"""How far tips are off after a rig that is known was calibrated from a board's noisy corners."""
+"""Errors of tips after a rig that is known was calibrated from a board's noisy corners."""
 
 from __future__ import annotations
 

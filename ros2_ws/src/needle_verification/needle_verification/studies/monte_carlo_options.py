@@ -52,7 +52,7 @@ exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 
 @dataclasses.dataclass(frozen=True)
 class MonteCarloOptions:
-    """What one study was asked for; SI."""
+    """Options of one study; SI."""
 
     controller: str
     grid: str

@@ -24,7 +24,7 @@ _SEEN = 0.95  # share of the last 10 mm in view, in both cameras: the needle is 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TrackedRun:
-    """What the tracker made of one insertion; one entry for each exposure.
+    """Answers of the tracker during one insertion, one for each exposure.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class TrackedRun:
 
     @property
     def found(self) -> NDArray[np.bool_]:
-        """Whether there is a tip."""
+        """Tell whether there is a tip."""
         return np.asarray(np.isfinite(self.normalised))
 
     @property

@@ -40,7 +40,7 @@ Key = tuple[str, int, bytes]
 
 @dataclasses.dataclass(frozen=True)
 class Extent:
-    """Where a message's bytes are: if one of [start, end) is wrong, it need not be readable.
+    """Place of a message's bytes: if one of [start, end) is wrong, it need not be readable.
 
     Attributes
     ----------

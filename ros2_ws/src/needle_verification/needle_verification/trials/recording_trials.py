@@ -36,7 +36,7 @@ _SECOND = 1_000_000_000
 
 @dataclasses.dataclass(frozen=True)
 class FullRate:
-    """What came of a recording at full rate.
+    """Outcome of a recording at full rate.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ class FullRate:
 
 @dataclasses.dataclass(frozen=True)
 class Killed:
-    """What `recover` made of a killed recording.
+    """Outcome of `recover` on a killed recording.
 
     Attributes
     ----------

@@ -37,7 +37,7 @@ _WRONG = ("Traceback", "Exception ignored", "terminate called", "Fatal Python er
 
 @dataclasses.dataclass(frozen=True)
 class Ended:
-    """How one node ended.
+    """End of one node.
 
     Attributes
     ----------
