@@ -94,8 +94,9 @@ class PtyPort:
         except OSError:
             return ()
         taken = self._adapter.feed(data)
-        if taken.opened:
-            # Whoever opens the channel must not read what was meant for the last one.
+        if taken.closed:
+            # Whoever opens the channel, and closes it first, must not read what was meant for the
+            # last one. When it is opened it may be read already.
             self._waiting = b""
             termios.tcflush(self._slave, termios.TCIFLUSH)
         self._write(taken.reply)

@@ -31,13 +31,13 @@ class SlcanInput:
         Frames for the bus, in order.
     reply : bytes
         What the adapter answers.
-    opened : bool
-        Whether the channel was opened or closed: what waits for the computer is obsolete.
+    closed : bool
+        Whether the channel was closed: what waits for the computer is obsolete.
     """
 
     frames: tuple[CanFrame, ...]
     reply: bytes
-    opened: bool
+    closed: bool
 
 
 class SlcanAdapter:
@@ -58,16 +58,16 @@ class SlcanAdapter:
         self._buffer += data
         frames: list[CanFrame] = []
         reply = bytearray()
-        opened = False
+        closed = False
         while (end := self._buffer.find(DONE)) >= 0:
             command = bytes(self._buffer[:end])
             del self._buffer[: end + 1]
-            opened = opened or command in (b"O", b"L", b"C")
+            closed = closed or command == b"C"
             reply += self._obey(command, frames)
         if len(self._buffer) > _LONGEST:
             self._buffer.clear()
             reply += REFUSED
-        return SlcanInput(tuple(frames), bytes(reply), opened)
+        return SlcanInput(tuple(frames), bytes(reply), closed)
 
     def encode(self, frame: CanFrame) -> bytes:
         """Return a frame as the computer reads it; nothing while the channel is closed."""

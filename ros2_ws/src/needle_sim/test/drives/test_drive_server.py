@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -113,6 +114,24 @@ def test_unplugged_adapter_is_an_error_and_comes_back(served: Served, tmp_path: 
         assert node.sdo.upload(0x1000, 0) == b"\x92\x01\x04\x00"
     finally:
         network.disconnect()
+
+
+def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(tmp_path: Path) -> None:
+    port = PtyPort(tmp_path / "can")
+    computer = os.open(port.path, os.O_RDWR | os.O_NOCTTY)
+    try:
+        for words in (b"C\r", b"S6\r", b"O\r"):
+            os.write(computer, words)
+            port.receive()
+        # Whoever waits at the port was told that there is something to read.
+        assert os.read(computer, 100) == b"\r\r\r"
+        port.send([CanFrame(0x181, b"\1")])
+        os.write(computer, b"C\r")
+        port.receive()
+        assert os.read(computer, 100) == b"\r"
+    finally:
+        os.close(computer)
+        port.unplug()
 
 
 def test_socketcand_serves_the_same_bus() -> None:
