@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shlex
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -102,13 +104,25 @@ class Ros2:
         self.code, self.out, self.err = result.returncode, result.stdout, result.stderr
 
 
+def at_once(ros2: type[Ros2], *commands: str) -> list[Ros2]:
+    """Run commands side by side: each waits for seconds."""
+    with ThreadPoolExecutor() as pool:
+        return list(pool.map(lambda command: ros2(*shlex.split(command)), commands))
+
+
 def test_lists_nodes_topics_services_and_parameters(ros2: type[Ros2]) -> None:
-    long = ("--spin-time", "3")
-    assert ros2("node", "list", *long).out == "/rig/partner\n"
-    topics = ros2("topic", "list", "-t", *long).out.splitlines()
-    assert "/rig/hold [sensor_msgs/msg/Joy]" in topics
-    assert "/rig/enable" in ros2("service", "list", *long).out.splitlines()
-    assert "  speed\n" in ros2("param", "list", "/rig/partner").out
+    # Another command's node is in the graph, too, but hidden.
+    nodes, topics, services, parameters = at_once(
+        ros2,
+        "node list --spin-time 3",
+        "topic list -t --spin-time 3",
+        "service list --spin-time 3",
+        "param list /rig/partner",
+    )
+    assert nodes.out == "/rig/partner\n"
+    assert "/rig/hold [sensor_msgs/msg/Joy]" in topics.out.splitlines()
+    assert "/rig/enable" in services.out.splitlines()
+    assert "  speed\n" in parameters.out
 
 
 def test_echo_hears_what_was_said_before_it_came_and_shortens_arrays(ros2: type[Ros2]) -> None:
@@ -169,9 +183,12 @@ def test_an_answer_that_never_comes_is_told(domain: int, ros2: type[Ros2]) -> No
     rclpy.init(context=context, domain_id=domain)
     deaf = Node("deaf", context=context)  # never spun
     deaf.create_service(SetBool, "deaf/enable", lambda _, response: response)
-    call = ros2("service", "call", "/deaf/enable", "std_srvs/srv/SetBool", "{data: true}")
+    call, get = at_once(
+        ros2,
+        "service call /deaf/enable std_srvs/srv/SetBool '{data: true}'",
+        "param get /deaf speed",
+    )
     assert (call.code, call.err) == (1, "no answer from /deaf/enable\n")
-    get = ros2("param", "get", "/deaf", "speed")
     assert (get.code, get.err) == (1, "no answer from /deaf\n")
     deaf.destroy_node()
     rclpy.try_shutdown(context=context)
