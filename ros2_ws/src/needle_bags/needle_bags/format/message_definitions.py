@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
@@ -70,6 +72,18 @@ def type_hash(type_name: str, definition: str) -> str:
         return store.hash_rihs01(type_name)
     except (TypesysError, KeyError) as error:
         raise UserError(f"the definition of {type_name} cannot be read: {error}") from error
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of an installed message or service type.
+
+    Raises
+    ------
+    ImportError, AttributeError, ValueError
+        If it is not installed, or the name is none.
+    """
+    package, kind, short = type_name.split("/")
+    return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
 def _read(type_name: str, prefixes: list[Path]) -> str:

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
-
 from needle_bags.format.bag_metadata import BagTopic
-from needle_bags.format.message_definitions import full_definition, type_hash
+from needle_bags.format.message_definitions import full_definition, message_class, type_hash
 from needle_common.errors import UserError
 
 
@@ -29,9 +26,3 @@ def unplayable(topic: BagTopic) -> str:
             "distribution): play it where it was recorded"
         )
     return ""
-
-
-def message_class(type_name: str) -> Any:
-    """Return the class of an installed type's messages; raises where it is not installed."""
-    package, kind, short = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), short)

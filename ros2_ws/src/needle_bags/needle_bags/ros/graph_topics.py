@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import collections
-import importlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +13,7 @@ from rclpy.qos import ReliabilityPolicy
 from rclpy.subscription import Subscription
 
 from needle_bags.format.bag_metadata import BagTopic
-from needle_bags.format.message_definitions import full_definition
+from needle_bags.format.message_definitions import full_definition, message_class
 from needle_bags.format.message_loss import SequenceGaps
 from needle_bags.format.topic_choice import TopicChoice
 from needle_bags.recording.recording import Received
@@ -131,9 +130,7 @@ class GraphTopics:
         if len(types) > 1:
             raise ValueError(f"it has several types: {', '.join(types)}")
         full_definition(types[0])
-        package, kind, short = types[0].split("/")
-        message_class = getattr(importlib.import_module(f"{package}.{kind}"), short)
-        topic = _Topic(name, types[0], message_class)
+        topic = _Topic(name, types[0], message_class(types[0]))
         self._topics[name] = topic
         return topic
 

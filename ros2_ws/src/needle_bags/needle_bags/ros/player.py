@@ -19,7 +19,8 @@ from std_srvs.srv import SetBool
 from tqdm import tqdm
 
 from needle_bags.format.bag_metadata import BagTopic
-from needle_bags.player.playable import message_class, unplayable
+from needle_bags.format.message_definitions import message_class
+from needle_bags.player.playable import unplayable
 from needle_bags.player.playback import PlaybackClock, ReadAhead
 from needle_bags.player.player_options import (
     MAX_RATE,

@@ -34,9 +34,7 @@ TRIALS = ("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
 def main() -> int:
     """Run trials; returns the exit code."""
     parser = CommandParser("drive_trials", __doc__ or "", "")
-    parser.add_argument(
-        "trial", choices=("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
-    )
+    parser.add_argument("trial", choices=TRIALS)
     parser.add_argument("count", type=int)
     parser.add_argument("kinds", nargs="*", help="which faults, or which nodes; all if none")
     parser.add_argument("--seed", type=int, default=1)

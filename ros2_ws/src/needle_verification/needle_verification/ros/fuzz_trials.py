@@ -15,11 +15,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
+from needle_bags.format.message_definitions import message_class
 from needle_common.errors import UserError
 from needle_common.ros.base_node import executor_of
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
 from needle_common.ros.whole_node import WholeNode
-from needle_verification.trials.random_messages import class_of, random_message
+from needle_verification.trials.random_messages import random_message
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
 _READY = 120.0
@@ -159,12 +160,12 @@ class _Fuzzer:
             there.add(name)
             for topic, types in self._node.get_subscriber_names_and_types_by_node(name, namespace):
                 if topic not in self.publishers and topic not in self.left_out:
-                    kind = class_of(types[0])
+                    kind = message_class(types[0])
                     publisher = self._node.create_publisher(kind, topic, LATCHED)
                     self.publishers[topic] = (publisher, kind)
             for service, types in self._node.get_service_names_and_types_by_node(name, namespace):
                 if service not in self.clients_of:
-                    kind = class_of(types[0])
+                    kind = message_class(types[0])
                     self.clients_of[service] = (self._node.create_client(kind, service), kind)
         return there
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import random
 import re
 from typing import Any
+
+from needle_bags.format.message_definitions import message_class
 
 _BITS = {"int8": 8, "int16": 16, "int32": 32, "int64": 64}
 _TEXTS = ("", "rig", "insertion_joint", "rotation_joint", "tip", "STEERING", "nan", "-1", "\0")
@@ -14,12 +15,6 @@ _SPECIAL = (0.0, -0.0, 1.0, -1.0, math.nan, math.inf, -math.inf, 1e-320, 1e300, 
 _LONGEST = 40
 _SEQUENCE = re.compile(r"sequence<(.*?)(?:, (\d+))?>$")
 _ARRAY = re.compile(r"(.*)\[(\d+)\]$")
-
-
-def class_of(type_name: str) -> Any:
-    """Return the class of a message or service, named `package/msg/Type`."""
-    package, kind, short = type_name.split("/")
-    return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
 def random_message(kind: Any, rng: random.Random) -> Any:
@@ -54,7 +49,7 @@ def _value(type_name: str, rng: random.Random) -> Any:  # noqa: PLR0911 - each r
             (low, high - 1, min(1, high), rng.randrange(low, high), rng.randrange(16))
         )
     package, short = type_name.split("/")
-    return random_message(class_of(f"{package}/msg/{short}"), rng)
+    return random_message(message_class(f"{package}/msg/{short}"), rng)
 
 
 def _values(type_name: str, count: int, rng: random.Random) -> list[Any]:
