@@ -195,8 +195,7 @@ def _run_nodes(
         while operator.exit_code is None and failure is None:
             interruption.check()
             if time.monotonic() - begin > QUIET_AFTER:
-                with interruption.at_once():
-                    _import_report()
+                _import_report()
             failure = _first_dead(nodes)
             wait_for([operator], POLL)
         failure = failure or _first_dead(nodes)
