@@ -19,7 +19,7 @@ from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import Pair, PairMatcher
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -108,7 +108,7 @@ class PairAnswers:
         tracker: TrackerSettings,
         settings: PairingSettings,
     ) -> None:
-        self.tracker = StereoTracker(calibration, tracker)
+        self.tracker = TipTracker(calibration, tracker)
         self.tracker.warm_up()
         self.swap = SwapWatch(calibration, tracker)
         self.matcher: PairMatcher[Frame] = PairMatcher(settings.pair_tolerance_ns)

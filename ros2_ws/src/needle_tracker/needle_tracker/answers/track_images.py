@@ -20,8 +20,8 @@ from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
-from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import default_settings
 
 DESCRIPTION = """\
@@ -81,7 +81,7 @@ def _run(words: Sequence[str]) -> int:
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
     settings = dataclasses.replace(default_settings(calibration.phantom), needle_width=width)
-    tracker = StereoTracker(calibration, settings)
+    tracker = TipTracker(calibration, settings)
     tracker.warm_up()
     begin = time.perf_counter()
     tracked = track_sequence(pairs, tracker, calibration, insertions)
@@ -116,7 +116,7 @@ def _run(words: Sequence[str]) -> int:
 
 def track_sequence(
     pairs: PairSequence,
-    tracker: StereoTracker,
+    tracker: TipTracker,
     calibration: StereoCalibration,
     insertions: Mapping[str, float] | None,
 ) -> TrackedSequence:
@@ -126,7 +126,7 @@ def track_sequence(
     ----------
     pairs : PairSequence
         The images.
-    tracker : StereoTracker
+    tracker : TipTracker
         A fresh one.
     calibration : StereoCalibration
         The tracker's.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +18,10 @@ Array = NDArray[np.float64]
 _LINE_SYSTEMATIC_PX = 0.018  # what calibration and the needle's bend leave in the line
 _END_SYSTEMATIC_PX = 0.13  # bevel, blur, light: where "half" is
 # An end that cannot be seen is hardly known; but the line is the needle's near that place only.
-_HIDDEN_END_PX = 8.0
+HIDDEN_END_PX = 8.0
 _END_DOUBT_PX = 4.5  # for each unit of mass too little before, or left after, the end
 _SOUND_END = 0.02
-_HIDDEN_FACTOR = 3.0  # what hides the end is beside the line too
+HIDDEN_FACTOR = 3.0  # what hides the end is beside the line too
 _CLEAR_BEFORE = (0.65, 1.45)
 _CLEAR_AFTER = 0.3
 _PATH_SEARCH_PX = 6
@@ -49,6 +50,9 @@ class ImageTip:
         Whether the end itself is seen; otherwise only the shaft is.
     bright : bool
         Whether the needle is brighter than what is around it.
+    allowance : float
+        How many times worse than a line's it may be known and count as much. A line's end is where
+        it is seen to end, and finely; a map's covers what a ground face hides.
     """
 
     point: Array
@@ -60,6 +64,7 @@ class ImageTip:
     visibility: float
     clear: bool = True
     bright: bool = False
+    allowance: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,8 +93,15 @@ class Expected:
     contrast: float = 0.0
 
 
+Fit = Callable[[Image, Expected, bool, DetectionSettings], ImageTip | None]
+
+
 def fit_tip(
-    image: Image, path: Path, settings: DetectionSettings, sigma_along: float = 0.0
+    image: Image,
+    path: Path,
+    settings: DetectionSettings,
+    sigma_along: float = 0.0,
+    fit: Fit | None = None,
 ) -> ImageTip | None:
     """Fit shaft line and end point near the end of a path.
 
@@ -103,6 +115,8 @@ def fit_tip(
         How the needle looks; the path says whether it is bright.
     sigma_along : float
         Of the path's end along the shaft [px]; 0: not known.
+    fit : callable, optional
+        In place of `fit_expected`.
 
     Returns
     -------
@@ -115,7 +129,7 @@ def fit_tip(
     # On the path itself first: a line beside the needle, such as its shadow, then hardly matters.
     for search in (0, _PATH_SEARCH_PX):
         expected = Expected(point, direction, room, search, sigma_along)
-        tip = fit_expected(image, expected, path.bright, settings)
+        tip = (fit or fit_expected)(image, expected, path.bright, settings)
         if tip is None:
             continue
         if tip.clear and tip.sigma_across < _SURE_PX:
@@ -176,8 +190,8 @@ def fit_expected(
     return ImageTip(
         point=np.array([u, v]),
         direction=np.array([d_u, d_v]),
-        sigma_across=math.hypot(across, _LINE_SYSTEMATIC_PX) * (1.0 if clear else _HIDDEN_FACTOR),
-        sigma_along=math.hypot(along, _END_SYSTEMATIC_PX, doubt) if clear else _HIDDEN_END_PX,
+        sigma_across=math.hypot(across, _LINE_SYSTEMATIC_PX) * (1.0 if clear else HIDDEN_FACTOR),
+        sigma_along=math.hypot(along, _END_SYSTEMATIC_PX, doubt) if clear else HIDDEN_END_PX,
         sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC_PX / line_px),
         contrast=contrast,
         visibility=contrast / max(light + contrast if bright else light, 1.0),
@@ -188,7 +202,7 @@ def fit_expected(
 
 def hidden(tip: ImageTip) -> ImageTip:
     """Return a tip whose end does not count, only its line."""
-    return dataclasses.replace(tip, sigma_along=_HIDDEN_END_PX, clear=False)
+    return dataclasses.replace(tip, sigma_along=HIDDEN_END_PX, clear=False)
 
 
 def _coarse_line(pixels: Array, length: float) -> tuple[Array, Array]:

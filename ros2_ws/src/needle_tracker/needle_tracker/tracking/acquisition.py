@@ -17,7 +17,6 @@ from needle_tracker.image.detection import (
     Path,
     cut_path,
     distinct,
-    find_paths,
     of_one_polarity,
     without_shadows,
 )
@@ -207,7 +206,9 @@ class Acquisition:
                 if pair[i] not in fitted[i]:
                     path = paths[i][pair[i]]
                     sigma = 0.0 if insertion is None else _CUT * self._scale(i)
-                    fitted[i][pair[i]] = fit_tip(images[i], path, self._detection[i], sigma)
+                    fitted[i][pair[i]] = fit_tip(
+                        images[i], path, self._detection[i], sigma, self._follower.looks[i].fit
+                    )
             left, right = fitted[0][pair[0]], fitted[1][pair[1]]
             left_path, right_path = paths[0][pair[0]], paths[1][pair[1]]
             if left is None or right is None or not (left.clear or right.clear):
@@ -373,7 +374,7 @@ class Acquisition:
         following = last is not None and self._track.state is TrackState.TRACKING
         if last is not None and following and look.bright is None:
             look = dataclasses.replace(look, bright=last[i].bright)
-        paths = find_paths(image, grid, look, ends=self._ends(i, insertion))
+        paths = self._follower.looks[i].find_paths(image, grid, look, self._ends(i, insertion))
         if insertion is not None:
             paths = [cut_path(path, grid, insertion) for path in paths]
         return without_shadows(distinct(paths))

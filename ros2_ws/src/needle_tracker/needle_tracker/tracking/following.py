@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.image.detection import DetectionSettings, Image
-from needle_tracker.image.tip_fit import Expected, ImageTip, fit_expected, hidden
+from needle_tracker.image.looks import LINE_LOOKS, Look
+from needle_tracker.image.tip_fit import Expected, ImageTip, hidden
 from needle_tracker.optics.compiled_projection import point_jacobian, project_point
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.tip_prediction import TipMotion
@@ -47,10 +48,12 @@ class Follower:
         Its diameter [m].
     hole_clearance : float
         Radius around the entry that is not looked at [m].
+    looks : pair of Look
+        How each image is looked at; at its lines by default.
 
     Attributes
     ----------
-    views : pair of RefractedCamera
+    views, looks : pair of RefractedCamera, pair of Look
         As given.
     """
 
@@ -60,8 +63,10 @@ class Follower:
         detection: tuple[DetectionSettings, DetectionSettings],
         needle_width: float,
         hole_clearance: float,
+        looks: tuple[Look, Look] = LINE_LOOKS,
     ) -> None:
         self.views = views
+        self.looks = looks
         self._detection = detection
         self._scales = tuple(look.needle_width_px / needle_width for look in detection)
         self._entries = tuple(view.project(np.zeros(3)) for view in views)
@@ -119,9 +124,9 @@ class Follower:
         tip = None
         if predicted.known and abs(predicted.ahead) < _FOLLOW_DIRECTLY:
             on_line = dataclasses.replace(expected, search=0)
-            tip = fit_expected(image, on_line, last.bright, self._detection[i])
+            tip = self.looks[i].fit(image, on_line, last.bright, self._detection[i])
         if tip is None:
-            tip = fit_expected(image, expected, last.bright, self._detection[i])
+            tip = self.looks[i].fit(image, expected, last.bright, self._detection[i])
         return None if tip is None else (tip, expected)
 
 
@@ -226,7 +231,11 @@ def weighed(
 
 def shows_end(tip: ImageTip, across_px: float, along_px: float) -> bool:
     """Return whether a view shows the needle's end to these standard deviations [px]."""
-    return tip.clear and tip.sigma_across <= across_px and tip.sigma_along <= along_px
+    return (
+        tip.clear
+        and tip.sigma_across <= tip.allowance * across_px
+        and tip.sigma_along <= tip.allowance * along_px
+    )
 
 
 def is_sound(tip: ImageTip) -> bool:

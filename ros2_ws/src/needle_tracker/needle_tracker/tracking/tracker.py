@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from needle_tracker.image.detection import DetectionSettings, Image
+from needle_tracker.image.looks import LINE_LOOKS, Look
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
@@ -54,9 +55,16 @@ class StereoTracker:
         The stereo rig.
     settings : TrackerSettings
         What else is known.
+    looks : pair of Look, optional
+        How each image is looked at; at its lines by default.
     """
 
-    def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
+    def __init__(
+        self,
+        calibration: StereoCalibration,
+        settings: TrackerSettings,
+        looks: tuple[Look, Look] = LINE_LOOKS,
+    ) -> None:
         # Results must not depend on how many cores there are.
         cv2.setNumThreads(1)
         cameras = (calibration.left, calibration.right)
@@ -67,7 +75,11 @@ class StereoTracker:
         )
         self._detection = (self._look(self.views[0]), self._look(self.views[1]))
         self._follower = Follower(
-            self.views, self._detection, settings.needle_width, settings.hole_clearance
+            self.views,
+            self._detection,
+            settings.needle_width,
+            settings.hole_clearance,
+            looks,
         )
         self._shapes = tuple((camera.height, camera.width) for camera in cameras)
         self.track = Track(settings.gates)
@@ -81,6 +93,12 @@ class StereoTracker:
         self._hidden_ends = HiddenEnds()
         self._clear_at: float | None = None
         self._sound_at: float | None = None
+
+    @property
+    def needle_widths_px(self) -> tuple[float, float]:
+        """Width of the needle in the left and the right image [px]."""
+        left, right = self._detection
+        return left.needle_width_px, right.needle_width_px
 
     def warm_up(self) -> None:
         """Compile, or load, all that is compiled: the first pair must not wait for it.

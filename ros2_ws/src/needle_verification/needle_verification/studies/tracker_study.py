@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
-from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import default_settings
 from needle_verification.studies.tracker_sequences import Exposure, insertion_sequence
 
@@ -70,13 +70,13 @@ class TrackedRun:
         return longest
 
 
-def new_tracker(calibration: StereoCalibration) -> StereoTracker:
+def new_tracker(calibration: StereoCalibration) -> TipTracker:
     """Return a tracker as the node's defaults make it."""
-    return StereoTracker(calibration, default_settings(calibration.phantom))
+    return TipTracker(calibration, default_settings(calibration.phantom))
 
 
 def track_run(
-    tracker: StereoTracker,
+    tracker: TipTracker,
     exposures: Iterable[Exposure],
     *,
     insertion_known: bool = True,
@@ -86,7 +86,7 @@ def track_run(
 
     Parameters
     ----------
-    tracker : StereoTracker
+    tracker : TipTracker
         Forgets what it knew.
     exposures : iterable of Exposure
         The insertion.

@@ -1,0 +1,78 @@
+"""The end in a needle map: where the chance to reach so far falls, and how fast."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression
+from scipy.stats import norm
+
+from needle_tracker.image.end_fit import _make_decreasing, fit_end
+
+SHAPE = (80, 160)
+WIDTH = 5.0
+END = np.array([97.3, 41.6])
+
+
+def drawn(angle: float, sigma: float = 0.4, end: NDArray[np.float64] = END) -> NDArray[np.uint8]:
+    """Draw a map of a straight needle whose end is normally distributed along it."""
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    along = math.cos(angle) * (u - end[0]) + math.sin(angle) * (v - end[1])
+    across = -math.sin(angle) * (u - end[0]) + math.cos(angle) * (v - end[1])
+    chance = norm.sf(along / sigma) * np.clip(0.5 * WIDTH + 0.5 - np.abs(across), 0.0, 1.0)
+    return np.asarray(np.rint(255.0 * chance), np.uint8)
+
+
+def fitted(
+    needle_map: NDArray[np.uint8], angle: float, search: float = 0.0
+) -> NDArray[np.float64] | None:
+    result = np.zeros(9)
+    expected = END + np.array([3.0, 0.0])
+    direction = np.array([math.cos(angle + 0.03), math.sin(angle + 0.03)])
+    there = fit_end(needle_map, expected, direction, 60.0, search, WIDTH, result)
+    return result if there else None
+
+
+@pytest.mark.parametrize("angle", [-0.4, 0.0, 0.2])
+def test_the_end_of_a_sure_map_is_found(angle: float) -> None:
+    result = fitted(drawn(angle), angle)
+    assert result is not None
+    assert result[:2] == pytest.approx(END, abs=0.15)
+    assert math.atan2(result[3], result[2]) == pytest.approx(angle, abs=0.01)
+    assert result[4] < 0.1
+    assert result[7] > 0.95
+    assert result[8] > 0.9
+
+
+@pytest.mark.parametrize("sigma", [1.5, 3.0, 5.0])
+def test_an_end_is_as_uncertain_as_the_map_says(sigma: float) -> None:
+    result = fitted(drawn(0.1, sigma), 0.1)
+    assert result is not None
+    assert result[5] == pytest.approx(sigma, rel=0.2)
+    assert np.linalg.norm(result[:2] - END) < 0.3 * sigma
+
+
+def test_a_line_beside_where_it_should_be_is_found_within_the_search_only() -> None:
+    beside = drawn(0.0, end=END + np.array([0.0, 9.0]))
+    near, far = fitted(beside, 0.0), fitted(beside, 0.0, search=12.0)
+    assert near is None or abs(near[1] - END[1] - 9.0) > 3.0
+    assert far is not None
+    assert far[1] == pytest.approx(END[1] + 9.0, abs=0.3)
+
+
+def test_where_there_is_no_needle_there_is_no_line() -> None:
+    assert fitted(np.zeros(SHAPE, np.uint8), 0.0, search=10.0) is None
+
+
+def test_a_needle_that_goes_on_has_no_end_inside() -> None:
+    result = fitted(drawn(0.0, end=np.array([400.0, END[1]])), 0.0)
+    assert result is not None
+    assert result[8] < 0.1
+
+
+def test_the_nearest_falling_values_are_those_of_isotonic_regression() -> None:
+    values = np.random.default_rng(4).normal(np.linspace(1.0, 0.0, 30), 0.3)
+    wanted = isotonic_regression(values, increasing=False).x
+    _make_decreasing(values)
+    assert values == pytest.approx(wanted)

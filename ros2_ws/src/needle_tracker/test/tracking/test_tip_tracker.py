@@ -1,0 +1,187 @@
+"""Which of the two ways to look counts: on drawn needles, and with trackers told what to say."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from needle_tracker.image.detection import Image
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.tip_tracker import TipTracker
+from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tracker_settings import TrackerSettings, default_settings
+from needle_tracker.tracking.triangulation import SpatialTip
+
+Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
+MakeArc = Callable[..., np.ndarray]
+Views = tuple[RefractedCamera, RefractedCamera]
+NOTHING = np.zeros((768, 1024), np.uint8)
+
+
+def mirroring(
+    views: Views, make_line: Callable[..., np.ndarray], path: np.ndarray, seed: int
+) -> tuple[Image, Image]:
+    """Draw a shaft whose core mirrors a lamp and whose rims mirror the dark, on a grey floor."""
+    rng = np.random.default_rng(seed)
+    images = []
+    for view in views:
+        shape = (view.camera.height, view.camera.width)
+        image = np.full(shape, 140.0)
+        for level, width in ((75.0, 4.6), (235.0, 2.0)):
+            share = make_line(shape, view.project(path), width, 1.0, 0.0)
+            image += share * (level - image)
+        image = cv2.GaussianBlur(image, (0, 0), 0.6) + rng.normal(0.0, 4.0, shape)
+        images.append(np.clip(image, 0, 255).astype(np.uint8))
+    return images[0], images[1]
+
+
+def test_a_needle_that_mirrors_a_lamp_is_found_where_lines_show_none(
+    calibration: StereoCalibration,
+    views: Views,
+    make_arc: MakeArc,
+    make_line: Callable[..., np.ndarray],
+) -> None:
+    settings = default_settings(calibration.phantom)
+    lines, both = StereoTracker(calibration, settings), TipTracker(calibration, settings)
+    seen_by_lines = found = 0
+    for mm in range(60, 68):
+        path = make_arc(1e-3 * mm, 6.0, 0.7)
+        images = mirroring(views, make_line, path, mm)
+        seen_by_lines += lines.process(*images, 1e-3 * mm).tip is not None
+        tip = both.process(*images, 1e-3 * mm).tip
+        if tip is not None:
+            found += 1
+            assert np.linalg.norm(tip.position - path[-1]) < 0.5e-3
+    assert seen_by_lines == 0
+    assert found >= 6
+
+
+def test_a_plain_needle_is_measured_by_its_lines(
+    calibration: StereoCalibration,
+    settings: TrackerSettings,
+    draw_pair: Drawer,
+    make_arc: MakeArc,
+) -> None:
+    lines, both = StereoTracker(calibration, settings), TipTracker(calibration, settings)
+    for mm in range(70, 74):
+        pair = draw_pair(make_arc(1e-3 * mm, 5.0, 0.4), mm)
+        alone, together = (each.process(*pair, 1e-3 * mm) for each in (lines, both))
+        assert alone.tip is not None
+        assert together.tip is not None
+        assert np.array_equal(alone.tip.position, together.tip.position)
+
+
+class Told:
+    """A tracker that says what it is told, and counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.tip: SpatialTip | None = None
+        self.asked = 0
+
+    def process(self, _: Image, __: Image, ___: float | None) -> Measurement:
+        self.asked += 1
+        return Measurement(self.tip, TrackState.TRACKING, "" if self.tip else "no needle")
+
+    def skip(self, reason: str) -> Measurement:
+        return Measurement(None, TrackState.SEARCHING, reason)
+
+    def reset(self) -> None:
+        self.tip = None
+
+
+@pytest.fixture
+def told(
+    calibration: StereoCalibration, settings: TrackerSettings
+) -> tuple[TipTracker, Told, Told]:
+    tracker = TipTracker(calibration, settings)
+    lines, maps = Told(), Told()
+    tracker._lines, tracker._maps = lines, maps  # type: ignore[assignment]
+    return tracker, lines, maps
+
+
+def tip_at(z: float, sigma: float) -> SpatialTip:
+    covariance = np.diag([1e-9, 1e-9, sigma**2])
+    ahead = np.array([0.0, 0.0, 1.0])
+    return SpatialTip(np.array([0.0, 0.0, z]), covariance, ahead, np.eye(3) * 1e-4, 0.0, 0.0)
+
+
+def answer(tracker: TipTracker) -> SpatialTip | None:
+    return tracker.process(NOTHING, NOTHING, 0.06).tip
+
+
+def test_lines_count_while_maps_agree_and_are_seldom_asked(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+    lines.tip, maps.tip = tip_at(0.0600, 2e-5), tip_at(0.0601, 2e-4)
+    assert all(answer(tracker) is lines.tip for _ in range(30))
+    assert 3 <= maps.asked <= 4
+
+
+def test_an_end_that_maps_deny_does_not_count(told: tuple[TipTracker, Told, Told]) -> None:
+    tracker, lines, maps = told
+    lines.tip, maps.tip = tip_at(0.0590, 2e-5), tip_at(0.0600, 2e-4)
+    assert all(answer(tracker) is maps.tip for _ in range(30))
+    # The finer one counts again when they have agreed three times in a row.
+    lines.tip = tip_at(0.0601, 2e-5)
+    assert [answer(tracker) is lines.tip for _ in range(4)] == [False, False, True, True]
+
+
+@pytest.mark.parametrize(("ahead", "counts"), [(0.5e-3, "maps"), (-0.5e-3, "lines")])
+def test_lines_that_end_short_of_an_uncertain_end_may_lack_a_face(
+    told: tuple[TipTracker, Told, Told], ahead: float, counts: str
+) -> None:
+    tracker, lines, maps = told
+    lines.tip, maps.tip = tip_at(0.0600, 2e-5), tip_at(0.0600 + ahead, 4e-4)
+    assert answer(tracker) is (maps if counts == "maps" else lines).tip
+
+
+def test_maps_are_compared_as_soon_as_they_show_a_needle(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+    lines.tip = tip_at(0.0590, 2e-5)
+    assert answer(tracker) is lines.tip
+    maps.tip = tip_at(0.0600, 2e-4)
+    assert answer(tracker) is maps.tip
+
+
+def test_the_other_answers_where_one_is_silent(told: tuple[TipTracker, Told, Told]) -> None:
+    tracker, lines, maps = told
+    maps.tip = tip_at(0.06, 2e-4)
+    assert answer(tracker) is maps.tip
+    maps.tip, lines.tip = None, tip_at(0.06, 2e-5)
+    assert answer(tracker) is lines.tip
+    lines.tip = None
+    assert answer(tracker) is None
+
+
+def test_maps_that_show_nothing_are_drawn_of_every_third_pair(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+    for _ in range(35):
+        assert answer(tracker) is None
+    assert lines.asked == 35
+    assert maps.asked == 5 + 30 // 3
+    maps.tip = tip_at(0.06, 2e-4)
+    assert any(answer(tracker) is maps.tip for _ in range(3))
+
+
+def test_a_new_insertion_begins_with_lines(
+    told: tuple[TipTracker, Told, Told], settings: TrackerSettings
+) -> None:
+    tracker, lines, maps = told
+    maps.tip = tip_at(0.06, 2e-4)
+    assert answer(tracker) is maps.tip
+    entering = 0.5 * settings.entry_zone
+    lines.tip = dataclasses.replace(tip_at(entering, 1e-3))
+    assert tracker.process(NOTHING, NOTHING, entering).tip is lines.tip
+    assert not tracker._maps_count

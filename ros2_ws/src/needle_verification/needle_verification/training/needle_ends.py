@@ -1,0 +1,157 @@
+"""Needles' ends in one view, drawn at random: a tube or rod with a ground bevel, and its shadow."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Image = NDArray[np.float32]
+_FINE = 3
+"""Points across a pixel."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Pose:
+    """Where a needle is in a patch.
+
+    Attributes
+    ----------
+    x, y : float
+        The end of the shaft's axis [px].
+    heading : float
+        Which way it points there [rad].
+    bend, twist : float
+        Curvature there, and how that changes [1/px, 1/px^2].
+    radius : float
+        Of the shaft [px].
+    """
+
+    x: float
+    y: float
+    heading: float
+    bend: float
+    twist: float
+    radius: float
+
+    def coordinates(self, size: int) -> tuple[Image, Image]:
+        """Return along (0 at the end, negative on the shaft) and across, on the fine grid [px]."""
+        places = (np.arange(size * _FINE, dtype=np.float32) + 0.5) / _FINE - 0.5
+        x, y = np.meshgrid(places - self.x, places - self.y)
+        along = np.cos(self.heading) * x + np.sin(self.heading) * y
+        across = -np.sin(self.heading) * x + np.cos(self.heading) * y
+        s = np.clip(along, -200.0, 20.0)
+        slope = self.bend * s + 1.5 * self.twist * s**2
+        across = (across - 0.5 * self.bend * s**2 - 0.5 * self.twist * s**3) / np.hypot(1.0, slope)
+        return along, across
+
+
+def random_pose(rng: np.random.Generator, size: int, radius: float) -> Pose:
+    """Return a needle's pose; most often its end is in the patch."""
+    heading = rng.normal(0.0, 0.5) if rng.random() < 0.7 else rng.uniform(0.0, 2 * np.pi)
+    x, y = rng.uniform(0.1 * size, 0.9 * size, 2)
+    if rng.random() < 0.3:
+        out = rng.uniform(0.4, 1.2) * size
+        x, y = x + out * np.cos(heading), y + out * np.sin(heading)
+    return Pose(x, y, heading, rng.normal(0.0, 1 / 400), rng.normal(0.0, 1 / 80000), radius)
+
+
+def coarse(fine: Image) -> Image:
+    """Return what pixels see of a fine image."""
+    size = len(fine) // _FINE
+    return np.asarray(cv2.resize(fine, (size, size), interpolation=cv2.INTER_AREA), np.float32)
+
+
+def true_map(pose: Pose, size: int) -> Image:
+    """Return the share of each pixel that is shaft, cut straight at the end of its axis."""
+    along, across = pose.coordinates(size)
+    return coarse(((along <= 0.0) & (np.abs(across) <= pose.radius)).astype(np.float32))
+
+
+def draw_needle(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
+    """Return an image with a needle in it: any material, light and bevel."""
+    size = len(image)
+    along, across = pose.coordinates(size)
+    rho = np.clip(across / pose.radius, -1.0, 1.0)
+    high = np.sqrt(1.0 - rho**2)
+    roll = rng.uniform(0.0, 2 * np.pi)
+    length = pose.radius * 2 * rng.choice([rng.uniform(0.0, 1.0), rng.uniform(1.0, 3.2)])
+    top = rho * np.cos(roll) + high * np.sin(roll)
+    far = rho * np.cos(roll) + high * abs(np.sin(roll))
+    inside = np.abs(across) <= pose.radius
+    if rng.random() < 0.1:  # a cone
+        tube_end = outline_end = -length * np.abs(rho)
+    else:
+        tube_end, outline_end = -0.5 * length * (1 - top), -0.5 * length * (1 - far)
+    tube = inside & (along <= tube_end)
+    face = inside & (along > tube_end) & (along <= outline_end)
+    ground = cv2.resize(image, (size * _FINE, size * _FINE), interpolation=cv2.INTER_LINEAR)
+    near = float(np.median(image))
+    metal = _metal(rng, near, along, rho)
+    fine = np.where(tube, metal, ground)
+    fine = np.where(face, _face(rng, near, along, ground, length), fine)
+    if length > 0.0 and rng.random() < 0.4:  # hollow
+        middle, wall = -0.5 * length, rng.uniform(0.4, 0.75)
+        bore = face & (np.hypot((along - middle) / (0.5 * length), rho) < wall)
+        fine = np.where(bore, near * rng.uniform(0.0, 1.2), fine)
+    return coarse(fine.astype(np.float32))
+
+
+def draw_shadow(rng: np.random.Generator, image: Image, pose: Pose) -> Image:
+    """Return an image with a needle's shadow on the floor: beside it, softer, maybe shorter."""
+    away = rng.uniform(0.0, 45.0) * rng.choice([-1.0, 1.0])
+    shift = rng.uniform(-25.0, 10.0)
+    cos, sin = np.cos(pose.heading), np.sin(pose.heading)
+    other = dataclasses.replace(
+        pose,
+        x=pose.x + shift * cos - away * sin,
+        y=pose.y + shift * sin + away * cos,
+        heading=pose.heading + rng.normal(0.0, 0.06),
+        radius=pose.radius * rng.uniform(0.8, 2.0),
+    )
+    soft = cv2.GaussianBlur(true_map(other, len(image)), (0, 0), rng.uniform(0.7, 7.0))
+    return np.asarray(image * (1.0 - rng.uniform(0.1, 0.7) * soft), np.float32)
+
+
+def _metal(rng: np.random.Generator, near: float, along: Image, rho: Image) -> Image:
+    """Return a shaft's brightness: a ground tone, and lamps that it mirrors along a part of it."""
+    kind = rng.choice(["dark", "plain", "mirror"], p=[0.3, 0.2, 0.5])
+    tone = {
+        "dark": rng.uniform(0.0, 0.5) * near,
+        "plain": near * rng.choice([rng.uniform(0.2, 0.85), rng.uniform(1.2, 2.5)]),
+        "mirror": near * rng.uniform(0.2, 1.3),
+    }[kind]
+    metal = tone * (1.0 - rng.uniform(0.0, 0.9) * np.abs(rho) ** rng.uniform(1.0, 6.0))
+    lamps = 0 if kind == "plain" and rng.random() < 0.5 else rng.integers(kind == "mirror", 4)
+    for _ in range(lamps):
+        strength = rng.uniform(10.0, 60.0) if kind == "dark" else rng.uniform(30.0, 400.0)
+        place = rng.uniform(-0.85, 0.85) + rng.normal(0.0, 0.004) * along
+        width = rng.uniform(0.08, 0.5)
+        glint = strength * np.exp(-(((rho - place) / width) ** 2))
+        if rng.random() < 0.5:  # what mirrors a lamp ends where the angle no longer fits
+            begin, slope = rng.uniform(-70.0, 5.0), rng.uniform(0.3, 12.0) * rng.choice([-1, 1])
+            glint = glint / (1.0 + np.exp(np.clip((along - begin) / slope, -30, 30)))
+        metal = metal + glint
+    if rng.random() < 0.4:  # a rough skin glitters
+        speck = rng.standard_normal((len(rho) // 2, len(rho) // 2)).astype(np.float32)
+        speck = cv2.resize(speck, rho.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        metal = metal * (1.0 + rng.uniform(0.05, 0.4) * speck)
+    return np.asarray(np.clip(metal, 0.0, 500.0), np.float32)
+
+
+def _face(
+    rng: np.random.Generator, near: float, along: Image, ground: Image, length: float
+) -> Image:
+    """Return a ground face's brightness: it mirrors a lamp, the dark, or what is like the floor."""
+    kind = rng.choice(["dark", "bright", "grey", "floor"], p=[0.4, 0.3, 0.2, 0.1])
+    if kind == "floor":
+        return np.asarray(ground * rng.uniform(0.85, 1.15), np.float32)
+    tone = {
+        "dark": near * rng.uniform(0.0, 0.6),
+        "bright": near + rng.uniform(40.0, 300.0),
+        "grey": near * rng.uniform(0.6, 1.6),
+    }[kind]
+    slope = rng.normal(0.0, 0.3) if rng.random() < 0.5 else 0.0
+    return np.asarray(np.clip(tone * (1.0 + slope * (along / max(length, 1.0))), 0.0, 500.0))

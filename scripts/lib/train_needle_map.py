@@ -1,0 +1,147 @@
+"""Train the net that draws needle maps; scripts/train_needle_map runs this.
+
+Patches are drawn at random by needle_verification.training. What comes out depends a little on the
+machine: another run gives another net, about as good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import nn
+from torch.nn import functional
+from tqdm import tqdm
+
+from needle_tracker.image.needle_map import normalized
+from needle_verification.training.patches import SIZE, patch
+
+Batch = tuple[NDArray[np.float16], NDArray[np.uint8]]
+
+WEIGHTS = (
+    Path(__file__).parents[2] / "ros2_ws/src/needle_tracker/needle_tracker/image/needle_map.onnx"
+)
+_CHANNELS, _FINE_CHANNELS = 16, 8
+_DILATIONS = (1, 2, 4, 8, 4, 2, 1)
+_SHARD = 256
+_SMALL_SHARE = 0.2  # of the shards
+_BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
+_NEEDLE_WEIGHT = 4.0  # most pixels are floor
+
+
+class NeedleNet(nn.Module):
+    """A trunk at half the size that looks far around, and a head at full size for the edges."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        channels = _CHANNELS
+        self.first = nn.Conv2d(1, channels, 5, 2, 2)
+        self.trunk = nn.ModuleList(
+            nn.Conv2d(channels, channels, 3, 1, dilation, dilation) for dilation in _DILATIONS
+        )
+        self.up = nn.Conv2d(channels, 4 * _FINE_CHANNELS, 1)
+        self.fine = nn.Conv2d(1, _FINE_CHANNELS, 3, 1, 1)
+        self.last = nn.Conv2d(2 * _FINE_CHANNELS, _FINE_CHANNELS, 3, 1, 1)
+        self.out = nn.Conv2d(_FINE_CHANNELS, 1, 3, 1, 1)
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Return the logit of being needle for each pixel of `normalized` images, (n, 1, h, w)."""
+        seen = functional.relu(self.first(image))
+        for layer in self.trunk:
+            seen = seen + functional.relu(layer(seen))
+        wide = functional.relu(functional.pixel_shuffle(self.up(seen), 2))
+        fine = functional.relu(self.fine(image))
+        return self.out(functional.relu(self.last(torch.cat([wide, fine], 1))))
+
+
+class NeedleMapNet(nn.Module):
+    """The net with chances in place of logits: what is stored."""
+
+    def __init__(self, net: NeedleNet) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, image: torch.Tensor) -> torch.Tensor:
+        """Return the chance of being needle for each pixel, (n, 1, h, w)."""
+        # Trained with that weight, the net takes the odds of needle for so many times too high.
+        return torch.sigmoid(self.net(image) - math.log(1.0 + _NEEDLE_WEIGHT))
+
+
+def draw_shard(number: int, *, small: bool) -> Batch:
+    """Return patches as the net sees them, and 255 times the share that is needle."""
+    drawn = [patch(np.random.default_rng([number, i]), small=small) for i in range(_SHARD)]
+    seen = np.stack([normalized(image) for image, _ in drawn]).astype(np.float16)
+    return seen, np.stack([np.rint(255.0 * share).astype(np.uint8) for _, share in drawn])
+
+
+def draw_all(shards: int) -> Batch:
+    """Return all patches, drawn by all cores."""
+    small = round(_SMALL_SHARE * shards)
+    with ProcessPoolExecutor() as pool:
+        drawn = [pool.submit(draw_shard, i, small=i < small) for i in range(shards)]
+        parts = [each.result() for each in tqdm(drawn, "drawing patches", unit=f"x{_SHARD}")]
+    return np.concatenate([seen for seen, _ in parts]), np.concatenate([y for _, y in parts])
+
+
+def train(patches: Batch, steps: int) -> NeedleNet:
+    """Return a net trained on these patches, turned and mirrored at random."""
+    torch.manual_seed(0)
+    # More threads than that wait for each other longer than they work.
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, total_steps=steps)
+    seen = np.empty((_BATCH, 1, SIZE, SIZE), np.float32)
+    wanted = np.empty_like(seen)
+    bar = tqdm(range(steps), "training", unit="step")
+    mean = 0.0
+    for step in bar:
+        for k, i in enumerate(rng.integers(len(patches[0]), size=_BATCH)):
+            turns, mirror = int(rng.integers(4)), int(rng.choice([-1, 1]))
+            seen[k, 0] = np.rot90(patches[0][i], turns)[::mirror]
+            wanted[k, 0] = np.rot90(patches[1][i], turns)[::mirror] / 255.0
+        target = torch.from_numpy(wanted)
+        logits = net(torch.from_numpy(seen).to(memory_format=torch.channels_last))
+        losses = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
+        loss = (losses * (1.0 + _NEEDLE_WEIGHT * target)).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+        mean += (float(loss) - mean) / min(step + 1, 100)
+        bar.set_postfix(loss=f"{mean:.4f}")
+    return net
+
+
+def main() -> int:
+    """Train, and write the weights; returns the exit code."""
+    parser = argparse.ArgumentParser(prog="scripts/train_needle_map", description=__doc__)
+    parser.add_argument("--steps", type=int, default=13000, metavar="N", help="default: 13000")
+    parser.add_argument("--shards", type=int, default=143, metavar="N", help="x256; default: 143")
+    parser.add_argument("--output", type=Path, default=WEIGHTS, metavar="FILE.onnx")
+    given = parser.parse_args()
+    net = train(draw_all(given.shards), given.steps).eval()
+    size = {2: "height", 3: "width"}
+    torch.onnx.export(
+        NeedleMapNet(net),
+        (torch.zeros(1, 1, SIZE, SIZE),),
+        str(given.output),
+        input_names=["image"],
+        output_names=["map"],
+        dynamic_axes={"image": size, "map": size},
+        opset_version=17,
+        dynamo=False,
+    )
+    print(f"written: {given.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
