@@ -20,9 +20,9 @@ from needle_sim.camera.scenarios import CLEAN
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.study import StudySettings, run_study
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.ros.parameters import StereoTrackerParameters
-from needle_tracker.tracking.tracker import StereoTracker
+from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_verification.studies.study_controllers import controller_factory
 
 CALIBRATION = (
@@ -50,7 +50,7 @@ def tracker() -> None:
     settings = StereoTrackerParameters().tracker_settings(calibration.phantom)
     rig = load_stereo_rig(CALIBRATION)
     for known in (True, False):
-        stereo = StereoTracker(calibration, settings)
+        stereo = TipTracker(calibration, settings)
         stereo.warm_up()
         for pair in render_insertion(rig, CLEAN, seed=1, frames=14):
             stereo.process(*pair.images, pair.insertion if known else None)

@@ -33,8 +33,8 @@ from needle_common.ros.parameters import OF_EVERY_NODE
 from needle_common.settings.parameter_files import read_parameters
 from needle_controller.presets.control_settings import PRESETS
 from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
-from needle_tracker.ros.parameters import StereoTrackerParameters
 
 DESCRIPTION = """\
 Run a bag again, without a graph and without waiting: its images through today's tracker, its tips

@@ -11,8 +11,8 @@ from needle_analysis.rerun.bag_pass import Output, stored
 from needle_bags.reading.bag_images import TOPICS, plain_image
 from needle_bags.reading.bag_order import SentMessage
 from needle_tracker.answers.pair_answers import Answer
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.ros.parameters import StereoTrackerParameters
 from needle_tracker.ros.tracker_messages import TrackerMessages, image_topic, output_messages
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import csv
 import dataclasses
 import math
@@ -10,19 +11,21 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from tqdm import tqdm
 
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, number, output_file
 from needle_common.errors import UserError
+from needle_common.settings.parameter_files import read_parameters
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
-from needle_tracker.tracking.tracker_settings import default_settings
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
@@ -36,6 +39,7 @@ The output is a CSV file, one line for each pair:
   sigma_*_m       its standard deviations
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
 The tip is measured in the images alone; the insertion says where to look and what cannot be.
+--params takes the parameters of the node stereo_tracker, of which those for topics change nothing.
 Without --insertion the first two pairs that show a needle have no tip: three have to agree.
 
 examples:
@@ -48,6 +52,7 @@ COLUMNS = (
     *("name", "valid", "x_m", "y_m", "z_m"),
     *("sigma_x_m", "sigma_y_m", "sigma_z_m", "pitch_rad", "yaw_rad"),
 )
+_NODE = "stereo_tracker"
 _NAMED = 5  # so many names are shown, the others counted
 _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
 
@@ -76,12 +81,11 @@ def _run(words: Sequence[str]) -> int:
     given = _parser().parse_args(words)
     output = output_file("--output", given.output)
     json = output_file("--json", given.json)
-    width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm") * 1e-3
+    parameters = _parameters(given)
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
-    settings = dataclasses.replace(default_settings(calibration.phantom), needle_width=width)
-    tracker = TipTracker(calibration, settings)
+    tracker = TipTracker(calibration, parameters.tracker_settings(calibration.phantom))
     tracker.warm_up()
     begin = time.perf_counter()
     tracked = track_sequence(pairs, tracker, calibration, insertions)
@@ -112,6 +116,20 @@ def _run(words: Sequence[str]) -> int:
     if json is not None:
         write_json(json, result)
     return EXIT_DONE
+
+
+def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
+    """Return the node's parameters: its defaults, what --params says, and the needle's width."""
+    changes: dict[str, Any] = {}
+    if given.params is not None:
+        changes |= read_parameters(Path(given.params)).get(_NODE, {})
+        known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
+        if unknown := sorted(set(changes) - known):
+            raise UserError(f"--params: {_NODE} has no parameter {', '.join(unknown)}")
+    if given.needle_width_mm is not None:
+        width = number("--needle-width-mm", given.needle_width_mm, 0.2, 3.0, "mm")
+        changes["needle_width"] = 1e-3 * width
+    return StereoTrackerParameters(**changes)
 
 
 def track_sequence(
@@ -243,12 +261,8 @@ def _parser() -> CommandParser:
     add("--right", required=True, metavar="DIR", help="folder of the right images, or a video")
     add("--insertion", metavar="FILE", help="CSV with name,insertion_m")
     add("--output", required=True, metavar="FILE.csv", help="where the tips go")
-    add(
-        "--needle-width-mm",
-        default="0.7",
-        metavar="W",
-        help="diameter of the needle (default: 0.7)",
-    )
+    add("--params", metavar="FILE", help="ROS parameter file with stereo_tracker's parameters")
+    add("--needle-width-mm", metavar="W", help="diameter of the needle (default: 0.7)")
     add("--json", metavar="FILE", help="write the counts as one flat JSON object")
     return parser
 

@@ -24,9 +24,9 @@ from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.pair_answers import Answer
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import SIDES, calibration_from, read_calibration
 from needle_tracker.ros.conversions import to_image
-from needle_tracker.ros.parameters import StereoTrackerParameters
 from needle_tracker.ros.tracker_messages import (
     OUTPUTS,
     TrackerMessages,

@@ -20,9 +20,9 @@ from needle_common.ros.conversions import (
 from needle_common.ros.topic_input import TopicInput
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.ros import conversions
-from needle_tracker.ros.parameters import StereoTrackerParameters
 
 OUTPUTS: Mapping[str, type[Any]] = {
     "needle/tip": PointStamped,

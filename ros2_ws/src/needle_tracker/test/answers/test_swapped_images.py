@@ -16,10 +16,10 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
 from needle_tracker.answers.swapped_images import SwapWatch
+from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import default_settings
 
 Pair = tuple[float, np.ndarray, np.ndarray]
 

@@ -12,9 +12,6 @@ import numpy as np
 import pytest
 
 from needle_tracker.answers.track_images import COLUMNS, main
-from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.ros.parameters import StereoTrackerParameters
-from needle_tracker.tracking.tracker_settings import default_settings
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]
 Drawn = list[tuple[np.ndarray, np.ndarray, np.ndarray]]
@@ -60,11 +57,6 @@ def track(folder: Path, calibration_path: Path, *more: str) -> tuple[int, list[d
     return code, rows
 
 
-def test_the_defaults_are_the_nodes(calibration: StereoCalibration) -> None:
-    phantom = calibration.phantom
-    assert default_settings(phantom) == StereoTrackerParameters().tracker_settings(phantom)
-
-
 def test_swapped_folders_are_suspected(
     tmp_path: Path,
     calibration_path: Path,
@@ -103,6 +95,41 @@ def test_every_pair_has_its_line(folder: Path, calibration_path: Path, drawn: Dr
         assert all(0.0 < float(row[f"sigma_{axis}_m"]) < 0.5e-3 for axis in "xyz")
         assert abs(float(row["pitch_rad"])) < 0.3
         assert abs(float(row["yaw_rad"])) < 0.3
+
+
+@pytest.mark.parametrize("agreeing", [2, 4])
+def test_parameters_of_the_node_count_here_too(
+    folder: Path, calibration_path: Path, agreeing: int
+) -> None:
+    (folder / "left" / "image_3.png").unlink()
+    file = folder / "rig.yaml"
+    file.write_text(f"stereo_tracker: {{ros__parameters: {{confirm_pairs: {agreeing}}}}}\n")
+    code, rows = track(folder, calibration_path, "--params", str(file))
+    assert code == 0
+    assert [row["valid"] for row in rows] == ["0"] * (agreeing - 1) + ["1"] * (5 - agreeing)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("stereo_tracker: {ros__parameters: {needle_widht: 0.001}}", "needle_widht"),
+        ("stereo_tracker: {ros__parameters: {needle_width: 1.0}}", "needle_width"),
+        ("stereo_trakcer: {ros__parameters: {needle_width: 0.001}}", "stereo_trakcer"),
+    ],
+)
+def test_parameters_that_are_none_are_refused_in_one_line(
+    folder: Path,
+    calibration_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    text: str,
+    said: str,
+) -> None:
+    (folder / "rig.yaml").write_text(text)
+    code, rows = track(folder, calibration_path, "--params", str(folder / "rig.yaml"))
+    assert (code, rows) == (2, [])
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1
+    assert said in lines[0]
 
 
 def test_without_insertion_three_must_agree(folder: Path, calibration_path: Path) -> None:

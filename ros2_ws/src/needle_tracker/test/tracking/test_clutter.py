@@ -14,10 +14,10 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import find_scenario
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import default_settings
 
 Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 

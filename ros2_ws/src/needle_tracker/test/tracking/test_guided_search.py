@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.image.tip_fit import ImageTip, fit_tip, hidden
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
@@ -25,7 +26,7 @@ from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import Anchor, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import TrackerSettings, default_settings
+from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 Image = np.ndarray
 Drawer = Callable[..., tuple[Image, Image]]

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.image.detection import Image
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
@@ -16,7 +17,7 @@ from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
-from needle_tracker.tracking.tracker_settings import TrackerSettings, default_settings
+from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Drawer = Callable[..., tuple[np.ndarray, np.ndarray]]

@@ -1,4 +1,4 @@
-"""The parameters of stereo_tracker."""
+"""The parameters of stereo_tracker, as a node and in `track_images`, and what follows from them."""
 
 from __future__ import annotations
 
@@ -204,3 +204,14 @@ class StereoTrackerParameters:
             entry_zone=self.entry_zone,
             hole_clearance=self.hole_clearance,
         )
+
+
+def default_settings(phantom: Phantom) -> TrackerSettings:
+    """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend).
+
+    Parameters
+    ----------
+    phantom : Phantom
+        From the calibration.
+    """
+    return StereoTrackerParameters().tracker_settings(phantom)
