@@ -25,7 +25,7 @@ from needle_verification.training.patches import SIZE, patch
 Batch = tuple[NDArray[np.float16], NDArray[np.uint8]]
 
 WEIGHTS = (
-    Path(__file__).parents[2] / "ros2_ws/src/needle_tracker/needle_tracker/image/needle_map.onnx"
+    Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/needle_tracker/image/needle_map.onnx"
 )
 _CHANNELS, _FINE_CHANNELS = 16, 8
 _DILATIONS = (1, 2, 4, 8, 4, 2, 1)
