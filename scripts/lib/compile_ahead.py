@@ -47,7 +47,7 @@ def controllers() -> None:
 def tracker() -> None:
     """Acquisition and tracking of a needle."""
     calibration = load_calibration(CALIBRATION)
-    settings = StereoTrackerParameters().tracker_settings(calibration.phantom)
+    settings = StereoTrackerParameters().tracker_settings(calibration)
     rig = load_stereo_rig(CALIBRATION)
     for known in (True, False):
         stereo = TipTracker(calibration, settings)

@@ -49,7 +49,7 @@ class PlainTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, empty: tuple[Image, Image]) -> None:
-        self._phantom = calibration.phantom
+        self._window = calibration.left.window
         self._cameras = (calibration.left, calibration.right)
         self._empty = tuple(
             self._undistorted(camera, image)
@@ -76,8 +76,8 @@ class PlainTracker:
         tip = np.asarray(found[:3] / found[3], dtype=np.float64)
         if corrected:
             # What lies deep seems to lie at its depth over the index.
-            surface = self._phantom.surface_height
-            tip[0] = surface - (surface - tip[0]) * self._phantom.refractive_index
+            surface = self._window.point[0]
+            tip[0] = surface - (surface - tip[0]) * self._window.inside
         return tip
 
     @staticmethod

@@ -13,7 +13,7 @@ import pytest
 
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 from needle_tracker.tracking.gates import GateSettings
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
@@ -32,10 +32,7 @@ def calibration() -> StereoCalibration:
 
 @pytest.fixture(scope="session")
 def views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
-    return (
-        RefractedCamera(calibration.left, calibration.phantom),
-        RefractedCamera(calibration.right, calibration.phantom),
-    )
+    return stereo_views(calibration)
 
 
 @pytest.fixture
@@ -43,7 +40,7 @@ def settings(calibration: StereoCalibration) -> TrackerSettings:
     reach = Reach(curvature=9.0, entry_angle=math.radians(10), hole_tolerance=0.5e-3, length=0.15)
     gates = GateSettings(
         reach=reach,
-        surface_height=calibration.phantom.surface_height,
+        windows=(calibration.left.window, calibration.right.window),
         least_distance=4e-3,
         tip_lean=math.radians(12),
         insertion_margin=2e-3,

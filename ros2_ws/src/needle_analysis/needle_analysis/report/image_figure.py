@@ -15,7 +15,7 @@ from needle_bags.reading.bag_images import SIDES, exposures, images_at
 from needle_bags.reading.bag_reader import Run
 from needle_common.errors import UserError
 from needle_tracker.optics.calibration import parse_calibration
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 
 Floats = npt.NDArray[np.float64]
 
@@ -68,10 +68,7 @@ def _cameras(run: Run) -> dict[str, RefractedCamera]:
         calibration = parse_calibration(yaml.safe_load(run.calibration))
     except (UserError, yaml.YAMLError):
         return {}
-    return {
-        "left": RefractedCamera(calibration.left, calibration.phantom),
-        "right": RefractedCamera(calibration.right, calibration.phantom),
-    }
+    return dict(zip(SIDES, stereo_views(calibration), strict=True))
 
 
 def _draw_exposure(

@@ -9,9 +9,10 @@ from scipy.special import erf
 
 from needle_sim.camera.optics import FloatImage, Optics
 from needle_sim.camera.scenarios import Bubbles
+from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.se3 import FloatArray
 
-# Where bubbles are: below the surface by, to both sides of the needle by, along it [m].
+# Where bubbles are: below the top by, to both sides of the needle by at most, along it [m].
 _DEPTHS = (0.0012, 0.0345)
 _SIDE = 0.055
 _LENGTHS = (0.006, 0.150)
@@ -49,7 +50,7 @@ class BubbleImage:
     gain, added : ndarray of float32
         The light behind times `gain` plus `added` [grey levels].
     height : ndarray of float32
-        x of the highest bubble at the pixel in `rig`, -inf where there is none [m].
+        Of the highest bubble at the pixel, towards the camera; -inf where there is none [m].
     """
 
     gain: FloatImage
@@ -57,15 +58,19 @@ class BubbleImage:
     height: FloatImage
 
 
-def place_bubbles(bubbles: Bubbles, surface_height: float, rng: np.random.Generator) -> BubbleCloud:
+def place_bubbles(bubbles: Bubbles, rig: StereoRig, rng: np.random.Generator) -> BubbleCloud:
     """Return where the bubbles are, uniform in the phantom, twice the size half as frequent."""
-    low = [surface_height - _DEPTHS[1], -_SIDE, _LENGTHS[0]]
-    high = [surface_height - _DEPTHS[0], _SIDE, _LENGTHS[1]]
+    side = min(_SIDE, rig.half_width)
+    low = [rig.half_height - _DEPTHS[1], -side, _LENGTHS[0]]
+    high = [rig.half_height - _DEPTHS[0], side, _LENGTHS[1]]
     centre = rng.uniform(low, high, (bubbles.count, 3))
     size = rng.uniform(np.log(bubbles.smallest), np.log(bubbles.largest), bubbles.count)
     radius = np.exp(size)
-    # None sticks out of the surface.
-    centre[:, 0] = np.minimum(centre[:, 0], surface_height - 1.2 * radius)
+    # None sticks out of a window.
+    for camera in (rig.left, rig.right):
+        window = camera.window
+        out = np.maximum(window.height(centre) - (window.inner - 1.2 * radius), 0.0)
+        centre -= out[:, np.newaxis] * window.normal
     return BubbleCloud(centre, radius)
 
 
@@ -80,8 +85,9 @@ def draw_bubbles(cloud: BubbleCloud, optics: Optics) -> BubbleImage:
     middles = optics.project(cloud.centre)
     radii = optics.radius_px(cloud.centre, cloud.radius)
     blurs = np.broadcast_to(optics.blur_px(cloud.centre), radii.shape)
+    heights = optics.window.height(cloud.centre)
     # From the bottom up: higher ones hide what is under them.
-    for i in np.argsort(cloud.centre[:, 0]):
+    for i in np.argsort(heights):
         radius, blur = float(radii[i]), float(blurs[i])
         reach = int(np.ceil(radius + 3.0 * blur))
         column, row = (round(float(part)) for part in middles[i])
@@ -96,7 +102,7 @@ def draw_bubbles(cloud: BubbleCloud, optics: Optics) -> BubbleImage:
         image.gain[part] *= gain
         image.added[part] = image.added[part] * gain + added
         inside = u * u + v * v < (radius + blur) ** 2
-        image.height[part][inside] = cloud.centre[i, 0]
+        image.height[part][inside] = heights[i]
     return image
 
 

@@ -28,7 +28,7 @@ _WAVE_LENGTHS = (0.025, 0.090)
 _WAVE_ANGLES = (0.3, 1.2)
 _TURNS_PER_M = 17.0
 _LARGEST_PITCH = np.deg2rad(5.0)
-# How far the tip keeps from the phantom's surface, and to the sides of the cameras' view [m].
+# How far the tip keeps from the phantom's faces, and from the sides of the cameras' view [m].
 _CLEARANCE = 0.004
 _SIDE = 0.025
 
@@ -75,7 +75,9 @@ class RenderedPair:
     share_seen: tuple[float, float]
 
 
-def random_path(seed: int, depth: float, surface_height: float, curvature: float) -> RandomPath:
+def random_path(
+    seed: int, depth: float, half_sizes: tuple[float, float], curvature: float
+) -> RandomPath:
     """Return a random path with smooth rotations, as a controller turns the needle.
 
     Parameters
@@ -84,8 +86,8 @@ def random_path(seed: int, depth: float, surface_height: float, curvature: float
         Same seed, same path.
     depth : float
         How far the needle goes in [m].
-    surface_height : float
-        Half the phantom's height [m].
+    half_sizes : pair of float
+        How far the phantom reaches from the needle's axis, along x and y [m].
     curvature : float
         Of the needle's path [1/m].
 
@@ -94,6 +96,7 @@ def random_path(seed: int, depth: float, surface_height: float, curvature: float
     UserError
         If no such path was found.
     """
+    high, wide = half_sizes[0] - _CLEARANCE, min(_SIDE, half_sizes[1] - _CLEARANCE)
     rng = np.random.default_rng([seed, 0, _STREAM])
     pieces = max(int(np.ceil(depth / _SPACING)), 1)
     at = np.arange(pieces + 1) * _SPACING
@@ -114,7 +117,7 @@ def random_path(seed: int, depth: float, surface_height: float, curvature: float
         for piece in range(pieces):
             plant.advance(_SPACING, rotation[:, piece])
             tip = np.abs(plant.T_rig_tip[:, :3, 3])
-            inside &= (tip[:, 0] < surface_height - _CLEARANCE) & (tip[:, 1] < _SIDE)
+            inside &= (tip[:, 0] < high) & (tip[:, 1] < wide)
         if inside.any():
             best = int(np.argmax(inside))
             return RandomPath(float(pitch[best]), float(roll[best]), rotation[best])
@@ -160,7 +163,7 @@ def render_insertion(
     UserError
         If no path of this depth stays inside the phantom.
     """
-    path = random_path(seed, depth, rig.surface_height, curvature)
+    path = random_path(seed, depth, (rig.half_height, rig.half_width), curvature)
     renderer = StereoRenderer(rig, seed, scenario=scenario)
 
     def pairs() -> Iterator[RenderedPair]:

@@ -68,12 +68,10 @@ def surface_glints(glints: Glints, optics: Optics, rng: np.random.Generator) -> 
     width, height = optics.image_size
     count = glints.on_surface + glints.over_needle
     over = np.arange(count) >= glints.on_surface
-    place = np.empty((count, 3))
-    place[:, 0] = optics.surface_height
-    for axis, bounds in ((1, (-_SIDE, _SIDE)), (2, _LENGTHS)):
-        place[:, axis] = rng.uniform(*bounds, count)
-    place[over, 1] = rng.uniform(-_WAY_SIDE, _WAY_SIDE, glints.over_needle)
-    place[over, 2] = rng.uniform(*_WAY_LENGTHS, glints.over_needle)
+    aside, along = rng.uniform(-_SIDE, _SIDE, count), rng.uniform(*_LENGTHS, count)
+    aside[over] = rng.uniform(-_WAY_SIDE, _WAY_SIDE, glints.over_needle)
+    along[over] = rng.uniform(*_WAY_LENGTHS, glints.over_needle)
+    place = optics.on_face(aside, along)
     half = glints.largest / 2.0 * rng.uniform(0.15, 1.0, count) ** 1.5
     half[over] = glints.largest / 2.0 * rng.uniform(0.5, 1.0, glints.over_needle)
     half_px = optics.radius_px(place, half)

@@ -1,13 +1,13 @@
-"""One camera over the phantom: where it sees points, how large and how sharp."""
+"""One camera before the phantom: where it sees points, how large and how sharp."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_sim.camera.projection import camera_centre, project
+from needle_sim.camera.projection import project
 from needle_sim.camera.scenarios import Lens
-from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.camera.stereo_rig import Camera
 from needle_sim.needle.se3 import FloatArray
 
 FloatImage = NDArray[np.float32]
@@ -17,23 +17,20 @@ SHARP_PX = 0.7
 
 
 class Optics:
-    """A camera, the surface it looks through and its lens.
+    """A camera, the window it looks through and its lens.
 
     Parameters
     ----------
-    rig : StereoRig
-        The phantom.
     camera : Camera
-        One of its cameras.
+        One of the rig's.
     lens : Lens or None
         None is in focus everywhere.
     """
 
-    def __init__(self, rig: StereoRig, camera: Camera, lens: Lens | None) -> None:
+    def __init__(self, camera: Camera, lens: Lens | None) -> None:
         self.camera = camera
-        self.surface_height = rig.surface_height
-        self.centre = camera_centre(camera)
-        self._refractive_index = rig.refractive_index
+        self.window = camera.window
+        self.centre = camera.centre
         self._lens = lens
 
     @property
@@ -43,7 +40,20 @@ class Optics:
 
     def project(self, points: FloatArray) -> FloatArray:
         """Return the pixels (..., 2) of points (..., 3) in `rig` [m]."""
-        return project(points, self.camera, self.surface_height, self._refractive_index)
+        return project(points, self.camera)
+
+    def on_face(self, aside: FloatArray, along: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the window's outer face in `rig` [m].
+
+        Parameters
+        ----------
+        aside, along : ndarray, shape (N,)
+            How far they are beside the needle's axis, as this camera sees it, and along it [m].
+        """
+        points = aside[:, np.newaxis] * self.window.sideways
+        points[:, 2] += along
+        off = self.window.outer - self.window.height(points)
+        return np.asarray(points + off[:, np.newaxis] * self.window.normal)
 
     def sideways(self, line: FloatArray, half_width: float) -> FloatArray:
         """Return the way from a line's points to its edge as this camera sees it, (M, 3) [m]."""
@@ -62,18 +72,20 @@ class Optics:
         """Return the blur's standard deviation at points (..., 3): one for all if in focus [px].
 
         A disk of confusion of diameter c blurs like a Gaussian of c / 4. Refraction lifts what is
-        in the phantom: its distance counts 1 / n.
+        in a layer or the phantom: its distance counts 1 / n.
         """
         if self._lens is None:
             return SHARP_PX
         sharp, seen = (
-            self.centre[0] - self._apparent_height(np.asarray(height))
-            for height in (self._lens.focus_height, points[..., 0])
+            self.window.height(self.centre) - self._apparent_height(np.asarray(height))
+            for height in (self._lens.focus_height, self.window.height(points))
         )
         focal_px = float(self.camera.camera_matrix[0, 0])
         confusion = self._lens.aperture * focal_px * np.abs(seen - sharp) / (seen * sharp)
         return np.asarray(np.hypot(SHARP_PX, confusion / 4.0))
 
     def _apparent_height(self, height: FloatArray) -> FloatArray:
-        below = np.maximum(self.surface_height - height, 0.0)
-        return np.asarray(height + below * (1.0 - 1.0 / self._refractive_index))
+        lengths = self.window.passed(height)
+        for length, index in zip(lengths, self.window.indices, strict=True):
+            height = height + length * (1.0 - 1.0 / index)
+        return height

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 
 from needle_sim.camera.scenarios import Cable, FloorShadow, Occlusion
+from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.se3 import FloatArray
 
 _CABLE_POINTS = 120
@@ -135,11 +136,11 @@ def event_at(occlusion: Occlusion, seed: int, exposure_number: int) -> Event | N
 
 
 def hand_capsules(
-    event: Event, target: FloatArray, camera_centres: tuple[FloatArray, FloatArray]
+    event: Event, target: FloatArray, rig: StereoRig
 ) -> list[tuple[FloatArray, FloatArray, float]]:
     """Return a hand on its way over the target and back.
 
-    High above the phantom it stands in the line of sight of one camera and beside the other's; for
+    High before a window it stands in the line of sight of one camera and beside the other's; for
     both it is low.
 
     Parameters
@@ -148,24 +149,28 @@ def hand_capsules(
         Whom the hand blocks, and how far it is.
     target : ndarray, shape (3,)
         What it passes over, in `rig` [m].
-    camera_centres : pair of ndarray, shape (3,)
-        In `rig` [m].
+    rig : StereoRig
+        Whose cameras it blocks.
 
     Returns
     -------
     list of (ndarray (3,), ndarray (3,), float)
         Capsules from point to point, in `rig`, and their radii [m].
     """
-    left, right = camera_centres
+    middle = (rig.left.centre + rig.right.centre) / 2.0
     if all(event.blocks):
-        centre, height, side = (left + right) / 2.0, _LOW, 0.0
+        centre, height = middle, _LOW
+        normal = rig.left.window.normal + rig.right.window.normal
+        normal = normal / np.linalg.norm(normal)
+        sideways = np.cross([0.0, 0.0, 1.0], normal)
     else:
-        centre, height = (left, _HIGH) if event.blocks[0] else (right, _HIGH)
-        side = float(np.sign(centre[1] - (left[1] + right[1]) / 2.0))
-    share = height / (centre[0] - target[0])
-    over = target + share * (centre - target)
+        camera = rig.left if event.blocks[0] else rig.right
+        centre, height = camera.centre, _HIGH
+        normal, sideways = camera.window.normal, camera.window.sideways
+    side = 0.0 if all(event.blocks) else float(np.sign((centre - middle) @ sideways))
+    over = target + height / float((centre - target) @ normal) * (centre - target)
     # From the blocked camera's side, so that the arm is in nobody else's way.
-    forward = np.array([0.0, -side if side else 1.0, 0.0])
+    forward = -side * sideways if side else sideways
     aside = np.array([0.0, 0.0, 1.0])
     # In and out fast, a while over the target.
     there = min(1.0, 1.6 * np.sin(np.pi * event.progress))

@@ -1,4 +1,4 @@
-"""Projection of points inside the phantom to a camera in air: Snell's law at its flat top."""
+"""Projection of points inside the phantom to a camera in air: Snell's law at a window's faces."""
 
 from __future__ import annotations
 
@@ -6,69 +6,61 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from needle_sim.camera.stereo_rig import Camera
+from needle_sim.camera.window import Window
 from needle_sim.needle.se3 import FloatArray
 
 # The slope's equation is concave and increasing: Newton is at the last digit after 3 steps.
 _NEWTON_STEPS = 4
 
 
-def camera_centre(camera: Camera) -> FloatArray:
-    """Return the centre of projection in `rig`, shape (3,) [m]."""
-    pose = camera.T_optical_rig
-    return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
+def refraction_point(points: ArrayLike, centre: ArrayLike, window: Window) -> FloatArray:
+    """Return where the ray from a point to a camera crosses the window's outer face.
 
-
-def refraction_point(
-    points: ArrayLike, centre: ArrayLike, surface_height: float, refractive_index: float
-) -> FloatArray:
-    """Return where the ray from a point to a camera crosses the surface x = surface_height.
-
-    With a = tan(angle in air), Snell's law makes tan(angle in the phantom)
-    a / sqrt(n^2 + (n^2 - 1) a^2); the two stretches must add up to the horizontal distance.
+    With a = tan(angle in air), Snell's law makes tan(angle in a medium) a / sqrt(n^2 + (n^2 - 1)
+    a^2); the stretches in air and all media must add up to the distance along the window.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
-        Points in `rig`, below the camera [m]. Above the surface the ray is straight, and the
+        Points in `rig`, below the camera [m]. Above the face the ray is straight, and the
         crossing is that of its extension.
     centre : array_like, shape (3,)
-        Centre of projection in `rig`, above the surface [m].
-    surface_height : float
-        x of the surface in `rig` [m].
-    refractive_index : float
-        Of the phantom, against air.
+        Centre of projection in `rig`, above the face [m].
+    window : Window
+        What the camera looks through.
 
     Returns
     -------
     ndarray, shape (..., 3)
-        Points of the surface in `rig` [m].
+        Points of the outer face in `rig` [m].
     """
     points = np.asarray(points, dtype=np.float64)
     centre = np.asarray(centre, dtype=np.float64)
-    depth = surface_height - points[..., 0]
-    height = centre[0] - surface_height
-    index = np.where(depth > 0.0, refractive_index, 1.0)
-    horizontal = points[..., 1:] - centre[1:]
-    distance = np.linalg.norm(horizontal, axis=-1)
+    level = window.height(points)
+    height = float(window.height(centre)) - window.outer
+    foot = centre - window.height(centre) * window.normal
+    along = points - level[..., np.newaxis] * window.normal - foot
+    distance = np.linalg.norm(along, axis=-1)
+    lengths = window.passed(level)
+    # What is above the face shortens the way in air.
+    straight = height - np.maximum(level - window.outer, 0.0)
 
-    slope = distance / (height + depth / index)
+    slope = distance / (straight + sum(t / n for t, n in zip(lengths, window.indices, strict=True)))
     for _ in range(_NEWTON_STEPS):
-        square = index**2 + (index**2 - 1.0) * slope**2
-        root = np.sqrt(square)
-        error = height * slope + depth * slope / root - distance
-        slope = slope - error / (height + depth * index**2 / (square * root))
+        error, growth = straight * slope - distance, straight
+        for length, index in zip(lengths, window.indices, strict=True):
+            square = index**2 + (index**2 - 1.0) * slope**2
+            root = np.sqrt(square)
+            error = error + length * slope / root
+            growth = growth + length * index**2 / (square * root)
+        slope = slope - error / growth
 
     share = height * slope / np.where(distance > 0.0, distance, 1.0)
-    crossing = np.empty(points.shape)
-    crossing[..., 0] = surface_height
-    crossing[..., 1:] = centre[1:] + share[..., np.newaxis] * horizontal
-    return crossing
+    return np.asarray(foot + window.outer * window.normal + share[..., np.newaxis] * along)
 
 
-def project(
-    points: ArrayLike, camera: Camera, surface_height: float, refractive_index: float
-) -> FloatArray:
-    """Return the pixels at which a camera sees points through the phantom's surface.
+def project(points: ArrayLike, camera: Camera) -> FloatArray:
+    """Return the pixels at which a camera sees points through its window.
 
     Parameters
     ----------
@@ -76,17 +68,13 @@ def project(
         Points in `rig` [m].
     camera : Camera
         The calibrated camera.
-    surface_height : float
-        x of the surface in `rig` [m].
-    refractive_index : float
-        Of the phantom, against air.
 
     Returns
     -------
     ndarray, shape (..., 2)
         u, v [px]; whole numbers are pixel centres.
     """
-    crossing = refraction_point(points, camera_centre(camera), surface_height, refractive_index)
+    crossing = refraction_point(points, camera.centre, camera.window)
     pose = camera.T_optical_rig
     seen = crossing @ pose[:3, :3].T + pose[:3, 3]
     return _distorted_pixel(seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2], camera)

@@ -1,4 +1,4 @@
-"""Stereo images of a needle in a clear phantom, as the cameras above its surface see it."""
+"""Stereo images of a needle in a clear phantom, as the cameras see it through its windows."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ _SHADOW_KEY = 2
 
 
 class StereoRenderer:
-    """Draws the needle as both cameras see it, refracted by the phantom's surface.
+    """Draws the needle as both cameras see it, refracted by their windows.
 
     Seen are the shaft inside the phantom, dark on bright plastisol in uneven light, the entry
     hole's rim at rig's origin and the support sheath before it, which hides the shaft outside; and
     the scenario's troubles.
-    Refraction is that of an endless surface: what little is seen before the phantom's front face is
+    Refraction is that of an endless window: what little is seen before the phantom's front face is
     drawn as if it were inside. Two renderers of one rig, seed and scenario draw the same images,
     bit for bit, in whatever order: an image depends on the exposure's number, not on those before.
 
@@ -63,13 +63,12 @@ class StereoRenderer:
         self._rig = rig
         self._needle = NeedleShape() if needle is None else needle
         self._scenario = scenario
-        optics = [Optics(rig, camera, scenario.lens) for camera in (rig.left, rig.right)]
-        self._centres = (optics[0].centre, optics[1].centre)
+        optics = [Optics(camera, scenario.lens) for camera in (rig.left, rig.right)]
         rng = np.random.default_rng([seed, 0, _SCENE_STREAM])
         self._drift_phase = float(rng.uniform(0.0, 2.0 * np.pi))
         self.bubbles: BubbleCloud | None = None
         if scenario.bubbles is not None:
-            self.bubbles = place_bubbles(scenario.bubbles, rig.surface_height, rng)
+            self.bubbles = place_bubbles(scenario.bubbles, rig, rng)
         self._views = tuple(
             View(
                 optics[side],
@@ -151,7 +150,7 @@ class StereoRenderer:
         exposure_number: int,
         event: Event | None,
     ) -> Moment:
-        scenario, height = self._scenario, self._rig.surface_height
+        scenario, height = self._scenario, self._rig.half_height
         pose = np.asarray(T_rig_tip, dtype=np.float64)
         needle = shadow = cable = _NOTHING
         fall = np.empty(0)
@@ -173,7 +172,7 @@ class StereoRenderer:
             cable_diameter=0.0 if scenario.cable is None else scenario.cable.diameter,
             hand=[]
             if event is None or event.covered
-            else hand_capsules(event, pose[:3, 3], self._centres),
+            else hand_capsules(event, pose[:3, 3], self._rig),
         )
 
     def _rng(self, key: int) -> np.random.Generator:

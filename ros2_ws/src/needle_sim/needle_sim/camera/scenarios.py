@@ -147,7 +147,8 @@ class Lens:
     Attributes
     ----------
     focus_height : float
-        x in `rig` of what is sharp [m].
+        Of what is sharp: from the needle's entry towards the camera, along its window's normal; x
+        in `rig` for cameras above [m].
     aperture : float
         Diameter of the entrance pupil [m].
     """

@@ -11,9 +11,13 @@ import numpy as np
 import yaml
 
 from needle_common.errors import UserError
+from needle_sim.camera.window import Window
 from needle_sim.needle.se3 import FloatArray
 
 _LARGEST_SIDE_PX = 20_000
+_HALF_HEIGHT = 0.0175  # of a phantom that no window ends above [m]
+_FACING = 0.75  # of a window's normal: the part along the axis that it faces
+_LEAST_ACROSS = 0.3  # of a window's normal: the part across the needle
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +34,8 @@ class Camera:
         plumb_bob: k1, k2, p1, p2, k3.
     T_optical_rig : ndarray, shape (4, 4)
         Rig to optical frame (REP 103) [m].
+    window : Window
+        What it looks through.
     """
 
     image_width: int
@@ -37,26 +43,43 @@ class Camera:
     camera_matrix: FloatArray
     distortion: FloatArray
     T_optical_rig: FloatArray
+    window: Window
+
+    @property
+    def centre(self) -> FloatArray:
+        """Centre of projection in `rig`, shape (3,) [m]."""
+        pose = self.T_optical_rig
+        return np.asarray(-pose[:3, :3].T @ pose[:3, 3])
 
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two cameras above a phantom with a flat, horizontal top surface.
+    """Two cameras that look at a phantom, each through its window.
 
     Parameters
     ----------
-    surface_height : float
-        x of the top surface in `rig` [m].
-    refractive_index : float
-        Of the phantom, against air.
     left, right : Camera
         The pair.
     """
 
-    surface_height: float
-    refractive_index: float
     left: Camera
     right: Camera
+
+    @property
+    def half_height(self) -> float:
+        """How far the phantom reaches up and down from the needle's axis, along x [m]."""
+        return self._reach(0, _HALF_HEIGHT)
+
+    @property
+    def half_width(self) -> float:
+        """How far it reaches to both sides, along y [m]."""
+        return self._reach(1, math.inf)
+
+    def _reach(self, axis: int, unseen: float) -> float:
+        """Return how far a window that faces this way is, or what is taken without one."""
+        windows = (self.left.window, self.right.window)
+        facing = [w for w in windows if abs(w.normal[axis]) >= _FACING]
+        return min((w.inner / abs(float(w.normal[axis])) for w in facing), default=unseen)
 
 
 def load_stereo_rig(path: Path | str) -> StereoRig:
@@ -97,27 +120,66 @@ class _BadEntryError(Exception):
 
 def _stereo_rig(document: object) -> StereoRig:
     top = _mapping(document, "the file")
-    phantom = _mapping(_entry(top, "phantom", ""), "phantom")
-    surface_height = _number(
-        _entry(phantom, "surface_height", "phantom."), "phantom.surface_height"
-    )
-    index = _number(_entry(phantom, "refractive_index", "phantom."), "phantom.refractive_index")
-    if not 1.0 <= index <= 3.0:
-        raise _BadEntryError(f"phantom.refractive_index = {index:g} is outside [1, 3]")
     cameras = {}
     for side in ("left", "right"):
-        camera = _camera(_mapping(_entry(top, side, ""), side), side)
-        height = float(-camera.T_optical_rig[:3, 0] @ camera.T_optical_rig[:3, 3])
-        if height <= surface_height:
+        values = _mapping(_entry(top, side, ""), side)
+        camera = _camera(values, side, _window_of(top, values, side))
+        before = float(camera.window.height(camera.centre)) - camera.window.outer
+        if before <= 0.0:
             raise _BadEntryError(
-                f"{side}.T_optical_rig puts the camera at x = {height:g} m, "
-                f"not above the surface at {surface_height:g} m"
+                f"{side}.T_optical_rig puts the camera {-before:g} m behind the window's outer "
+                "face, not above the surface"
             )
         cameras[side] = camera
-    return StereoRig(surface_height, index, cameras["left"], cameras["right"])
+    return StereoRig(cameras["left"], cameras["right"])
 
 
-def _camera(values: Mapping[object, object], side: str) -> Camera:
+def _window_of(top: Mapping[object, object], values: Mapping[object, object], side: str) -> Window:
+    """Return what a camera looks through: its own window, or the phantom's surface."""
+    if ("phantom" in top) == ("window" in values):
+        what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
+        raise _BadEntryError(
+            f"{side}.window {what}: say either phantom, the surface of both, or a window for each"
+        )
+    if "phantom" in top:
+        phantom = _mapping(top["phantom"], "phantom")
+        height = _number(_entry(phantom, "surface_height", "phantom."), "phantom.surface_height")
+        index = _refractive_index(phantom, "refractive_index", "phantom.")
+        return Window(np.array([1.0, 0.0, 0.0]), height, (), (index,))
+    prefix = f"{side}.window."
+    window = _mapping(values["window"], f"{side}.window")
+    point = _numbers(_entry(window, "point", prefix), prefix + "point", 3)
+    normal = _numbers(_entry(window, "normal", prefix), prefix + "normal", 3)
+    length = float(np.linalg.norm(normal))
+    if abs(length - 1.0) > 0.01:
+        raise _BadEntryError(f"{prefix}normal has length {length:g}, not 1")
+    normal = normal / length
+    if np.linalg.norm(normal[:2]) < _LEAST_ACROSS:
+        raise _BadEntryError(f"{prefix}normal = {normal.tolist()} lies along the needle")
+    layers = _entry(window, "layers", prefix)
+    if not isinstance(layers, list):
+        raise _BadEntryError(f"{prefix}layers = {layers!r} is no list")
+    thicknesses, indices = [], []
+    for number, layer in enumerate(layers):
+        name = f"{prefix}layers[{number}]"
+        values = _mapping(layer, name)
+        thickness = _number(_entry(values, "thickness", f"{name}."), f"{name}.thickness")
+        if thickness <= 0.0:
+            raise _BadEntryError(f"{name}.thickness = {thickness:g} m is not above 0")
+        thicknesses.append(thickness)
+        indices.append(_refractive_index(values, "refractive_index", f"{name}."))
+    inside = _refractive_index(window, "inside", prefix)
+    return Window(normal, float(normal @ point), tuple(thicknesses), (*indices, inside))
+
+
+def _refractive_index(values: Mapping[object, object], key: str, prefix: str) -> float:
+    index = _number(_entry(values, key, prefix), prefix + key)
+    if not 1.0 <= index <= 3.0:
+        raise _BadEntryError(f"{prefix}{key} = {index:g} is outside [1, 3]")
+    return index
+
+
+def _camera(values: Mapping[object, object], side: str, window: Window) -> Camera:
     prefix = f"{side}."
     width, height = (
         _number(_entry(values, key, prefix), prefix + key)
@@ -146,7 +208,7 @@ def _camera(values: Mapping[object, object], side: str) -> Camera:
     pose[:3, 3] = _numbers(_entry(transform, "translation", prefix), prefix + "translation", 3)
     quaternion = _numbers(_entry(transform, "rotation", prefix), prefix + "rotation", 4)
     pose[:3, :3] = _rotation_matrix(quaternion, prefix + "rotation")
-    return Camera(int(width), int(height), matrix, distortion, pose)
+    return Camera(int(width), int(height), matrix, distortion, pose, window)
 
 
 def _rotation_matrix(quaternion: FloatArray, name: str) -> FloatArray:

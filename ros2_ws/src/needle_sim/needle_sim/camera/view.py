@@ -191,7 +191,7 @@ class View:
         )
         image += _MOTTLE * mottle / mottle.std()
         # The bench before the phantom's front face, up to the upper edge of that face.
-        edge = np.array([[self._optics.surface_height, y, 0.0] for y in (-0.1, 0.1)])
+        edge = self._optics.on_face(np.array([-0.1, 0.1]), np.zeros(2))
         beside = edge - [0.0, 0.0, 0.1]
         outline = np.rint(self._optics.project(np.concatenate([edge, beside[::-1]])))
         bench = cv2.fillPoly(np.zeros_like(image), [outline.astype(np.int32)], 1.0)
@@ -228,7 +228,7 @@ class View:
                 bright = shine(glints, line[:, 2], np.random.default_rng(self._shine_key))
                 colour += bright[tube.sample] * np.exp(-((tube.across / 0.45) ** 2))
             if self._bubbles is not None:
-                above = self._bubbles.height[pixels] > line[tube.sample, 0]
+                above = self._bubbles.height[pixels] > self._optics.window.height(line)[tube.sample]
                 seen_through = colour * self._bubbles.gain[pixels] + self._bubbles.added[pixels]
                 colour = np.where(above, seen_through, colour)
         image[pixels] += tube.coverage * (colour - image[pixels])

@@ -279,12 +279,13 @@ class SimRigNode(WholeNode):
         self._diagnostics.set("simulation", Diagnostic(level, message, values))
 
     def _end_outside_phantom(self) -> None:
-        height, surface = float(self._bench.tip[0]), self._sensors.surface_height
-        if abs(height) > surface:
-            self._end_run(
-                f"the tip left the phantom: x = {height * 1e3:.2f} mm is beyond "
-                f"{math.copysign(surface, height) * 1e3:.2f} mm"
-            )
+        tip = self._bench.tip[:2].tolist()
+        for axis, place, half_size in zip("xy", tip, self._sensors.half_sizes, strict=True):
+            if abs(place) > half_size:
+                self._end_run(
+                    f"the tip left the phantom: {axis} = {place * 1e3:.2f} mm is beyond "
+                    f"{math.copysign(half_size, place) * 1e3:.2f} mm"
+                )
 
     def _end_run(self, why: str) -> None:
         if self._ended:

@@ -41,8 +41,8 @@ class SimulatedTips:
         The node's.
     """
 
-    surface_height = math.inf
-    """Ends of the phantom, either way [m]: none without cameras."""
+    half_sizes = (math.inf, math.inf)
+    """Ends of the phantom, either way, along x and y [m]: none without cameras."""
 
     def __init__(self, node: Node, bench: SimulatedBench, values: SimRigParameters) -> None:
         self._bench = bench
@@ -104,7 +104,7 @@ class SimulatedCameras:
             Path(get_package_share_directory("needle_tracker")) / "config" / "calibration.yaml"
         )
         rig = load_stereo_rig(file)
-        self.surface_height = rig.surface_height
+        self.half_sizes = (rig.half_height, rig.half_width)
         self._cameras = (rig.left, rig.right)
         scenario = SCENARIOS[values.scenario]
         self._has_needle = scenario.needle

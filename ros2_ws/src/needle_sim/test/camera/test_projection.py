@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,9 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from needle_sim.camera.projection import camera_centre, project, refraction_point
+from needle_sim.camera.projection import project, refraction_point
 from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
+from needle_sim.camera.window import Window
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
 HEIGHT = 0.0175
@@ -19,6 +21,14 @@ HEIGHT = 0.0175
 @pytest.fixture(scope="module")
 def rig() -> StereoRig:
     return load_stereo_rig(CALIBRATION)
+
+
+def surface(index: float) -> Window:
+    return Window(np.array([1.0, 0.0, 0.0]), HEIGHT, (), (index,))
+
+
+def through(camera: Camera, index: float) -> Camera:
+    return dataclasses.replace(camera, window=surface(index))
 
 
 def points_inside(count: int, seed: int = 1) -> np.ndarray:
@@ -41,20 +51,20 @@ def opencv_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
 def test_without_refraction_it_is_opencv_s_camera(rig: StereoRig) -> None:
     points = points_inside(200)
     for camera in (rig.left, rig.right):
-        seen = project(points, camera, HEIGHT, 1.0)
+        seen = project(points, through(camera, 1.0))
         np.testing.assert_allclose(seen, opencv_pixels(points, camera), rtol=0, atol=1e-8)
 
 
 def test_above_the_surface_nothing_is_refracted(rig: StereoRig) -> None:
     points = points_inside(50) + np.array([0.04, 0.0, 0.0])
-    seen = project(points, rig.left, HEIGHT, 1.3)
+    seen = project(points, rig.left)
     np.testing.assert_allclose(seen, opencv_pixels(points, rig.left), rtol=0, atol=1e-8)
 
 
 def test_on_the_surface_nothing_is_refracted(rig: StereoRig) -> None:
     points = points_inside(50)
     points[:, 0] = HEIGHT
-    seen = project(points, rig.left, HEIGHT, 1.3)
+    seen = project(points, rig.left)
     np.testing.assert_allclose(seen, opencv_pixels(points, rig.left), rtol=0, atol=1e-8)
 
 
@@ -65,8 +75,8 @@ def test_snell_s_law_holds_in_the_plane_of_incidence(
 ) -> None:
     points = points_inside(300)
     points[:, 1:] *= spread / 0.03
-    centre = camera_centre(rig.right)
-    crossing = refraction_point(points, centre, HEIGHT, index)
+    centre = rig.right.centre
+    crossing = refraction_point(points, centre, surface(index))
     into, out = crossing - points, centre - crossing
     into /= np.linalg.norm(into, axis=1)[:, np.newaxis]
     out /= np.linalg.norm(out, axis=1)[:, np.newaxis]
@@ -76,7 +86,7 @@ def test_snell_s_law_holds_in_the_plane_of_incidence(
 
 
 def test_the_ray_takes_the_least_optical_path(rig: StereoRig) -> None:
-    centre = camera_centre(rig.left)
+    centre = rig.left.centre
     for point in points_inside(10, seed=2):
 
         def optical_path(place: np.ndarray, point: np.ndarray = point) -> float:
@@ -86,13 +96,13 @@ def test_the_ray_takes_the_least_optical_path(rig: StereoRig) -> None:
 
         options = {"xatol": 1e-7, "fatol": 1e-17, "maxiter": 2000}
         found = minimize(optical_path, point[1:] * 1e3, method="Nelder-Mead", options=options)
-        crossing = refraction_point(point, centre, HEIGHT, 1.3)
+        crossing = refraction_point(point, centre, surface(1.3))
         np.testing.assert_allclose(crossing[1:], found.x * 1e-3, rtol=0, atol=1e-7)
 
 
 def test_a_point_below_the_camera_is_seen_straight_down(rig: StereoRig) -> None:
-    centre = camera_centre(rig.left)
-    crossing = refraction_point([0.0, centre[1], centre[2]], centre, HEIGHT, 1.3)
+    centre = rig.left.centre
+    crossing = refraction_point([0.0, centre[1], centre[2]], centre, surface(1.3))
     np.testing.assert_array_equal(crossing, [HEIGHT, centre[1], centre[2]])
 
 
@@ -101,6 +111,36 @@ def test_the_whole_way_of_the_needle_is_in_both_images(rig: StereoRig) -> None:
         np.meshgrid([-0.0175, 0.0, 0.0175], [-0.015, 0.0, 0.015], [0.0, 0.06, 0.13]), axis=-1
     )
     for camera in (rig.left, rig.right):
-        seen = project(grid, camera, HEIGHT, 1.3)
+        seen = project(grid, camera)
         assert seen.shape == (3, 3, 3, 2)
         assert np.all((seen > 10.0) & (seen < [1014.0, 758.0]))
+
+
+def refracted(direction: np.ndarray, normal: np.ndarray, ratio: float) -> np.ndarray:
+    """Snell's law for vectors, by angles: from a medium into one of another index."""
+    cosine = -float(direction @ normal)
+    angle = np.arcsin(np.sin(np.arccos(min(cosine, 1.0))) / ratio)
+    along = direction + cosine * normal
+    length = np.linalg.norm(along)
+    along = along / length if length > 0.0 else along
+    return np.asarray(np.sin(angle) * along - np.cos(angle) * normal)
+
+
+@pytest.mark.parametrize("layers", [(), (0.005,), (0.005, 0.003, 0.01)])
+def test_a_ray_traced_from_face_to_face_meets_the_point(layers: tuple[float, ...]) -> None:
+    normal = np.array([0.1, 0.97, -0.2]) / np.linalg.norm([0.1, 0.97, -0.2])
+    indices = (1.49, 1.1, 1.6)[: len(layers)]
+    window = Window(normal, 0.03, layers, (*indices, 1.34))
+    centre = np.array([0.02, 0.5, 0.1])
+    points = np.random.default_rng(4).uniform([-0.2, -0.15, -0.1], [0.2, -0.08, 0.3], (100, 3))
+    for point, crossing in zip(points, refraction_point(points, centre, window), strict=True):
+        assert window.height(crossing) == pytest.approx(0.03, abs=1e-15)
+        direction = (crossing - centre) / np.linalg.norm(crossing - centre)
+        place, before = crossing, 1.0
+        for thickness, index in zip(layers, indices, strict=True):
+            direction = refracted(direction, normal, index / before)
+            place = place + direction * thickness / -float(direction @ normal)
+            before = index
+        direction = refracted(direction, normal, 1.34 / before)
+        away = point - place
+        np.testing.assert_allclose(np.cross(away, direction), 0.0, atol=1e-9)

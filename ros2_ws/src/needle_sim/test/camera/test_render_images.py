@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import itertools
 import json
+import math
 from pathlib import Path
 
 import cv2
@@ -85,7 +86,7 @@ def test_the_stage_rests_at_its_depth() -> None:
 def test_random_paths_stay_inside_differ_and_are_smooth() -> None:
     ends = []
     for seed in range(12):
-        path = random_path(seed, 0.12, 0.0175, 1.0 / 0.122)
+        path = random_path(seed, 0.12, (0.0175, math.inf), 1.0 / 0.122)
         plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=1.0 / 0.122)
         tips = []
         for rotation in path.rotation:
@@ -97,12 +98,12 @@ def test_random_paths_stay_inside_differ_and_are_smooth() -> None:
         ends.append(tips[-1])
     for one, other in itertools.combinations(ends, 2):
         assert np.linalg.norm(one - other) > 1e-4
-    again = random_path(3, 0.12, 0.0175, 1.0 / 0.122)
+    again = random_path(3, 0.12, (0.0175, math.inf), 1.0 / 0.122)
     np.testing.assert_array_equal(
-        again.rotation, random_path(3, 0.12, 0.0175, 1.0 / 0.122).rotation
+        again.rotation, random_path(3, 0.12, (0.0175, math.inf), 1.0 / 0.122).rotation
     )
     with pytest.raises(UserError, match="no random path of 120 mm stays inside the phantom"):
-        random_path(0, 0.12, 0.0041, 1.0 / 0.122)
+        random_path(0, 0.12, (0.0041, math.inf), 1.0 / 0.122)
 
 
 def test_truth_s_angles_give_the_directions_back() -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from needle_sim.camera.projection import project
 from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.camera.stroke import stroke
 from needle_sim.needle.needle_shape import NeedleShape
@@ -56,7 +57,7 @@ def test_the_shaft_is_darkest_where_its_path_projects(
     circle[:, 2] = np.sin(angle) / CURVATURE
     path = circle @ initial_pose(*np.deg2rad([2.0, 15.0]))[:3, :3].T
     for camera, dark in zip((rig.left, rig.right), darkness(renderer, plant), strict=True):
-        u, v = project(path, camera, rig.surface_height, rig.refractive_index).T
+        u, v = project(path, camera).T
         columns = np.arange(np.ceil(u[0]), np.floor(u[-1])).astype(int)
         expected = np.interp(columns, u, v)
         error = []
@@ -76,7 +77,7 @@ def test_the_needle_ends_at_the_tip(
     plant = needle(-20.0, 90.0, length)
     for camera, dark in zip((rig.left, rig.right), darkness(renderer, plant), strict=True):
         tip = plant.T_rig_tip[:3, 3]
-        u, v = project(tip, camera, rig.surface_height, rig.refractive_index)
+        u, v = project(tip, camera)
         across = round(float(v)) + np.arange(-12, 13)
         profile = dark[across].sum(axis=0)
         column = round(float(u))
@@ -186,3 +187,32 @@ def test_any_insertion_can_be_rendered(renderer: StereoRenderer, length: float) 
     plant = needle(5.0, 170.0, length)
     for image in renderer.render(plant.T_rig_tip, plant.centreline(0.001), 0):
         assert image.shape == (768, 1024)
+
+
+def test_through_windows_the_needle_is_seen_from_above_and_from_aside() -> None:
+    rig = load_stereo_rig(CALIBRATION.with_name("calibration_top_and_side.yaml"))
+    plant = needle(2.0, 15.0, 0.11)
+    path = plant.centreline(0.001)[10:70]
+    for camera, dark in zip(
+        (rig.left, rig.right), darkness(StereoRenderer(rig, seed=5), plant), strict=True
+    ):
+        u, v = project(path, camera).T
+        for column in range(round(u[0]) + 1, round(u[-1]) - 1, 10):
+            expected = float(np.interp(column, u, v))
+            rows = round(expected) + np.arange(-9, 10)
+            part = dark[rows, column]
+            assert rows @ part / part.sum() == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_every_scenario_draws_through_windows(name: str) -> None:
+    rig = load_stereo_rig(CALIBRATION.with_name("calibration_top_and_side.yaml"))
+    renderer = StereoRenderer(rig, 5, scenario=SCENARIOS[name])
+    plant = needle(2.0, 15.0, 0.08)
+    for number in (1, 31):
+        for image in renderer.render(plant.T_rig_tip, plant.centreline(0.001), number):
+            assert image.shape == (768, 1024)
+    if renderer.bubbles is not None:
+        for camera in (rig.left, rig.right):
+            heights = camera.window.height(renderer.bubbles.centre)
+            assert np.all(heights + renderer.bubbles.radius < camera.window.inner)

@@ -30,6 +30,7 @@ from needle_sim.camera.scenarios import (
     find_scenario,
 )
 from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
+from needle_sim.camera.window import Window
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -83,7 +84,7 @@ def test_clean_is_what_it_always_was(rig: StereoRig) -> None:
     left, _ = render(StereoRenderer(rig, 5), needle(), 7)
     golden = cv2.imread(str(GOLDEN), cv2.IMREAD_GRAYSCALE)
     assert golden is not None
-    u, v = project(needle().T_rig_tip[:3, 3], rig.left, 0.0175, 1.3).astype(int)
+    u, v = project(needle().T_rig_tip[:3, 3], rig.left).astype(int)
     difference = np.abs(left[v - 40 : v + 40, u - 80 : u + 40].astype(int) - golden)
     # Other processors blur the mottle with other roundings.
     assert difference.max() <= 1
@@ -119,8 +120,9 @@ def test_bubbles_are_seen_where_refraction_puts_them(rig: StereoRig) -> None:
     assert renderer.bubbles is not None
     checked = 0
     for image, camera in zip(dark, cameras(rig), strict=True):
-        centres = project(renderer.bubbles.centre, camera, 0.0175, 1.3)
-        straight = project(renderer.bubbles.centre, camera, 0.0175, 1.0)
+        centres = project(renderer.bubbles.centre, camera)
+        dry = Window(camera.window.normal, camera.window.outer, (), (1.0,))
+        straight = project(renderer.bubbles.centre, dataclasses.replace(camera, window=dry))
         for i, (u, v) in enumerate(centres):
             apart = np.linalg.norm(np.delete(centres, i, axis=0) - [u, v], axis=1)
             if not (40 < u < 980 and 40 < v < 720) or apart.min() < 45.0:
@@ -148,10 +150,10 @@ def test_a_bubble_hides_the_needle_only_from_above(
     change = []
     for height in (0.004, -0.004):
         # Where the left camera sees it at the same pixel as the needle.
-        pixel = project(point, rig.left, 0.0175, 1.3)
+        pixel = project(point, rig.left)
 
         def miss(yz: np.ndarray, x: float = point[0] + height, at: np.ndarray = pixel) -> object:
-            return project([x, *yz], rig.left, 0.0175, 1.3) - at
+            return project([x, *yz], rig.left) - at
 
         centre = np.array([[point[0] + height, *fsolve(miss, point[1:])]])
         cloud = BubbleCloud(centre, np.array([0.0012]))
@@ -193,9 +195,9 @@ def test_the_shadow_lies_on_the_floor(rig: StereoRig, floor_depth: float) -> Non
         height = 0.0175 - depth
 
         def miss(yz: np.ndarray) -> np.ndarray:
-            return project([height, *yz], rig.left, 0.0175, 1.3) - [u, v]
+            return project([height, *yz], rig.left) - [u, v]
 
-        u_right, v_right = project([height, *fsolve(miss, [0.0, 0.05])], rig.right, 0.0175, 1.3)
+        u_right, v_right = project([height, *fsolve(miss, [0.0, 0.05])], rig.right)
         return float(v_right - np.interp(u_right, np.arange(250, 650), right))
 
     misses = [right_row(float(u), v, floor_depth) for u, v in zip(columns, left, strict=True)]
@@ -244,7 +246,7 @@ def test_glints_saturate_over_the_needle_and_differ_between_the_views(rig: Stere
     path = plant.centreline(0.0005)[10:]
     on_needle = []
     for image, camera in zip(brighter, cameras(rig), strict=True):
-        u, v = np.rint(project(path, camera, 0.0175, 1.3)).astype(int).T
+        u, v = np.rint(project(path, camera)).astype(int).T
         on_needle.append(image[v, u])
         assert on_needle[-1].max() > 60.0
     assert np.any(np.abs(on_needle[0] - on_needle[1]) > 30.0)
@@ -252,7 +254,7 @@ def test_glints_saturate_over_the_needle_and_differ_between_the_views(rig: Stere
 
 def test_blur_is_a_thin_lens_s_and_keeps_the_needle_s_darkness(rig: StereoRig) -> None:
     lens = Lens(focus_height=0.065, aperture=0.011)
-    optics = Optics(rig, rig.left, lens)
+    optics = Optics(rig.left, lens)
     heights = np.array([0.065, 0.0175, 0.0, -0.0175])
     points = np.zeros((4, 3))
     points[:, 0] = heights
@@ -312,7 +314,7 @@ def test_an_event_blocks_whom_it_says(
     assert renderer.share_seen(pose, line, 0) == tuple(float(not blocked) for blocked in blocks)
     dark = taken(renderer.render(pose, line, 0), renderer.render(pose, NO_NEEDLE, 0))
     for image, camera, blocked in zip(dark, cameras(rig), blocks, strict=True):
-        u, v = np.rint(project(pose[:3, 3], camera, 0.0175, 1.3)).astype(int)
+        u, v = np.rint(project(pose[:3, 3], camera)).astype(int)
         near = np.abs(image[v - 20 : v + 21, u - 40 : u + 5])
         assert near.max() <= 1.0 if blocked else near.max() > 60.0
 

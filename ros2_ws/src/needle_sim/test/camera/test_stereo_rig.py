@@ -19,15 +19,59 @@ CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibra
 
 def test_the_shipped_file_puts_both_cameras_where_its_header_says() -> None:
     rig = load_stereo_rig(CALIBRATION)
-    assert (rig.surface_height, rig.refractive_index) == (0.0175, 1.3)
+    assert rig.half_height == 0.0175
     for camera, y in ((rig.left, -0.1), (rig.right, 0.1)):
-        centre = -camera.T_optical_rig[:3, :3].T @ camera.T_optical_rig[:3, 3]
-        np.testing.assert_allclose(centre, [0.5175, y, 0.0625], atol=1e-8)
+        window = camera.window
+        assert (window.normal.tolist(), window.outer) == ([1.0, 0.0, 0.0], 0.0175)
+        assert (window.thicknesses, window.indices) == ((), (1.3,))
+        np.testing.assert_allclose(camera.centre, [0.5175, y, 0.0625], atol=1e-8)
         # Image u runs along rig z, v along rig y, the optical axis down.
         assert camera.T_optical_rig[0, 2] > 0.99
         assert camera.T_optical_rig[1, 1] > 0.97
         assert camera.T_optical_rig[2, 0] < -0.97
         assert (camera.image_width, camera.image_height) == (1024, 768)
+
+
+TOP_AND_SIDE = CALIBRATION.with_name("calibration_top_and_side.yaml")
+
+
+def test_each_camera_may_have_its_own_window() -> None:
+    rig = load_stereo_rig(TOP_AND_SIDE)
+    for camera, axis, outer in ((rig.left, 0, 0.0225), (rig.right, 1, 0.035)):
+        window = camera.window
+        assert window.normal[axis] > 0.9999
+        assert window.outer == pytest.approx(outer, abs=0.3e-3)
+        assert (window.thicknesses, window.indices) == ((0.005,), (1.49, 1.34))
+        # The camera looks at its window.
+        assert camera.T_optical_rig[2, axis] < -0.99
+        assert float(window.height(camera.centre)) - window.outer == pytest.approx(0.5, abs=1e-3)
+    assert rig.half_height == pytest.approx(0.0175, abs=0.3e-3)
+    assert rig.half_width == pytest.approx(0.030, abs=0.3e-3)
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda d: d.update(phantom={"surface_height": 0.0, "refractive_index": 1.3}), "beside"),
+        (lambda d: d["right"].pop("window"), "right.window is missing, and so phantom is missing"),
+        (lambda d: d["left"]["window"].pop("layers"), "left.window.layers is missing"),
+        (lambda d: d["left"]["window"].update(normal=[0, 0, 1]), "lies along the needle"),
+        (lambda d: d["left"]["window"].update(normal=[1, 1, 0]), "normal has length 1.41"),
+        (lambda d: d["left"]["window"].update(normal=[-1, 0, 0]), "not above the surface"),
+        (lambda d: d["left"]["window"].update(inside=0.9), r"inside = 0.9 is outside \[1, 3\]"),
+        (lambda d: d["left"]["window"]["layers"][0].update(thickness=0), "thickness = 0 m"),
+    ],
+)
+def test_a_bad_window_is_one_line(
+    change: Callable[[dict[str, Any]], None], named: str, tmp_path: Path
+) -> None:
+    document = yaml.safe_load(TOP_AND_SIDE.read_text())
+    change(document)
+    path = tmp_path / "rig.yaml"
+    path.write_text(yaml.safe_dump(document))
+    with pytest.raises(UserError, match=named) as caught:
+        load_stereo_rig(path)
+    assert "\n" not in str(caught.value)
 
 
 def test_rotation_is_the_quaternion_s() -> None:

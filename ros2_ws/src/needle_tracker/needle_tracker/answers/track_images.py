@@ -85,7 +85,7 @@ def _run(words: Sequence[str]) -> int:
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
-    tracker = TipTracker(calibration, parameters.tracker_settings(calibration.phantom))
+    tracker = TipTracker(calibration, parameters.tracker_settings(calibration))
     tracker.warm_up()
     begin = time.perf_counter()
     tracked = track_sequence(pairs, tracker, calibration, insertions)

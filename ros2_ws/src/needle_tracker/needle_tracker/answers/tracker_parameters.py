@@ -8,7 +8,7 @@ from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.pair_answers import PairingSettings
 from needle_tracker.image.search_grid import Reach
-from needle_tracker.optics.calibration import Phantom
+from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.gates import GateSettings
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
@@ -165,13 +165,13 @@ class StereoTrackerParameters:
             lean=self.lean,
         )
 
-    def tracker_settings(self, phantom: Phantom) -> TrackerSettings:
+    def tracker_settings(self, calibration: StereoCalibration) -> TrackerSettings:
         """Return the settings of the tracker behind the node.
 
         Parameters
         ----------
-        phantom : Phantom
-            From the calibration.
+        calibration : StereoCalibration
+            The stereo rig.
 
         Returns
         -------
@@ -182,7 +182,7 @@ class StereoTrackerParameters:
             reach=Reach(
                 self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
             ),
-            surface_height=phantom.surface_height,
+            windows=(calibration.left.window, calibration.right.window),
             least_distance=self.hole_clearance + 1.5e-3,
             tip_lean=self.tip_lean,
             insertion_margin=self.insertion_margin,
@@ -206,12 +206,12 @@ class StereoTrackerParameters:
         )
 
 
-def default_settings(phantom: Phantom) -> TrackerSettings:
+def default_settings(calibration: StereoCalibration) -> TrackerSettings:
     """Return the settings for the needle of [KC09] section II (0.7 mm, 10 deg pre-bend).
 
     Parameters
     ----------
-    phantom : Phantom
-        From the calibration.
+    calibration : StereoCalibration
+        The stereo rig.
     """
-    return StereoTrackerParameters().tracker_settings(phantom)
+    return StereoTrackerParameters().tracker_settings(calibration)

@@ -19,7 +19,7 @@ from needle_tracker.calibrating.calibration_outliers import doubts, misfits, squ
 from needle_tracker.calibrating.calibration_session import load_session
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
-from needle_tracker.calibrating.rig_model import BoardView
+from needle_tracker.calibrating.rig_model import SURFACE, BoardView
 from needle_tracker.optics.calibration import SIDES
 
 _DESCRIPTION = """\
@@ -92,7 +92,7 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
         )
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
-    result = calibrate([view for view in views if view.name not in empty], sizes, session.phantom)
+    result = calibrate([view for view in views if view.name not in empty], sizes, session.windows)
     size = square_error(result)
     problems = doubts(result, size)
     text = "\n".join(
@@ -146,7 +146,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
     ]
     lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
     for name, found in result.parameters.items():
-        scale, unit = (1e3, " mm") if name == "surface_height" else (1.0, "")
+        scale, unit = _unit(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
         if not found.kept:
             lines.append(f"{name}: {value:.5g}{unit} +- {sigma:.2g}{unit}")
@@ -171,7 +171,7 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         f"expected error of a tip in the phantom from what was determined, 95 %: {error_mm:.3f} mm "
         f"({verdict} {goal_mm:g} mm)"
     )
-    if result.parameters["refractive_index"].kept or result.parameters["surface_height"].kept:
+    if any(result.parameters[name].kept for name in SURFACE if name in result.parameters):
         lines.append(
             "an error of a given value comes on top: about 0.14 mm for 0.01 of the index, 0.31 mm "
             "for 1 mm of the surface"
@@ -190,9 +190,10 @@ def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
     for (side, name), error in reprojection_by_set(result).items():
         values[f"reprojection_{side}_{name}_px"] = error
     for name, found in result.parameters.items():
-        key, scale = name.replace(".", "_"), 1.0
-        if name == "surface_height":
-            key, scale = "surface_height_mm", 1e3
+        key = name.replace(".", "_")
+        scale, unit = _unit(name)
+        if unit:
+            key += f"_{unit.strip()}"
         elif name.split(".")[-1] in ("fx", "fy", "cx", "cy"):
             key += "_px"
         values[key] = scale * found.value
@@ -201,12 +202,19 @@ def figures(result: RigCalibration, goal_mm: float) -> dict[str, JsonValue]:
     return values
 
 
+def _unit(name: str) -> tuple[float, str]:
+    """Return the factor to a person's unit of a parameter, and that unit in words."""
+    if "tilt" in name:
+        return math.degrees(1.0), " deg"
+    return (1e3, " mm") if name.endswith(("surface_height", "window_offset")) else (1.0, "")
+
+
 def _parser() -> CommandParser:
     parser = CommandParser("calibrate_stereo", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
     add("--right", type=Path, metavar="DIR", help="images of the right camera, of the same names")
-    add("--session", type=Path, metavar="FILE", help="board, phantom and places (YAML)")
+    add("--session", type=Path, metavar="FILE", help="board, windows and places (YAML)")
     add("--output", type=Path, metavar="FILE.yaml", help="the calibration file to write")
     add("--goal-mm", type=float, default=0.06, metavar="MM", help="wanted tip error (0.06)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")

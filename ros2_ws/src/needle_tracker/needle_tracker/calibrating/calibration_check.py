@@ -17,13 +17,11 @@ from needle_common.errors import UserError
 from needle_tracker.calibrating.calibration_start import LEAST_CORNERS
 from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
 from needle_tracker.calibrating.rig_model import (
+    CAMERA_PARAMETERS,
     LENS,
-    PHANTOM,
-    SHARED_PARAMETERS,
     BoardView,
     RigModel,
     camera_slice,
-    shared_names,
 )
 from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
@@ -32,7 +30,6 @@ from needle_tracker.optics.camera_model import optical_rays
 Array = NDArray[np.float64]
 
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
-CAUSES = (*CAMERAS, *PHANTOM)
 LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
 LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
 EXPLAINED_PX = 1.0  # a larger misfit, and the causes found explain nothing
@@ -47,7 +44,7 @@ class Deviation:
     Attributes
     ----------
     cause : str
-        One of `CAUSES`.
+        One of `CheckResult.causes`.
     size, sigma : float
         Truth minus calibration, and its standard deviation [rad, m or -]; a camera's is the
         angle of its turn, not negative.
@@ -67,6 +64,9 @@ class CheckResult:
 
     Attributes
     ----------
+    causes : tuple of str
+        What was looked for: cameras that turned (`CAMERAS`), and what the windows' parameters are
+        called (`rig_model.window_names`).
     deviations : list of Deviation
         What was found, the most telling first.
     tip_error : float
@@ -82,6 +82,7 @@ class CheckResult:
         Why the calibration is not shown to be good; empty where it is.
     """
 
+    causes: tuple[str, ...]
     deviations: list[Deviation]
     tip_error: float
     unseen_tip_error: float
@@ -126,10 +127,11 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
                 )
     boards = np.stack([_board(calibration, view) for view in views])
     model = RigModel(calibration, views, boards)
-    everything = _fit(model, list(CAUSES), None)
+    causes = _all_causes(model)
+    everything = _fit(model, list(causes), None)
     sigma = everything.corner_sigma_px
     misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
-    covariance = everything.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
+    covariance = everything.covariance[: model.shared, : model.shared]
     unseen = tip_error_p95(calibration, covariance)
     asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
     reprojection = float(np.sqrt(np.mean(np.sum(asis**2, axis=-1))))
@@ -139,7 +141,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
             "another target or place than the session says, left and right exchanged, or other "
             "cameras"
         )
-        return CheckResult([], np.nan, unseen, sigma, reprojection, [problem])
+        return CheckResult(causes, [], np.nan, unseen, sigma, reprojection, [problem])
     found = _causes(model, sigma)
     best = _fit(model, found, sigma)
     deviations = [_deviation(model, best, cause) for cause in found]
@@ -163,7 +165,7 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
             + (f" below {1e3 * unseen:.2f} mm" if unseen < NOTHING_SHOWN else "")
             + ": lay it at known places on and under the surface, tilted"
         )
-    return CheckResult(deviations, shift, unseen, sigma, reprojection, problems)
+    return CheckResult(causes, deviations, shift, unseen, sigma, reprojection, problems)
 
 
 def _noise_px(views: list[BoardView]) -> float:
@@ -187,12 +189,17 @@ def _noise_px(views: list[BoardView]) -> float:
     return float(np.sqrt(total / spare)) if spare else 0.0
 
 
+def _all_causes(model: RigModel) -> tuple[str, ...]:
+    return (*CAMERAS, *model.names[CAMERA_PARAMETERS:])
+
+
 def _causes(model: RigModel, sigma: float) -> list[str]:
     """Return the fewest causes that explain what is seen, the most telling first."""
+    causes = _all_causes(model)
     found: list[str] = []
     cost = _fit(model, found, sigma).cost
-    while len(found) < len(CAUSES):
-        costs = {c: _fit(model, [*found, c], sigma).cost for c in CAUSES if c not in found}
+    while len(found) < len(causes):
+        costs = {c: _fit(model, [*found, c], sigma).cost for c in causes if c not in found}
         best = min(costs, key=lambda cause: costs[cause])
         if 2.0 * (cost - costs[best]) < LEAST_IMPROVEMENT:
             break
@@ -204,20 +211,20 @@ def _causes(model: RigModel, sigma: float) -> list[str]:
 def _fit(model: RigModel, causes: list[str], sigma: float | None) -> RigFit:
     free = board_parameters_free(model)
     for cause in causes:
-        free[_columns(cause)] = True
+        free[_columns(model, cause)] = True
     return fit(model, model.start, free, sigma)
 
 
-def _columns(cause: str) -> list[int]:
-    """Return where a cause's parameters are: a camera's rotation, or one of the phantom's."""
+def _columns(model: RigModel, cause: str) -> list[int]:
+    """Return where a cause's parameters are: a camera's rotation, or one of the windows'."""
     if cause in CAMERAS:
         start = camera_slice(SIDES[CAMERAS.index(cause)]).start + len(LENS)
         return [start, start + 1, start + 2]
-    return [shared_names().index(cause)]
+    return [model.names.index(cause)]
 
 
 def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
-    columns = _columns(cause)
+    columns = _columns(model, cause)
     change = (best.parameters - model.start)[columns]
     size = float(change[0])
     sigma = float(best.sigma[columns[0]])
@@ -237,7 +244,7 @@ def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
 
 def _board(calibration: StereoCalibration, view: BoardView) -> Array:
     """Return T_rig_board: as given, or as the left camera sees a board in air."""
-    if view.place is not None:
+    if view.place is not None and view.place.is_known:
         return view.place.T_rig_board
     return np.asarray(np.linalg.inv(calibration.left.T_optical_rig) @ _seen(calibration.left, view))
 

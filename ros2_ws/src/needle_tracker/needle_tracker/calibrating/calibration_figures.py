@@ -15,6 +15,7 @@ from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, Camera
 from needle_tracker.optics.camera_model import optical_rays
+from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
@@ -27,13 +28,12 @@ def rig_figure(result: RigCalibration) -> Figure:
     figure = Figure(figsize=(9.0, 8.5), layout="constrained")
     FigureCanvasAgg(figure)
     calibration = result.calibration
-    height = calibration.phantom.surface_height
     planes = ((2, "z (insertion) [mm]"), (1, "y [mm]"))
     for number, (axis, axis_label) in enumerate(planes):
         axes = figure.add_subplot(1, 2, number + 1)
         # The legend names each thing once.
         named = number == 1
-        axes.axhline(_MM * height, color="#2e9d55", label="surface" if named else None)
+        axes.plot([], [], color="#2e9d55", label="window" if named else None)
         axes.plot(0, 0, "k+", markersize=12, label="rig (entry point)" if named else None)
         for i, view in enumerate(result.model.views):
             outline = _outline(result, i)
@@ -45,7 +45,8 @@ def rig_figure(result: RigCalibration) -> Figure:
                 _MM * camera.centre[axis], _MM * camera.centre[0], "o",
                 color=_COLOURS[side], label=label,
             )  # fmt: skip
-            _draw_frustum(axes, camera, height, axis, _COLOURS[side])
+            _draw_frustum(axes, camera, axis, _COLOURS[side])
+            _draw_face(axes, camera.window, axis)
         axes.set_aspect("equal")
         axes.set_xlabel(axis_label)
         axes.set_ylabel("x (up) [mm]")
@@ -117,15 +118,23 @@ def _style(view: BoardView) -> dict[str, Any]:
     return {"color": "#b03060" if view.under_surface else "#1b1b1b", "linewidth": 2.0}
 
 
-def _draw_frustum(axes: Any, camera: Camera, surface_height: float, axis: int, colour: str) -> None:
+def _draw_face(axes: Any, window: Window, axis: int) -> None:
+    """Draw a window's outer face where it is seen edge on."""
+    along, up = window.normal[axis], window.normal[0]
+    if np.hypot(along, up) > 0.5:
+        place = (_MM * window.point[axis], _MM * window.point[0])
+        axes.axline(place, (place[0] + up, place[1] - along), color="#2e9d55")
+
+
+def _draw_frustum(axes: Any, camera: Camera, axis: int, colour: str) -> None:
     centre = camera.centre
     corners = np.array(
         [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]], dtype=float
     )
     rays = optical_rays(camera, corners) @ camera.T_optical_rig[:3, :3]
-    above = centre[0] - surface_height
-    # Down to the surface; a camera that looks level has no such end.
-    lengths = np.minimum(above / np.maximum(-rays[:, 0], 1e-9), 2.0 * above)
+    above = float(camera.window.height(centre))
+    # Down to the window; a camera that looks past it has no such end.
+    lengths = np.minimum(above / np.maximum(-rays @ camera.window.normal, 1e-9), 2.0 * above)
     ends = centre + lengths[:, None] * rays
     for end in ends:
         axes.plot(

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from needle_common.errors import UserError
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
+from needle_tracker.optics.window import Window
 
 
 def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str:
@@ -20,12 +21,13 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
     comments : list of str
         Lines to put before it.
     """
-    phantom = calibration.phantom
-    lines = [
-        *(f"# {line}" for line in comments),
-        f"phantom: {{surface_height: {phantom.surface_height:.9f}, "
-        f"refractive_index: {phantom.refractive_index:.6f}}}",
-    ]
+    surface = calibration.surface
+    lines = [f"# {line}" for line in comments]
+    if surface is not None:
+        lines.append(
+            f"phantom: {{surface_height: {surface.point[0]:.9f}, "
+            f"refractive_index: {surface.inside:.6f}}}"
+        )
     for side in SIDES:
         camera = calibration.left if side == "left" else calibration.right
         matrix = ", ".join(f"{value:.4f}" for value in camera.camera_matrix.ravel())
@@ -44,7 +46,25 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
             f"    translation: [{translation}]",
             f"    rotation: [{rotation}]",
         ]
+        if surface is None:
+            lines += _window_lines(camera.window)
     return "\n".join(lines) + "\n"
+
+
+def _window_lines(window: Window) -> list[str]:
+    point = ", ".join(f"{value:.9f}" for value in window.point)
+    normal = ", ".join(f"{value:.12f}" for value in window.normal)
+    layers = ", ".join(
+        f"{{thickness: {layer.thickness:.9f}, refractive_index: {layer.refractive_index:.6f}}}"
+        for layer in window.layers
+    )
+    return [
+        "  window:",
+        f"    point: [{point}]",
+        f"    normal: [{normal}]",
+        f"    layers: [{layers}]",
+        f"    inside: {window.inside:.6f}",
+    ]
 
 
 def save_calibration(path: Path, calibration: StereoCalibration, comments: list[str]) -> None:

@@ -17,7 +17,7 @@ from needle_tracker.calibrating.rig_fit import (
     place_deviations,
     place_rows,
 )
-from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, BoardView
+from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
         True size over the given one, less 1; infinite sigma where no two places tell it.
     """
     model, fitted = result.model, result.fit
-    columns = SHARED_PARAMETERS + np.arange(len(fitted.parameters) - SHARED_PARAMETERS)
+    columns = np.arange(model.shared, len(fitted.parameters))
     of_boards = np.zeros(len(fitted.parameters), dtype=bool)
     of_boards[columns.reshape(-1, 6)[:, _TRANSLATION].ravel()] = True
     by_translation = model.jacobian(fitted.parameters, of_boards).reshape(

@@ -14,12 +14,14 @@ from numpy.typing import NDArray
 
 from needle_common.errors import OutOfBoundsError, UserError
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.optics.calibration import Phantom, yaml_problem
+from needle_tracker.optics.calibration import SIDES, parse_windows, yaml_problem
+from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
 
 _LEAST_SINE = math.cos(math.radians(5.0))
 _PLACE_KEYS = ("origin", "columns", "rows", "under_surface", "sigma")
+_SURFACE_KEYS = ("surface_height", "refractive_index")
 _BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary")
 
 
@@ -32,32 +34,38 @@ class Place:
     T_rig_board : ndarray, shape (4, 4)
         Takes points of the board's frame to `rig` [m].
     under_surface : bool
-        Whether it was seen through the phantom's surface.
+        Whether it was in the phantom, and so seen through the windows.
     sigma : float
-        Standard deviation of the place's coordinates [m]; 0: exact, it defines `rig`.
+        Standard deviation of the place's coordinates [m]; 0: exact, it defines `rig`; infinite:
+        held freely, `T_rig_board` says nothing.
     """
 
     T_rig_board: Array
     under_surface: bool = False
     sigma: float = 0.0
 
+    @property
+    def is_known(self) -> bool:
+        """Whether it says where the board lay."""
+        return math.isfinite(self.sigma)
+
 
 @dataclasses.dataclass(frozen=True)
 class Session:
-    """Board, given phantom and known places.
+    """Board, given windows and known places.
 
     Attributes
     ----------
     board : CharucoBoard
         The board of all images.
-    phantom : Phantom
-        The surface height and refractive index to keep where the images do not tell them.
+    windows : pair of Window
+        Of the left and the right camera; what the images do not tell of them is kept.
     places : dict of str to Place
         By file name without ending; `*` and `?` as in a shell.
     """
 
     board: CharucoBoard
-    phantom: Phantom
+    windows: tuple[Window, Window]
     places: dict[str, Place]
 
     def place_of(self, name: str) -> Place | None:
@@ -83,7 +91,7 @@ def load_session(path: Path) -> Session:
     Parameters
     ----------
     path : Path
-        YAML: `board`, `phantom`, `places` (docs/calibration.md).
+        YAML: `board`, `phantom` or the cameras' windows, `places` (docs/calibration.md).
 
     Returns
     -------
@@ -126,31 +134,45 @@ def parse_session(content: Any) -> Session:
     UserError
         An unknown key, or a value missing or out of bounds.
     """
-    top = _mapping(content, "the file", ("board", "phantom", "places"))
-    given = _mapping(top.get("phantom"), "phantom", ("surface_height", "refractive_index"))
-    height = _number(given, ("phantom", "surface_height"), (-1.0, 1.0), "m")
-    index = _number(given, ("phantom", "refractive_index"), (1.0, 3.0), "-")
+    top = _mapping(content, "the file", ("board", "phantom", *SIDES, "places"))
+    for key, known in (("phantom", _SURFACE_KEYS), *((side, ("window",)) for side in SIDES)):
+        if key in top:
+            _mapping(top[key], key, known)
+    windows = parse_windows(top)
     content = top.get("places") or {}
     if not isinstance(content, dict):
         raise UserError(f"places = {content!r} is not a mapping of file names")
     board = _board(top.get("board"))
     places = {str(name): _place(value, f"places.{name}") for name, value in content.items()}
     for name, place in places.items():
-        _check_side(f"places.{name}", place, board, height)
-    return Session(board, Phantom(height, index), places)
+        if place.is_known:
+            _check_side(f"places.{name}", place, board, windows)
+    return Session(board, windows, places)
 
 
-def _check_side(name: str, place: Place, board: CharucoBoard, height: float) -> None:
-    """Refuse a board that is not wholly on the side of the surface that is said."""
+def _check_side(
+    name: str, place: Place, board: CharucoBoard, windows: tuple[Window, Window]
+) -> None:
+    """Refuse a board that cannot be seen, or is not wholly on the side that is said."""
     T = place.T_rig_board  # noqa: N806
-    above = (board.corners @ T[:3, :3].T + T[:3, 3])[:, 0] - height
-    if place.under_surface and float(above.max()) >= 0.0:
+    corners = board.corners @ T[:3, :3].T + T[:3, 3]
+    for window in windows:
+        if float(T[:3, 2] @ window.normal) >= 0.0:
+            raise UserError(
+                f"{name}: with these columns and rows the board's print faces downwards, away from "
+                "the camera"
+            )
+        depth = window.depth(corners)
+        if place.under_surface and float(depth.min()) <= 0.0:
+            raise UserError(
+                f"{name} is under_surface, but reaches {-1e3 * depth.min():.1f} mm above the "
+                "surface"
+            )
+    # Where each camera has a window of its own, a board in air is there before the phantom is.
+    above = common_surface(*windows) is None or float(depth.max()) <= 1e-3
+    if not (place.under_surface or above):
         raise UserError(
-            f"{name} is under_surface, but reaches {1e3 * above.max():.1f} mm above the surface"
-        )
-    if not place.under_surface and float(above.min()) < -1e-3:
-        raise UserError(
-            f"{name} reaches {-1e3 * above.min():.1f} mm below the surface: under_surface: true?"
+            f"{name} reaches {1e3 * depth.max():.1f} mm below the surface: under_surface: true?"
         )
 
 
@@ -167,12 +189,14 @@ def _board(content: Any) -> CharucoBoard:
 
 def _place(content: Any, name: str) -> Place:
     place = _mapping(content, name, _PLACE_KEYS)
-    origin = _vector(place, name, "origin", None)
-    along = _vector(place, name, "columns", [0.0, 0.0, 1.0])
-    across = _vector(place, name, "rows", [0.0, 1.0, 0.0])
     under = place.get("under_surface", False)
     if not isinstance(under, bool):
         raise UserError(f"{name}.under_surface = {under!r} is not true or false")
+    if under and set(place) == {"under_surface"}:
+        return Place(np.eye(4), under, math.inf)
+    origin = _vector(place, name, "origin", None)
+    along = _vector(place, name, "columns", [0.0, 0.0, 1.0])
+    across = _vector(place, name, "rows", [0.0, 1.0, 0.0])
     sigma = 0.0
     if "sigma" in place:
         sigma = _number(place, (name, "sigma"), (0.0, 0.01), "m")
@@ -184,8 +208,6 @@ def _place(content: Any, name: str) -> Place:
     transform[:3, :3] = np.stack([x, y / np.linalg.norm(y), np.zeros(3)], axis=-1)
     transform[:3, 2] = np.cross(transform[:3, 0], transform[:3, 1])
     transform[:3, 3] = origin
-    if transform[0, 2] >= 0.0:
-        raise UserError(f"{name}: with these columns and rows the board's print faces downwards")
     return Place(transform, under, sigma)
 
 

@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from needle_common.errors import UserError
 from needle_tracker.calibrating.rig_model import BoardView, Corners
-from needle_tracker.optics.calibration import SIDES, Camera, Phantom, StereoCalibration
+from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
+from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
 
@@ -18,55 +19,85 @@ LEAST_TILT_DEG = 10.0
 _FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2
 
 
-def check_views(views: list[BoardView]) -> None:
-    """Refuse a set of views that cannot determine the rig.
+def checked_views(views: list[BoardView], windows: tuple[Window, Window]) -> list[BoardView]:
+    """Refuse a set of views that cannot determine the rig; return what of it counts.
 
-    Raises
-    ------
-    UserError
-        Too few views or corners, a board seen by one camera only, no board of known place in air.
-    """
-    for view in views:
-        counts = {side: len(view.corners(side).points) for side in SIDES}
-        few = [side for side in SIDES if counts[side] < LEAST_CORNERS]
-        if few:
-            raise UserError(
-                f"{view.name}: the {few[0]} camera sees {counts[few[0]]} corners of the board, "
-                f"{LEAST_CORNERS} are needed (left {counts['left']}, right {counts['right']})"
-            )
-        for side in SIDES:
-            points = view.corners(side).points[:, :2]
-            if np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 2:
-                raise UserError(f"{view.name}: the {side} camera's corners are all on one line")
-    held = [view for view in views if view.place is None]
-    if len(held) < LEAST_FREE_VIEWS:
-        raise UserError(
-            f"{len(held)} views of the board held freely in air, at least {LEAST_FREE_VIEWS} are "
-            "needed (20 are good)"
-        )
-    if not any(view.place and not view.under_surface for view in views):
-        raise UserError(
-            "no view of the board at a known place in air: nothing says where `rig` is (give the "
-            "place of the board on the surface in the session file)"
-        )
-
-
-def first_calibration(
-    views: list[BoardView], sizes: dict[str, tuple[int, int]], phantom: Phantom
-) -> tuple[StereoCalibration, Array]:
-    """Return a calibration good enough to start the adjustment from.
-
-    Each camera by itself from the views in air (Zhang's method, OpenCV), `rig` from a board of
-    known place.
+    Cameras with windows of their own may see hardly anything in common but through these: a board
+    that is held freely in air then counts for the camera that sees it.
 
     Parameters
     ----------
     views : list of BoardView
-        That `check_views` accepts.
+        What was seen.
+    windows : pair of Window
+        Of the left and the right camera.
+
+    Raises
+    ------
+    UserError
+        Too few views or corners, a board seen by one camera only, no board of known place.
+    """
+    surface = common_surface(*windows)
+    checked = [_checked(view, alone=surface is None and view.place is None) for view in views]
+    for side in SIDES:
+        held = [v for v in checked if v.place is None and len(v.corners(side).points)]
+        if len(held) < LEAST_FREE_VIEWS:
+            raise UserError(
+                f"{len(held)} views of the board held freely in air"
+                f"{'' if surface else f' that the {side} camera sees'}, at least "
+                f"{LEAST_FREE_VIEWS} are needed (20 are good)"
+            )
+    if _anchor(checked, surface) is None:
+        raise UserError(
+            "no view of the board at a known place in air: nothing says where `rig` is (give the "
+            "place of the board on the surface in the session file)"
+            if surface
+            else "no view of the board at a known place: nothing says where `rig` is"
+        )
+    return checked
+
+
+def _checked(view: BoardView, *, alone: bool) -> BoardView:
+    """Return a view without the camera that sees too little, if the other one may see it alone."""
+    counts = {side: len(view.corners(side).points) for side in SIDES}
+    few = [side for side in SIDES if counts[side] < LEAST_CORNERS]
+    if few and not (alone and len(few) < len(SIDES)):
+        raise UserError(
+            f"{view.name}: the {few[0]} camera sees {counts[few[0]]} corners of the board, "
+            f"{LEAST_CORNERS} are needed (left {counts['left']}, right {counts['right']})"
+        )
+    for side in SIDES:
+        points = view.corners(side).points[:, :2]
+        if side in few:
+            view = view.without(side)
+        elif np.linalg.matrix_rank(points - points.mean(axis=0), tol=1e-6) < 2:
+            raise UserError(f"{view.name}: the {side} camera's corners are all on one line")
+    return view
+
+
+def _anchor(views: list[BoardView], surface: Window | None) -> int | None:
+    """Return the view that says where `rig` is: in air if possible, and always under a surface."""
+    known = [i for i, view in enumerate(views) if view.place and view.place.is_known]
+    in_air = [i for i in known if not views[i].under_surface]
+    return next(iter(in_air if surface else in_air + known), None)
+
+
+def first_calibration(
+    views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
+) -> tuple[StereoCalibration, Array]:
+    """Return a calibration good enough to start the adjustment from.
+
+    Each camera by itself from the views in air (Zhang's method, OpenCV), `rig` from a board of
+    known place, all of it as if there were no windows.
+
+    Parameters
+    ----------
+    views : list of BoardView
+        From `checked_views`.
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
-    phantom : Phantom
-        The given surface height and refractive index.
+    windows : pair of Window
+        Of the left and the right camera, as given.
 
     Returns
     -------
@@ -80,29 +111,38 @@ def first_calibration(
     UserError
         Views that do not determine the cameras: all parallel, or contradictory.
     """
-    anchor = next(i for i, v in enumerate(views) if v.place and not v.under_surface)
+    anchor = _anchor(views, common_surface(*windows))
+    assert anchor is not None
     place = views[anchor].place
     assert place is not None
-    cameras, poses = [], []
-    for side in SIDES:
-        in_air = [view.corners(side) for view in views if not view.under_surface]
+    cameras = []
+    boards = [
+        view.place.T_rig_board if view.place is not None and view.place.is_known else None
+        for view in views
+    ]
+    for side, window in zip(SIDES, windows, strict=True):
+        seen = [view.corners(side) for view in views]
+        in_air = [
+            corners
+            for view, corners in zip(views, seen, strict=True)
+            if not view.under_surface and len(corners.points)
+        ]
         matrix, distortion = _single_camera(in_air, side, sizes[side])
-        own = [_board_pose(view.corners(side), matrix, distortion) for view in views]
-        poses.append(own)
-        transform = own[anchor] @ np.linalg.inv(place.T_rig_board)
-        cameras.append(Camera(*sizes[side], matrix, distortion, transform))
-    for side, camera in zip(SIDES, cameras, strict=True):
-        if camera.centre[0] <= phantom.surface_height:
+        transform = _board_pose(seen[anchor], matrix, distortion) @ np.linalg.inv(place.T_rig_board)
+        camera = Camera(*sizes[side], matrix, distortion, transform, window)
+        if window.height(camera.centre) <= 0.0:
             raise UserError(
-                f"the {side} camera comes out below the surface, at x = {camera.centre[0]:.3f} m: "
+                f"the {side} camera comes out below the surface, at "
+                f"{np.round(camera.centre, 3).tolist()} m: "
                 f"the place given for {views[anchor].name} cannot be right"
             )
-    rig_from_left = np.linalg.inv(cameras[0].T_optical_rig)
-    boards = [
-        view.place.T_rig_board if view.place is not None else rig_from_left @ poses[0][i]
-        for i, view in enumerate(views)
-    ]
-    return StereoCalibration(phantom, cameras[0], cameras[1]), np.stack(boards)
+        cameras.append(camera)
+        for i, corners in enumerate(seen):
+            if boards[i] is None and len(corners.points):
+                own = _board_pose(corners, matrix, distortion)
+                boards[i] = np.linalg.inv(transform) @ own
+    poses = [board for board in boards if board is not None]
+    return StereoCalibration(cameras[0], cameras[1]), np.stack(poses)
 
 
 def _single_camera(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Array, Array]:

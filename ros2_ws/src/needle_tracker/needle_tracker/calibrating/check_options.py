@@ -12,7 +12,6 @@ from needle_common.commands.options import CommandParser
 from needle_common.errors import OutOfBoundsError, UserError
 from needle_tracker.calibrating.calibration_check import (
     CAMERAS,
-    CAUSES,
     NOTHING_SHOWN,
     CheckResult,
     Deviation,
@@ -133,10 +132,10 @@ def figures(result: CheckResult) -> dict[str, JsonValue]:
         "problem": "; ".join(result.problems) or None,
     }
     found = {deviation.cause: deviation for deviation in result.deviations}
-    for cause in CAUSES:
+    for cause in result.causes:
         scale, unit, _ = _unit(cause)
         deviation = found.get(cause)
-        key = f"{cause}{'_error' if cause not in CAMERAS else ''}{unit}"
+        key = f"{cause.replace('.', '_')}{'_error' if cause not in CAMERAS else ''}{unit}"
         values[key] = None if deviation is None else scale * deviation.size
         values[f"sigma_{key}"] = None if deviation is None else scale * deviation.sigma
     return values
@@ -149,15 +148,15 @@ def _words(deviation: Deviation) -> str:
     if deviation.cause in CAMERAS:
         side = deviation.cause.split("_")[0]
         return f"{side} camera turned by {size:.4f} +- {sigma:.4f} deg (or moved); {effect}"
-    name = deviation.cause.replace("_", " ")
+    name = deviation.cause.replace("_", " ").replace(".", " ")
     return f"{name} is {size:+.4f} +- {sigma:.4f}{unit} off the calibration's; {effect}"
 
 
 def _unit(cause: str) -> tuple[float, str, str]:
     """Return the factor to a person's unit, the ending of its key, and the unit in words."""
-    if cause in CAMERAS:
+    if cause in CAMERAS or "tilt" in cause:
         return math.degrees(1.0), "_deg", " deg"
-    return (1e3, "_mm", " mm") if cause == "surface_height" else (1.0, "", "")
+    return (1.0, "", "") if cause == "refractive_index" else (1e3, "_mm", " mm")
 
 
 def _parser() -> CommandParser:

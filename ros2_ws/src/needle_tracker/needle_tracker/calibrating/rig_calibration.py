@@ -11,23 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
-from needle_tracker.calibrating.calibration_start import check_views, first_calibration
+from needle_tracker.calibrating.calibration_start import checked_views, first_calibration
 from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
 from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
     LENS,
-    SHARED_PARAMETERS,
+    POSE,
     BoardView,
     RigModel,
-    shared_names,
 )
 from needle_tracker.calibrating.tip_error import tip_error_p95
-from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, Phantom, StereoCalibration
+from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, StereoCalibration
+from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
 # A standard deviation above these, and the parameter is kept at its given value: about 0.04 mm of
-# depth for the phantom's, about a pixel at the image's corner for the lens's (f = 16 mm).
+# depth for the surface's, about a pixel at the image's corner for the lens's (f = 16 mm). A window
+# moved along its normal hardly shows, and hardly moves tips: worse than a ruler tells it is no use.
 LIMITS = {
     "refractive_index": 0.003,
     "surface_height": 0.15e-3,
@@ -35,7 +36,11 @@ LIMITS = {
     "k2": 1.0,
     "p1": 0.003,
     "p2": 0.003,
+    "window_offset": 2e-3,
+    "window_tilt_1": 0.03,
+    "window_tilt_2": 0.03,
 }
+_FIRST_SIGMA_PX = 10.0  # of corners, while cameras and boards come near
 _FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
 
 
@@ -62,7 +67,7 @@ class RigCalibration:
     model : RigModel
         What was fitted.
     parameters : dict of str to Determined
-        By name: `left.fx` ... `right.k3`, `refractive_index`, `surface_height`.
+        By name: `left.fx` ... `right.k3`, and the windows' (`rig_model.window_names`).
     tip_error_p95 : float
         Expected 95 % error of a tip in the phantom from this calibration alone [m].
     """
@@ -96,18 +101,18 @@ class RigCalibration:
 
 
 def calibrate(
-    views: list[BoardView], sizes: dict[str, tuple[int, int]], phantom: Phantom
+    views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
 ) -> RigCalibration:
     """Calibrate the rig from views of a board.
 
     Parameters
     ----------
     views : list of BoardView
-        Held freely in air, on the surface, under it.
+        Held freely in air, on the surface, in the phantom.
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
-    phantom : Phantom
-        The given surface height and refractive index, kept where the views do not tell them.
+    windows : pair of Window
+        Of the left and the right camera, as given; what the views do not tell of them is kept.
 
     Returns
     -------
@@ -119,22 +124,28 @@ def calibrate(
     UserError
         A set of views that does not determine the cameras.
     """
-    check_views(views)
-    start, boards = first_calibration(views, sizes, phantom)
+    views = checked_views(views, windows)
+    start, boards = first_calibration(views, sizes, windows)
     model = RigModel(start, views, boards)
-    names = shared_names()
-    given = _given_values(model.start, phantom)
+    names = list(model.names)
+    given = _given_values(model)
     free = board_parameters_free(model)
-    free[:SHARED_PARAMETERS] = True
+    # The start ignores what refracts: where no board of known place in air holds the cameras, they
+    # and the boards first have to come near.
+    poses = free.copy()
+    poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
+    free[: model.shared] = True
     for side in SIDES:
         free[names.index(f"{side}.k3")] = False
     if not any(view.under_surface for view in views):
-        free[CAMERA_PARAMETERS:SHARED_PARAMETERS] = False
+        free[CAMERA_PARAMETERS : model.shared] = False
     sigmas = dict.fromkeys(names, np.inf)
     parameters = model.start
+    if start.surface is None:
+        parameters = fit(model, parameters, poses, _FIRST_SIGMA_PX).parameters
     while True:
         result = fit(model, parameters, free)
-        fitted = dict(zip(names, result.sigma[:SHARED_PARAMETERS], strict=True))
+        fitted = dict(zip(names, result.sigma[: model.shared], strict=True))
         sigmas.update({name: fitted[name] for i, name in enumerate(names) if free[i]})
         worst = _least_determined(names, result)
         if worst is None:
@@ -156,18 +167,18 @@ def calibrate(
         for i, name in enumerate(names)
         if name.split(".")[-1] in LENS or i >= CAMERA_PARAMETERS
     }
-    shared = result.covariance[:SHARED_PARAMETERS, :SHARED_PARAMETERS]
+    shared = result.covariance[: model.shared, : model.shared]
     return RigCalibration(
         calibration, result, model, determined, tip_error_p95(calibration, covariance=shared)
     )
 
 
-def _given_values(start: Array, phantom: Phantom) -> Array:
-    given = np.zeros(SHARED_PARAMETERS)
-    for i, name in enumerate(shared_names()):
-        if name.split(".")[-1] in ("fx", "fy", "cx", "cy"):
-            given[i] = start[i]
-    given[CAMERA_PARAMETERS:] = (phantom.refractive_index, phantom.surface_height)
+def _given_values(model: RigModel) -> Array:
+    """Return what parameters are kept at: the windows as given, a lens without distortion."""
+    given: Array = model.start[: model.shared].copy()
+    for i, name in enumerate(model.names[:CAMERA_PARAMETERS]):
+        if name.split(".")[-1] not in ("fx", "fy", "cx", "cy"):
+            given[i] = 0.0
     return given
 
 

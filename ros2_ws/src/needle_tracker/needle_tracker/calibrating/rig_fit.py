@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, RigModel
+from needle_tracker.calibrating.rig_model import RigModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -58,7 +58,7 @@ def board_parameters_free(model: RigModel) -> Mask:
     free = np.zeros(len(model.start), dtype=bool)
     for number, view in enumerate(model.views):
         if view.place is None or view.place.sigma > 0.0:
-            first = SHARED_PARAMETERS + 6 * number
+            first = model.shared + 6 * number
             free[first : first + 6] = True
     return free
 
@@ -132,7 +132,7 @@ def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, 
         of its six parameters in standard deviations.
     """
     rows, sigmas = _place_priors(model, result.free)
-    numbers = (rows.reshape(-1, 6)[:, 0] - SHARED_PARAMETERS) // 6
+    numbers = (rows.reshape(-1, 6)[:, 0] - model.shared) // 6
     poses = model.board_poses(result.parameters)
     deviations = []
     for number, pulls in zip(
@@ -204,9 +204,9 @@ def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]
     rows: list[int] = []
     sigmas: list[float] = []
     for number, view in enumerate(model.views):
-        if view.place is None or view.place.sigma <= 0.0:
+        if view.place is None or not 0.0 < view.place.sigma < np.inf:
             continue
-        first = SHARED_PARAMETERS + 6 * number
+        first = model.shared + 6 * number
         if not free[first]:
             continue
         # The place is known by coordinates of its edges: so well is its rotation known.

@@ -3,7 +3,11 @@
 What calibration and its check have in common. Parameters are one vector:
 
     left: fx fy cx cy k1 k2 p1 p2 k3, rotation (3), translation (3); right: likewise;
-    refractive index, surface height; for each view of the board: rotation (3), translation (3).
+    the windows'; for each view of the board: rotation (3), translation (3).
+
+The windows' are refractive index and surface height where both cameras look through one level
+surface, else of each window how far it is moved along its normal and how it is tilted about two
+axes across that; layers and indices are then as given.
 
 Rotations and translations are increments on the transforms that the model starts from. A camera
 turns about its own centre, T_optical_rig = [exp(rotation) | translation] T0; a board about its
@@ -19,21 +23,22 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_tracker.calibrating.calibration_session import Place
-from needle_tracker.optics.calibration import SIDES, Camera, Phantom, StereoCalibration
+from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
 from needle_tracker.optics.camera_model import project_optical
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.window import Window, common_surface, surface_from_above
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LENS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 POSE = ("rx", "ry", "rz", "tx", "ty", "tz")
-PHANTOM = ("refractive_index", "surface_height")
+SURFACE = ("refractive_index", "surface_height")
+WINDOW = ("window_offset", "window_tilt_1", "window_tilt_2")
 _CAMERA = len(LENS) + len(POSE)
 CAMERA_PARAMETERS = 2 * _CAMERA
-SHARED_PARAMETERS = CAMERA_PARAMETERS + len(PHANTOM)
 # Central differences; the model is smooth, so that these are good to 1e-6 relative.
-_STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5}
+_STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,9 +62,15 @@ class BoardView:
         """Return what the camera of one side saw."""
         return self.left if side == "left" else self.right
 
+    def without(self, side: str) -> BoardView:
+        """Return the view as if the camera of one side had seen nothing."""
+        nothing = Corners(np.zeros((0, 3)), np.zeros((0, 2)))
+        left, right = (nothing if s == side else self.corners(s) for s in SIDES)
+        return dataclasses.replace(self, left=left, right=right)
+
     @property
     def under_surface(self) -> bool:
-        """Whether the board was seen through the phantom's surface."""
+        """Whether the board was in the phantom, and so seen through the windows."""
         return self.place is not None and self.place.under_surface
 
 
@@ -69,9 +80,11 @@ def camera_slice(side: str) -> slice:
     return slice(start, start + _CAMERA)
 
 
-def shared_names() -> list[str]:
-    """Return the names of the parameters that all views share, `left.fx` and so on."""
-    return [f"{side}.{name}" for side in SIDES for name in LENS + POSE] + list(PHANTOM)
+def window_names(windows: tuple[Window, Window]) -> tuple[str, ...]:
+    """Return the names of the parameters that these windows have."""
+    if common_surface(*windows) is not None:
+        return SURFACE
+    return tuple(f"{side}.{name}" for side in SIDES for name in WINDOW)
 
 
 class RigModel:
@@ -80,16 +93,30 @@ class RigModel:
     Parameters
     ----------
     start : StereoCalibration
-        Cameras and phantom that the parameters start from.
+        Cameras and windows that the parameters start from.
     views : list of BoardView
         What was seen.
     boards : ndarray, shape (len(views), 4, 4)
         T_rig_board of each view that the parameters start from.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the parameters that all views share, `left.fx` and so on; they come first.
+    shared : int
+        How many these are.
+    start : ndarray, shape (p,)
+        The parameters that it starts from.
     """
 
     def __init__(self, start: StereoCalibration, views: list[BoardView], boards: Array) -> None:
         self.views = views
         self._start = {"left": start.left, "right": start.right}
+        self._windows = (start.left.window, start.right.window)
+        self._surface = start.surface
+        own = tuple(f"{side}.{name}" for side in SIDES for name in LENS + POSE)
+        self.names = own + window_names(self._windows)
+        self.shared = len(self.names)
         self._boards = np.asarray(boards, dtype=np.float64).reshape(-1, 4, 4)
         self._points = {s: _join([v.corners(s).points for v in views], 3) for s in SIDES}
         self.pixels = {s: _join([v.corners(s).pixels for v in views], 2) for s in SIDES}
@@ -99,29 +126,26 @@ class RigModel:
         }
         under = np.array([view.under_surface for view in views], dtype=bool)
         self._under = {s: under[self.view_of[s]] for s in SIDES}
-        self.start = np.zeros(SHARED_PARAMETERS + 6 * len(views))
+        self.start = np.zeros(self.shared + 6 * len(views))
         for side in SIDES:
             camera = self._start[side]
             matrix = camera.camera_matrix
             lens = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *camera.distortion]
             self.start[camera_slice(side)][: len(LENS)] = lens
-        phantom = start.phantom
-        self.start[CAMERA_PARAMETERS:SHARED_PARAMETERS] = (
-            phantom.refractive_index,
-            phantom.surface_height,
-        )
-        letters = [name.split(".")[-1][0] for name in shared_names()] + list("rrrttt") * len(views)
+        if self._surface is not None:
+            height = self._surface.point[0]
+            self.start[CAMERA_PARAMETERS : self.shared] = self._surface.inside, height
+        letters = [name.split(".")[-1][0] for name in self.names] + list("rrrttt") * len(views)
         self._steps = np.array([_STEPS[letter] for letter in letters])
 
     def calibration(self, parameters: Array) -> StereoCalibration:
         """Return the calibration that a parameter vector stands for."""
-        index, height = parameters[CAMERA_PARAMETERS:SHARED_PARAMETERS]
         left, right = (self._camera(parameters, side) for side in SIDES)
-        return StereoCalibration(Phantom(float(height), float(index)), left, right)
+        return StereoCalibration(left, right)
 
     def board_poses(self, parameters: Array) -> Array:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
-        steps = parameters[SHARED_PARAMETERS:].reshape(-1, 6)
+        steps = parameters[self.shared :].reshape(-1, 6)
         return np.stack([moved(b, s) for b, s in zip(self._boards, steps, strict=True)])
 
     def residuals(self, parameters: Array) -> Array:
@@ -137,9 +161,7 @@ class RigModel:
         transform, under = camera.T_optical_rig, self._under[side]
         pixels = project_optical(camera, points @ transform[:3, :3].T + transform[:3, 3])
         if np.any(under):
-            index, height = parameters[CAMERA_PARAMETERS:SHARED_PARAMETERS]
-            phantom = Phantom(float(height), float(index))
-            pixels[under] = RefractedCamera(camera, phantom).project(points[under])
+            pixels[under] = RefractedCamera(camera).project(points[under])
         return pixels
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
@@ -158,14 +180,14 @@ class RigModel:
             first = 0 if side == "left" else count["left"]
             rows = slice(first, first + count[side])
             own = camera_slice(side)
-            shared = [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, SHARED_PARAMETERS)]
+            shared = [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, self.shared)]
             for column in shared:
                 if free[column]:
                     result[rows, column] = -self._slope(parameters, side, [column]).ravel()
             # One board's pose moves that board's corners only: all boards at once.
             boards = self.view_of[side]
             for k in range(6):
-                columns = np.arange(SHARED_PARAMETERS + k, len(parameters), 6)
+                columns = np.arange(self.shared + k, len(parameters), 6)
                 if not np.any(free[columns]):
                     continue
                 slope = self._slope(parameters, side, list(columns))
@@ -190,7 +212,20 @@ class RigModel:
         step[:3, :3] = Rotation.from_rotvec(own[len(LENS) : len(LENS) + 3]).as_matrix()
         step[:3, 3] = own[len(LENS) + 3 :]
         transform = step @ start.T_optical_rig
-        return Camera(start.width, start.height, matrix, own[4:9].copy(), transform)
+        window = self._window(parameters[CAMERA_PARAMETERS : self.shared], SIDES.index(side))
+        return Camera(start.width, start.height, matrix, own[4:9].copy(), transform, window)
+
+    def _window(self, parameters: Array, number: int) -> Window:
+        if self._surface is not None:
+            return surface_from_above(float(parameters[1]), float(parameters[0]))
+        window = self._windows[number]
+        offset, *tilt = parameters.reshape(len(SIDES), -1)[number]
+        # Any two axes across the normal.
+        axes = np.linalg.svd(window.normal[None])[2][1:]
+        turned = Rotation.from_rotvec(np.array(tilt) @ axes).apply(window.normal)
+        return dataclasses.replace(
+            window, point=window.point + offset * window.normal, normal=turned
+        )
 
 
 def moved(transform: Array, step: Array) -> Array:

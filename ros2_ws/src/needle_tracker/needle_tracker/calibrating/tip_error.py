@@ -9,38 +9,52 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_common.errors import UserError
 from needle_tracker.calibrating.calibration_session import Place
-from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, BoardView, Corners, RigModel
-from needle_tracker.optics.calibration import SIDES, StereoCalibration
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
+from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.optics.refraction import stereo_views
 from needle_tracker.tracking.triangulation import midpoint
 
 Array = NDArray[np.float64]
 
-# Where the needle goes, in `rig` [m]: depth below the surface, half width, insertion.
-DEPTHS = (0.002, 0.033)
-HALF_WIDTH = 0.015
+# Where the needle goes, in `rig` [m]: to both sides of its axis, and along it; and so far it keeps
+# behind the windows.
+HALF_HEIGHT, HALF_WIDTH = 0.0155, 0.015
 INSERTIONS = (0.005, 0.120)
+LEAST_DEPTH = 1e-3
 _DRAWS = 400
 _SEED = 0
 
 
-def phantom_points(surface_height: float, counts: tuple[int, int, int] = (4, 3, 5)) -> Array:
+def needle_points(
+    calibration: StereoCalibration, counts: tuple[int, int, int] = (4, 3, 5)
+) -> Array:
     """Return a grid of points where the needle goes, shape (n, 3), in `rig` [m].
 
     Parameters
     ----------
-    surface_height : float
-        x of the surface [m].
+    calibration : StereoCalibration
+        The points are behind both of its windows.
     counts : tuple of int
-        Points along x, y and z.
+        Points along x, y and z; fewer where some would be outside.
+
+    Raises
+    ------
+    UserError
+        No place about the needle's axis is behind both windows.
     """
     axes = (
-        surface_height - np.linspace(*DEPTHS, counts[0]),
+        np.linspace(HALF_HEIGHT, -HALF_HEIGHT, counts[0]),
         np.linspace(-HALF_WIDTH, HALF_WIDTH, counts[1]),
         np.linspace(*INSERTIONS, counts[2]),
     )
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    for camera in (calibration.left, calibration.right):
+        points = points[camera.window.depth(points) >= LEAST_DEPTH]
+    if not len(points):
+        raise UserError("the needle's axis, z of rig, is not in the phantom behind both windows")
+    return points
 
 
 def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
@@ -53,10 +67,8 @@ def tip_shifts(assumed: StereoCalibration, true: StereoCalibration) -> Array:
     true : StereoCalibration
         What the rig really is.
     """
-    points = phantom_points(true.phantom.surface_height)
-    left, right = (
-        RefractedCamera(getattr(true, side), true.phantom).project(points) for side in SIDES
-    )
+    points = needle_points(true)
+    left, right = (view.project(points) for view in stereo_views(true))
     return measured_points(assumed, left, right) - points
 
 
@@ -70,10 +82,7 @@ def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Ar
     left, right : ndarray, shape (n, 2)
         The pixels at which each camera sees them.
     """
-    views = (
-        RefractedCamera(assumed.left, assumed.phantom),
-        RefractedCamera(assumed.right, assumed.phantom),
-    )
+    views = stereo_views(assumed)
     return np.stack([midpoint(views, pair) for pair in zip(left, right, strict=True)])
 
 
@@ -84,31 +93,31 @@ def tip_error_p95(calibration: StereoCalibration, covariance: Array) -> float:
     ----------
     calibration : StereoCalibration
         The calibration.
-    covariance : ndarray, shape (32, 32)
-        Of the parameters that all views share (`rig_model.shared_names`).
+    covariance : ndarray, shape (s, s)
+        Of the parameters that all views share (`RigModel.names`).
     """
     generator = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
-    draws = generator.standard_normal((_DRAWS, SHARED_PARAMETERS)) @ root.T
+    draws = generator.standard_normal((_DRAWS, len(covariance))) @ root.T
     shifts = np.einsum("nij,dj->dni", _tip_slopes(calibration), draws)
     return float(np.percentile(np.linalg.norm(shifts, axis=-1), 95.0))
 
 
 def _tip_slopes(calibration: StereoCalibration) -> Array:
-    """Return d(tip)/d(shared parameters), shape (points, 3, 32).
+    """Return d(tip)/d(shared parameters), shape (points, 3, s).
 
     The pixels stay: J_tip d(tip) + J_parameters d(parameters) = 0, in the least squares sense.
     """
-    points = phantom_points(calibration.phantom.surface_height)
+    points = needle_points(calibration)
     nowhere = Corners(points, np.zeros((len(points), 2)))
     view = BoardView("", Place(np.eye(4), under_surface=True), nowhere, nowhere)
     model = RigModel(calibration, [view], np.eye(4)[None])
     free = np.zeros(len(model.start), dtype=bool)
-    free[:SHARED_PARAMETERS] = True
+    free[: model.shared] = True
     # Residuals are seen minus expected: the sign turns twice.
     by_parameter = model.jacobian(model.start, free).reshape(2, len(points), 2, -1)
-    cameras = [RefractedCamera(getattr(calibration, side), calibration.phantom) for side in SIDES]
+    cameras = stereo_views(calibration)
     slopes = []
     for i, point in enumerate(points):
         by_tip = np.concatenate([camera.jacobian(point) for camera in cameras])

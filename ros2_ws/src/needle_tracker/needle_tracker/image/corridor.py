@@ -41,16 +41,17 @@ def within_corridor(
         lies farther than its half width.
     """
     origins, directions = view.rays(view.project(way))
-    # Where these lines of sight pass the grid's plane, x = 0.
+    facing = np.cross(grid.sideways, [0.0, 0.0, 1.0])
+    # Where these lines of sight pass the grid's plane.
     with np.errstate(invalid="ignore", divide="ignore"):
-        share = -origins[:, 0] / directions[:, 0]
-        places = origins[:, 1:] + share[:, None] * directions[:, 1:]
-    distance = np.hypot(places[:, 0], places[:, 1])
+        places = origins - (origins @ facing / (directions @ facing))[:, None] * directions
+    aside, ahead = places @ grid.sideways, places[:, 2]
+    distance = np.hypot(aside, ahead)
     known = np.flatnonzero(np.isfinite(distance))
     known = known[np.argsort(distance[known])]
     if len(known) == 0:
         return grid
-    angle = np.arctan2(places[known, 0], places[known, 1])
+    angle = np.arctan2(aside[known], ahead[known])
     middle = np.interp(grid.distances, distance[known], angle)
     allowed = np.interp(grid.distances, distance[known], half_widths[known]) / grid.distances
     near = np.abs(grid.angles[None, :] - middle[:, None]) <= allowed[:, None]

@@ -1,5 +1,7 @@
 """Where in an image the needle can be: a polar grid about the entry point, seen by one camera.
 
+The grid lies in the plane through the needle's axis (z of `rig`) that faces the camera's window.
+
 The needle always passes the entry point, and along an arc of radius R the chord turns only half as
 fast as the needle: in polar coordinates about the entry, any reachable needle runs outwards, row by
 row. Outside of the grid (sheath, hole, the phantom's rim) nothing is looked at.
@@ -58,10 +60,12 @@ class SearchGrid:
 
     Attributes
     ----------
+    sideways : ndarray, shape (3,)
+        Unit vector in `rig`: with z it spans the grid's plane.
     distances : ndarray, shape (rows,)
-        Distance of each row from the entry, in the plane x = 0 [m].
+        Distance of each row from the entry [m].
     angles : ndarray, shape (columns,)
-        Angle of each column to z, positive towards y [rad].
+        Angle of each column to z, positive towards `sideways` [rad].
     pixels : ndarray, shape (rows, columns, 2), float32
         Where the camera sees the grid's points.
     reachable : ndarray, shape (rows, columns)
@@ -70,6 +74,7 @@ class SearchGrid:
         Least and largest pixel coordinates of the reachable cells up to each row.
     """
 
+    sideways: Array
     distances: Array
     angles: Array
     pixels: NDArray[np.float32]
@@ -146,7 +151,7 @@ def make_search_grid(
     angle_pitch : float
         Angle between columns [rad].
     parallax_angle : float
-        Room for needles above and below the plane x = 0, which appear displaced sideways [rad].
+        Room for needles before and behind the plane, which appear displaced sideways [rad].
     body_offset : float
         How far the shaft lies beside the tip's path, with a pre-bend of 10 deg over 9 mm [m].
     border_px : int
@@ -163,14 +168,8 @@ def make_search_grid(
     widest = min(float(limit[len(limit) // 4 :].max()), math.radians(75.0))
     half = math.ceil(widest / angle_pitch)
     angles = angle_pitch * np.arange(-half, half + 1)
-    points = np.stack(
-        [
-            np.zeros((len(distances), len(angles))),
-            distances[:, None] * np.sin(angles),
-            distances[:, None] * np.cos(angles),
-        ],
-        axis=-1,
-    )
+    directions = np.sin(angles)[:, None] * view.sideways + np.cos(angles)[:, None] * [0.0, 0.0, 1.0]
+    points = distances[:, None, None] * directions
     pixels = view.project(points)
     camera = view.camera
     with np.errstate(invalid="ignore"):
@@ -186,6 +185,7 @@ def make_search_grid(
     high = np.where(reachable[..., None], pixels32, np.float32(-1e9)).max(axis=1)
     bounds = np.stack([np.minimum.accumulate(low), np.maximum.accumulate(high)], axis=1)
     return SearchGrid(
+        view.sideways,
         np.asarray(distances, dtype=np.float64),
         np.asarray(angles, dtype=np.float64),
         pixels32,

@@ -12,15 +12,19 @@ import yaml
 from numpy.typing import NDArray
 
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
 SIDES = ("left", "right")
 LEAST_BASELINE = 1e-3  # between the cameras [m]
 _DISTORTION_MODEL = "plumb_bob"
+_INDICES = (1.0, 3.0)
+_THICKEST = 0.5  # of a layer [m]
+_LEAST_ASIDE = 0.3  # of a window's normal across the needle's axis
 
 
 @dataclasses.dataclass(frozen=True)
 class Camera:
-    """One calibrated pinhole camera.
+    """One calibrated pinhole camera, and what it looks through.
 
     Attributes
     ----------
@@ -32,6 +36,8 @@ class Camera:
         plumb_bob's k1, k2, p1, p2, k3 [-].
     T_optical_rig : ndarray, shape (4, 4)
         Takes points of `rig` to the camera's optical frame [m].
+    window : Window
+        Where its view enters the body that the needle is in.
     """
 
     width: int
@@ -39,6 +45,7 @@ class Camera:
     camera_matrix: NDArray[np.float64]
     distortion: NDArray[np.float64]
     T_optical_rig: NDArray[np.float64]
+    window: Window
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -48,28 +55,16 @@ class Camera:
 
 
 @dataclasses.dataclass(frozen=True)
-class Phantom:
-    """The refracting body that the needle is in.
-
-    Attributes
-    ----------
-    surface_height : float
-        x of the flat top surface in `rig` [m].
-    refractive_index : float
-        Of the phantom against air [-], at least 1.
-    """
-
-    surface_height: float
-    refractive_index: float
-
-
-@dataclasses.dataclass(frozen=True)
 class StereoCalibration:
-    """Both cameras and the surface they look through."""
+    """Both cameras, each with the window that it looks through."""
 
-    phantom: Phantom
     left: Camera
     right: Camera
+
+    @property
+    def surface(self) -> Window | None:
+        """The level surface that both look through from above; None for windows of their own."""
+        return common_surface(self.left.window, self.right.window)
 
 
 def load_calibration(path: Path) -> StereoCalibration:
@@ -78,7 +73,8 @@ def load_calibration(path: Path) -> StereoCalibration:
     Parameters
     ----------
     path : Path
-        YAML file in the format of docs: `phantom`, `left`, `right`.
+        YAML file in the format of docs/calibration.md: `left` and `right`; `phantom`, or a `window`
+        under each of them.
 
     Returns
     -------
@@ -133,20 +129,53 @@ def parse_calibration(content: Any) -> StereoCalibration:
     UserError
         A value missing, not finite, of the wrong size or out of bounds.
     """
-    surface_height = _number(content, "phantom", "surface_height")
-    refractive_index = _number(content, "phantom", "refractive_index")
-    if not 1.0 <= refractive_index <= 3.0:
-        raise OutOfBoundsError("phantom.refractive_index", refractive_index, 1.0, 3.0, "-")
-    cameras = [_camera(content, side) for side in SIDES]
-    for side, camera in zip(SIDES, cameras, strict=True):
-        if camera.centre[0] <= surface_height:
+    left, right = (
+        _camera(content, side, window)
+        for side, window in zip(SIDES, parse_windows(content), strict=True)
+    )
+    for side, camera in zip(SIDES, (left, right), strict=True):
+        height = float(camera.window.height(camera.centre))
+        if height <= 0.0:
             raise UserError(
-                f"{side} camera is at x = {camera.centre[0]:g} m, not above the surface at "
-                f"{surface_height:g} m"
+                f"{side} camera is not above the surface that it looks through, but "
+                f"{-1e3 * height:.1f} mm beneath: the window's normal points to the camera"
             )
-    if np.linalg.norm(cameras[0].centre - cameras[1].centre) < LEAST_BASELINE:
+    if np.linalg.norm(left.centre - right.centre) < LEAST_BASELINE:
         raise UserError("left and right camera are in the same place: no depth can be measured")
-    return StereoCalibration(Phantom(surface_height, refractive_index), cameras[0], cameras[1])
+    return StereoCalibration(left, right)
+
+
+def parse_windows(content: Any) -> tuple[Window, Window]:
+    """Return the left and the right camera's window: its own, or the phantom's one surface.
+
+    Parameters
+    ----------
+    content : mapping
+        A file's content: `phantom`, or `left` and `right` with a `window` each.
+
+    Raises
+    ------
+    UserError
+        Both or neither, or a value missing, not finite or out of bounds.
+    """
+    top = content if isinstance(content, dict) else {}
+    own = [f"{s}.window" for s in SIDES if isinstance(top.get(s), dict) and "window" in top[s]]
+    if "phantom" in top and own:
+        raise UserError(
+            f"phantom and {' and '.join(own)} contradict each other: take phantom out where each "
+            "camera has a window, or the windows where both look through one level surface"
+        )
+    if own:
+        return _window(content, SIDES[0]), _window(content, SIDES[1])
+    if "phantom" not in top:
+        raise UserError(
+            "phantom is missing, and so are left.window and right.window: give "
+            "phantom for one level surface, or each camera its window"
+        )
+    height = _number(content, "phantom", "surface_height")
+    index = _index(content, "phantom", "refractive_index")
+    surface = surface_from_above(height, index)
+    return surface, surface
 
 
 def yaml_problem(error: yaml.YAMLError) -> str:
@@ -156,7 +185,40 @@ def yaml_problem(error: yaml.YAMLError) -> str:
     return problem if mark is None else f"line {mark.line + 1}: {problem}"
 
 
-def _camera(content: Any, side: str) -> Camera:
+def _window(content: Any, side: str) -> Window:
+    point = _numbers(content, 3, side, "window", "point")
+    normal = _numbers(content, 3, side, "window", "normal")
+    norm = float(np.linalg.norm(normal))
+    if not 0.99 <= norm <= 1.01:
+        raise OutOfBoundsError(f"length of {side}.window.normal", norm, 0.99, 1.01, "-")
+    normal = normal / norm
+    if math.hypot(normal[0], normal[1]) < _LEAST_ASIDE:
+        raise UserError(
+            f"{side}.window.normal = {normal.tolist()} lies along z, the needle's axis: a camera "
+            "sees the needle from aside only"
+        )
+    name = f"{side}.window.layers"
+    layers = _value(content, side, "window", "layers")
+    if not isinstance(layers, list):
+        raise UserError(f"{name} = {layers!r} is not a list (of none: [])")
+    found = []
+    for number, layer in enumerate(layers):
+        entry = {f"{name}[{number}]": layer}
+        thickness = _number(entry, *entry, "thickness")
+        if not 0.0 < thickness <= _THICKEST:
+            raise OutOfBoundsError(f"{name}[{number}].thickness", thickness, 0.0, _THICKEST, "m")
+        found.append(Layer(thickness, _index(entry, *entry, "refractive_index")))
+    return Window(point, normal, tuple(found), _index(content, side, "window", "inside"))
+
+
+def _index(content: Any, *keys: str) -> float:
+    index = _number(content, *keys)
+    if not _INDICES[0] <= index <= _INDICES[1]:
+        raise OutOfBoundsError(".".join(keys), index, *_INDICES, "-")
+    return index
+
+
+def _camera(content: Any, side: str, window: Window) -> Camera:
     width, height = (_size(content, side, key) for key in ("image_width", "image_height"))
     matrix = _numbers(content, 9, side, "camera_matrix", "data").reshape(3, 3)
     fx, fy = matrix[0, 0], matrix[1, 1]
@@ -176,7 +238,7 @@ def _camera(content: Any, side: str) -> Camera:
     transform = np.eye(4)
     transform[:3, :3] = rotation_matrix(quaternion / norm)
     transform[:3, 3] = translation
-    return Camera(width, height, matrix, distortion, transform)
+    return Camera(width, height, matrix, distortion, transform, window)
 
 
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

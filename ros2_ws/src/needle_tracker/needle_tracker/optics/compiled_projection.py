@@ -1,4 +1,4 @@
-"""One point through the refracting surface into one camera, and back: for the tracker's loops.
+"""One point through the refracting window into one camera, and back: for the tracker's loops.
 
 The same model as `refraction`, which serves arrays and documents it; the tests hold the two
 together.
@@ -14,8 +14,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
-from needle_tracker.optics.calibration import Camera, Phantom
+from needle_common.compiled import compiled, inlined
+from needle_tracker.optics.calibration import Camera
 
 Array = NDArray[np.float64]
 
@@ -25,18 +25,90 @@ _UNDISTORTED = 1e-9  # what is inverted so well is, at unit focal length
 _JACOBIAN_STEP = 1e-5  # [m]
 
 
-def pack_camera(camera: Camera, phantom: Phantom) -> Array:
+_LAYERS = 29  # from here on, thickness and index of each layer
+
+
+def foot_and_height(camera: Camera) -> tuple[Array, float]:
+    """Return the point of the window's outer face next to a camera, and how far it is before it.
+
+    Returns
+    -------
+    foot : ndarray, shape (3,)
+        In `rig` [m].
+    height : float
+        [m].
+    """
+    window = camera.window
+    height = float(window.height(camera.centre))
+    offset = camera.centre - window.point
+    return window.point + (offset - height * window.normal), height
+
+
+def pack_camera(camera: Camera) -> Array:
     """Return all that projection needs, as the array that `project_point` takes."""
+    window = camera.window
+    foot, height = foot_and_height(camera)
     return np.concatenate(
         [
             camera.T_optical_rig[:3, :3].reshape(-1),
             camera.T_optical_rig[:3, 3],
-            camera.centre,
+            foot,
             camera.camera_matrix[[0, 1, 0, 1], [0, 1, 2, 2]],
             camera.distortion,
-            [phantom.surface_height, phantom.refractive_index],
+            [height, window.inside],
+            window.normal,
+            *([layer.thickness, layer.refractive_index] for layer in window.layers),
         ]
     )
+
+
+@inlined
+def _crossing(camera: Array, distance: float, depth: float) -> float:
+    """Return how far from the camera's foot, along the window, light crosses the outer face [m].
+
+    The equation is that of `RefractedCamera`. `distance` is the point's from the foot, `depth` how
+    far it is behind the outer face [m].
+    """
+    # The last medium is the one that the point is in.
+    index, end = camera[25], len(camera)
+    shallower = 0.0
+    for i in range(_LAYERS, len(camera), 2):
+        if depth <= camera[i]:
+            index, end = camera[i + 1], i
+            break
+        depth -= camera[i]
+        shallower += camera[i] / camera[i + 1]
+    height = camera[24]
+    low, high = 0.0, distance
+    rho: float = distance * index * height / (index * height + (depth + index * shallower))
+    for _ in range(_ITERATIONS):
+        air2 = rho * rho + height * height
+        air = math.sqrt(air2)
+        sine, bend = rho / air, height * height / (air2 * air)
+        farther = growth = 0.0
+        for i in range(_LAYERS, end, 2):
+            index2 = camera[i + 1] * camera[i + 1]
+            square = index2 - sine * sine
+            root = math.sqrt(square)
+            farther += camera[i] * sine / root
+            growth += camera[i] * index2 / (square * root)
+        rest = distance - rho - farther
+        body2 = rest * rest + depth * depth
+        body = math.sqrt(body2)
+        value = sine - index * rest / body
+        slope = bend + index * depth * depth / (body2 * body) * (1.0 + growth * bend)
+        if value < 0.0:
+            low = rho
+        else:
+            high = rho
+        following = rho - value / slope
+        if not low <= following <= high:
+            following = 0.5 * (low + high)
+        change = abs(following - rho)
+        rho = following
+        if change <= 1e-15 * distance:
+            break
+    return rho
 
 
 @compiled
@@ -52,36 +124,19 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     pixel : ndarray, shape (2,)
         Takes the result; NaN behind the camera.
     """
-    surface, index = camera[24], camera[25]
-    offset_y, offset_z = point[1] - camera[13], point[2] - camera[14]
-    depth = surface - point[0]
+    offset_x, offset_y = point[0] - camera[12], point[1] - camera[13]
+    offset_z = point[2] - camera[14]
+    depth = -(camera[26] * offset_x + camera[27] * offset_y + camera[28] * offset_z)
     target_x, target_y, target_z = point[0], point[1], point[2]
     if depth > 0.0:
-        height = camera[12] - surface
-        distance = math.sqrt(offset_y * offset_y + offset_z * offset_z)
-        low, high = 0.0, distance
-        rho = distance * index * height / (index * height + depth)
-        for _ in range(_ITERATIONS):
-            rest = distance - rho
-            air2, body2 = rho * rho + height * height, rest * rest + depth * depth
-            air, body = math.sqrt(air2), math.sqrt(body2)
-            value = rho / air - index * rest / body
-            slope = height * height / (air2 * air) + index * depth * depth / (body2 * body)
-            if value < 0.0:
-                low = rho
-            else:
-                high = rho
-            following = rho - value / slope
-            if not low <= following <= high:
-                following = 0.5 * (low + high)
-            change = abs(following - rho)
-            rho = following
-            if change <= 1e-15 * distance:
-                break
-        ratio = rho / distance if distance > 0.0 else 1.0
-        target_x = surface
-        target_y = camera[13] + offset_y * ratio
-        target_z = camera[14] + offset_z * ratio
+        along_x = offset_x + depth * camera[26]
+        along_y = offset_y + depth * camera[27]
+        along_z = offset_z + depth * camera[28]
+        distance = math.sqrt(along_y * along_y + along_z * along_z + along_x * along_x)
+        ratio = _crossing(camera, distance, depth) / distance if distance > 0.0 else 1.0
+        target_x = camera[12] + along_x * ratio
+        target_y = camera[13] + along_y * ratio
+        target_z = camera[14] + along_z * ratio
     x = camera[0] * target_x + camera[1] * target_y + camera[2] * target_z + camera[9]
     y = camera[3] * target_x + camera[4] * target_y + camera[5] * target_z + camera[10]
     z = camera[6] * target_x + camera[7] * target_y + camera[8] * target_z + camera[11]
@@ -97,6 +152,19 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     pixel[1] = camera[16] * (y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y) + camera[18]
 
 
+@inlined
+def _refracted(
+    camera: Array, along_x: float, along_y: float, along_z: float, index: float, direction: Array
+) -> float:
+    """Write the unit vector into a medium of an index; return its part along the normal."""
+    x, y, z = along_x / index, along_y / index, along_z / index
+    steep = math.sqrt(1.0 - x * x - y * y - z * z)
+    direction[0] = x - steep * camera[26]
+    direction[1] = y - steep * camera[27]
+    direction[2] = z - steep * camera[28]
+    return steep
+
+
 @compiled
 def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> None:
     """Write the refracted ray that a pixel looks along.
@@ -108,8 +176,8 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
     pixel : ndarray, shape (2,)
         Pixel coordinates.
     origin, direction : ndarray, shape (3,)
-        Take the point of the surface in `rig` [m] and the unit vector into the phantom; NaN for a
-        pixel that does not look down, or where the distortion has no inverse.
+        Take the point of the window's inner face in `rig` [m] and the unit vector into the body;
+        NaN for a pixel that does not look at the window, or where the distortion has no inverse.
     """
     k1, k2, p1, p2, k3 = camera[19], camera[20], camera[21], camera[22], camera[23]
     seen_x = (pixel[0] - camera[17]) / camera[15]
@@ -132,20 +200,27 @@ def pixel_ray(camera: Array, pixel: Array, origin: Array, direction: Array) -> N
         y -= (j_xx * miss_y - j_xy * miss_x) / det
     length = math.sqrt(x * x + y * y + 1.0)
     x, y, z = x / length, y / length, 1.0 / length
-    down = -(camera[0] * x + camera[3] * y + camera[6] * z)
-    if not (down > 0.0 and abs(miss_x) + abs(miss_y) < _UNDISTORTED):
+    air_x = camera[0] * x + camera[3] * y + camera[6] * z
+    air_y = camera[1] * x + camera[4] * y + camera[7] * z
+    air_z = camera[2] * x + camera[5] * y + camera[8] * z
+    inwards = -(camera[26] * air_x + camera[27] * air_y + camera[28] * air_z)
+    if not (inwards > 0.0 and abs(miss_x) + abs(miss_y) < _UNDISTORTED):
         origin[:] = np.nan
         direction[:] = np.nan
         return
-    across = camera[1] * x + camera[4] * y + camera[7] * z
-    along = camera[2] * x + camera[5] * y + camera[8] * z
-    reach = (camera[12] - camera[24]) / down
-    origin[0] = camera[24]
-    origin[1] = camera[13] + reach * across
-    origin[2] = camera[14] + reach * along
-    # Snell: the part along the surface shrinks by the index; unit length gives the rest.
-    direction[1], direction[2] = across / camera[25], along / camera[25]
-    direction[0] = -math.sqrt(1.0 - direction[1] * direction[1] - direction[2] * direction[2])
+    # The part along the window; Snell's law: it shrinks by the index, in each medium anew.
+    along_x = air_x + inwards * camera[26]
+    along_y = air_y + inwards * camera[27]
+    along_z = air_z + inwards * camera[28]
+    reach = camera[24] / inwards
+    origin[0] = camera[12] + reach * along_x
+    origin[1] = camera[13] + reach * along_y
+    origin[2] = camera[14] + reach * along_z
+    for i in range(_LAYERS, len(camera), 2):
+        steep = _refracted(camera, along_x, along_y, along_z, camera[i + 1], direction)
+        for k in range(3):
+            origin[k] += camera[i] / steep * direction[k]
+    _refracted(camera, along_x, along_y, along_z, camera[25], direction)
 
 
 @compiled
@@ -165,13 +240,18 @@ def point_jacobian(camera: Array, point: Array, jacobian: Array) -> None:
 
 @compiled
 def solve_position(
-    cameras: Array, points: Array, axes: Array, sigmas: Array, position: Array, iterations: int
+    cameras: tuple[Array, Array],
+    points: Array,
+    axes: Array,
+    sigmas: Array,
+    position: Array,
+    iterations: int,
 ) -> tuple[int, Array, Array, Array]:
     """Fit a position to two image points, each known across and along its shaft.
 
     Parameters
     ----------
-    cameras : ndarray, shape (2, 26)
+    cameras : pair of ndarray
         From `pack_camera`.
     points : ndarray, shape (2, 2)
         Image points [px].

@@ -1,8 +1,8 @@
-"""A camera that looks through the phantom's flat surface: Snell's law, both ways.
+"""A camera that looks through its window: Snell's law, both ways.
 
-The surface is the plane x = surface_height of `rig`; the camera is above it in air, the phantom
-below. A ray from the camera and its continuation in the phantom lie in one vertical plane, so that
-both directions reduce to that plane.
+The window is a stack of plane-parallel media: air with the camera, layers such as a wall of
+acrylic, then the body with the needle. A ray from the camera and its continuations lie in one plane
+with the window's normal, so that both directions reduce to that plane.
 """
 
 from __future__ import annotations
@@ -10,39 +10,44 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.optics.calibration import Camera, Phantom
+from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.optics.camera_model import optical_rays, project_optical
-from needle_tracker.optics.compiled_projection import pack_camera
+from needle_tracker.optics.compiled_projection import foot_and_height, pack_camera
 
 Array = NDArray[np.float64]
 
 _ROOT_ITERATIONS = 60
-_LEAST_DEPTH = 1e-12  # [m]: keeps Snell's law regular for points that are not below the surface
+_LEAST_DEPTH = 1e-12  # [m]: keeps Snell's law regular for points that are not behind the window
 _JACOBIAN_STEP = 1e-5  # [m]: central differences are then good to about 1e-8 relative
 
 
 class RefractedCamera:
-    """Projection between points of the phantom and pixels of one camera.
+    """Projection between points of the body and pixels of one camera.
 
     Parameters
     ----------
     camera : Camera
-        Calibrated camera, above the surface.
-    phantom : Phantom
-        Surface height and refractive index.
+        Calibrated camera, before its window.
     """
 
-    def __init__(self, camera: Camera, phantom: Phantom) -> None:
+    def __init__(self, camera: Camera) -> None:
         self.camera = camera
-        self.phantom = phantom
-        self._centre = camera.centre
         self._rotation = camera.T_optical_rig[:3, :3]
         self._translation = camera.T_optical_rig[:3, 3]
-        self._camera_height = float(self._centre[0]) - phantom.surface_height
-        self.packed = pack_camera(camera, phantom)
+        self._foot, self._camera_height = foot_and_height(camera)
+        self.packed = pack_camera(camera)
+
+    @property
+    def sideways(self) -> Array:
+        """Unit vector in `rig`, shape (3,), across the needle's axis and the window's normal.
+
+        With the axis, z, it spans the plane through the needle's way that faces this camera.
+        """
+        sideways = np.cross([0.0, 0.0, 1.0], self.camera.window.normal)
+        return np.asarray(sideways / np.linalg.norm(sideways))
 
     def rays(self, pixels: Array) -> tuple[Array, Array]:
-        """Return the refracted rays, in the phantom, that pixels look along.
+        """Return the refracted rays, in the body, that pixels look along.
 
         Parameters
         ----------
@@ -52,19 +57,21 @@ class RefractedCamera:
         Returns
         -------
         origins : ndarray, shape (..., 3)
-            Where the rays enter the phantom: points of the surface in `rig` [m].
+            Where the rays enter the body: points of the window's inner face in `rig` [m].
         directions : ndarray, shape (..., 3)
-            Unit directions in `rig`, downwards (x < 0). NaN for a pixel that does not look down.
+            Unit directions in `rig`, inwards. NaN for a pixel that does not look at the window.
         """
+        window = self.camera.window
         air = optical_rays(self.camera, np.asarray(pixels, dtype=np.float64)) @ self._rotation
-        down = np.where(air[..., 0] < 0.0, -air[..., 0], np.nan)
-        origins = self._centre + air * (self._camera_height / down)[..., None]
-        origins[..., 0] = self.phantom.surface_height
-        # Snell: the part along the surface shrinks by the index; unit length gives the rest.
-        directions = air / self.phantom.refractive_index
-        along2 = directions[..., 1] ** 2 + directions[..., 2] ** 2
-        directions[..., 0] = -np.sqrt(1.0 - along2) * np.where(np.isnan(down), np.nan, 1.0)
-        return origins, directions
+        inwards = -(air @ window.normal)
+        inwards = np.where(inwards > 0.0, inwards, np.nan)[..., None]
+        # The part along the window; Snell's law: it shrinks by the index, in each medium anew.
+        along = air + inwards * window.normal
+        origins = self._foot + along * (self._camera_height / inwards)
+        for layer in window.layers:
+            steep = _into(along / layer.refractive_index, window.normal)
+            origins = origins + steep * (layer.thickness / -(steep @ window.normal))[..., None]
+        return origins, _into(along / window.inside, window.normal)
 
     def project(self, points: Array) -> Array:
         """Return the pixels at which points are seen.
@@ -72,7 +79,7 @@ class RefractedCamera:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; above the surface they are seen straight.
+            Points in `rig` [m]; before the window they are seen straight.
 
         Returns
         -------
@@ -80,14 +87,15 @@ class RefractedCamera:
             Pixel coordinates, also outside the image; NaN behind the camera.
         """
         points = np.asarray(points, dtype=np.float64)
-        offset = points - self._centre
-        distance = np.hypot(offset[..., 1], offset[..., 2])
-        depth = self.phantom.surface_height - points[..., 0]
-        crossing = self._crossing(distance, np.maximum(depth, _LEAST_DEPTH))
+        normal = self.camera.window.normal
+        offset = points - self._foot
+        depth = -(offset @ normal)
+        along = offset + depth[..., None] * normal
+        distance = np.hypot(np.hypot(along[..., 0], along[..., 1]), along[..., 2])
+        crossing = self._crossing(distance, depth)
         ratio = np.divide(crossing, distance, out=np.ones_like(distance), where=distance > 0.0)
-        # The point of the surface through which the camera sees the point.
-        target = self._centre + offset * ratio[..., None]
-        target[..., 0] = self.phantom.surface_height
+        # The point of the outer face through which the camera sees the point.
+        target = self._foot + along * ratio[..., None]
         target = np.where((depth > 0.0)[..., None], target, points)
         return project_optical(self.camera, target @ self._rotation.T + self._translation)
 
@@ -98,20 +106,38 @@ class RefractedCamera:
         return np.asarray((pixels[:3] - pixels[3:]).T / (2.0 * _JACOBIAN_STEP))
 
     def _crossing(self, distance: Array, depth: Array) -> Array:
-        """Return how far from the camera's foot, along the surface, the light path crosses it.
+        """Return how far from the camera's foot, along the window, light crosses the outer face.
 
-        Snell's law in the vertical plane, rho the wanted distance:
-        rho / sqrt(rho^2 + h^2) = n (D - rho) / sqrt((D - rho)^2 + d^2).
-        The difference of the sides increases with rho and has one root in [0, D].
+        Snell's law in the plane of incidence, rho the wanted distance, s = rho / sqrt(rho^2 + h^2)
+        the sine in air: a layer takes the light t s / sqrt(n_i^2 - s^2) farther, and in the last
+        medium, of index n, the rest r = D - rho - ... over the depth d wants s = n r / sqrt(r^2 +
+        d^2). The difference of the sides increases with rho and has one root in [0, D].
+
+        Parameters
+        ----------
+        distance : ndarray, shape (...)
+            D: of the point from the camera's foot, along the window [m].
+        depth : ndarray, shape (...)
+            Of the point behind the outer face [m].
         """
-        index, height = self.phantom.refractive_index, self._camera_height
+        passed, index, depth = self._media(depth)
+        height = self._camera_height
         low, high = np.zeros_like(distance), np.array(distance)
-        rho = distance * index * height / (index * height + depth)
+        apparent = depth + index * sum(t / n for t, n in passed)
+        rho = distance * index * height / (index * height + apparent)
         for _ in range(_ROOT_ITERATIONS):
-            rest = distance - rho
-            air, body = np.hypot(rho, height), np.hypot(rest, depth)
-            value = rho / air - index * rest / body
-            slope = height**2 / air**3 + index * depth**2 / body**3
+            air = np.hypot(rho, height)
+            sine = rho / air
+            farther, growth = np.zeros_like(rho), np.zeros_like(rho)
+            for thickness, layer_index in passed:
+                square = layer_index**2 - sine**2
+                farther += thickness * sine / np.sqrt(square)
+                growth += thickness * layer_index**2 / (square * np.sqrt(square))
+            rest = distance - rho - farther
+            body = np.hypot(rest, depth)
+            value = sine - index * rest / body
+            bend = height**2 / air**3
+            slope = bend + index * depth**2 / body**3 * (1.0 + growth * bend)
             low = np.where(value < 0.0, rho, low)
             high = np.where(value > 0.0, rho, high)
             newton = rho - value / slope
@@ -122,3 +148,37 @@ class RefractedCamera:
             if not np.any(change > 1e-15 * distance):
                 break
         return rho
+
+    def _media(self, depth: Array) -> tuple[list[tuple[Array, float]], Array, Array]:
+        """Return what light passes on its way to points so deep behind the outer face [m].
+
+        Returns
+        -------
+        passed : list of (ndarray, float)
+            Of each layer, how much of it is passed [m]: all or nothing; and its index.
+        index : ndarray, shape (...)
+            Of the medium that the point is in.
+        depth : ndarray, shape (...)
+            How deep the point is in that medium [m].
+        """
+        window = self.camera.window
+        index = np.full_like(depth, window.inside)
+        passed = []
+        arrives = np.ones(depth.shape, dtype=bool)
+        for layer in window.layers:
+            passes = arrives & (depth > layer.thickness)
+            index = np.where(arrives & ~passes, layer.refractive_index, index)
+            passed.append((np.where(passes, layer.thickness, 0.0), layer.refractive_index))
+            depth = np.where(passes, depth - layer.thickness, depth)
+            arrives = passes
+        return passed, index, np.maximum(depth, _LEAST_DEPTH)
+
+
+def stereo_views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
+    """Return the left and the right camera of a calibration."""
+    return RefractedCamera(calibration.left), RefractedCamera(calibration.right)
+
+
+def _into(sines: Array, normal: Array) -> Array:
+    """Return the unit directions (..., 3) into a medium, of their parts along the window."""
+    return np.asarray(sines - np.sqrt(1.0 - np.sum(sines**2, axis=-1))[..., None] * normal)

@@ -56,7 +56,7 @@ class TrackerMessages:
         self._cameras = {"left": calibration.left, "right": calibration.right}
         self.answers = PairAnswers(
             calibration,
-            parameters.tracker_settings(calibration.phantom),
+            parameters.tracker_settings(calibration),
             parameters.answering_settings(),
         )
         self.health = Health()

@@ -53,7 +53,7 @@ _FITTING = 9.0  # squared, over the covariance: place and direction of what one 
 _AGREE = 1e-3  # two views that say the same do so along the needle, too [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
 _GRID_AHEAD = 1.5e-3
-_GRID_MARGIN = 3e-3  # needles off the plane x = 0 appear displaced along the grid [m]
+_GRID_MARGIN = 3e-3  # needles off the grid's plane appear displaced along it [m]
 
 
 class Acquisition:

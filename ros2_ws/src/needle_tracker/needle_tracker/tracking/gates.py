@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.image.search_grid import Reach
+from needle_tracker.optics.window import Window
 from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -23,8 +24,8 @@ class GateSettings:
     ----------
     reach : Reach
         What the needle can do.
-    surface_height : float
-        x of the phantom's surface [m].
+    windows : tuple of Window
+        What the cameras look through: the needle is behind each of them.
     least_distance : float
         Least distance from the entry at which a tip can be seen [m].
     tip_lean : float
@@ -50,7 +51,7 @@ class GateSettings:
     """
 
     reach: Reach
-    surface_height: float
+    windows: tuple[Window, ...]
     least_distance: float
     tip_lean: float
     insertion_margin: float
@@ -91,7 +92,10 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
         (tip.disagreement > settings.max_disagreement, Refusal.DISAGREE_ALONG),
         (tip.disagreement_across > settings.max_miss_px, Refusal.DISAGREE_ACROSS),
         (largest_sigma > settings.max_depth_sigma, Refusal.UNCERTAIN),
-        (tip.position[0] > settings.surface_height, Refusal.ABOVE_SURFACE),
+        (
+            any(window.depth(tip.position) < 0.0 for window in settings.windows),
+            Refusal.OUTSIDE,
+        ),
         (distance < settings.least_distance, Refusal.NEAR_ENTRY),
         (distance > reach.length + margin, Refusal.BEYOND_REACH),
         (

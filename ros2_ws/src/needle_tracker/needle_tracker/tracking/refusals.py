@@ -16,7 +16,7 @@ class Refusal(str, enum.Enum):
     DISAGREE_ALONG = "views disagree along the needle"
     DISAGREE_ACROSS = "views disagree across the needle"
     UNCERTAIN = "too uncertain"
-    ABOVE_SURFACE = "above the surface"
+    OUTSIDE = "outside the phantom"
     NEAR_ENTRY = "too close to the entry"
     BEYOND_REACH = "beyond the longest insertion"
     OUTSIDE_CONE = "outside the reachable cone"

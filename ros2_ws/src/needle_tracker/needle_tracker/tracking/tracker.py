@@ -15,7 +15,7 @@ from needle_tracker.image.detection import DetectionSettings, Image
 from needle_tracker.image.looks import LINE_LOOKS, Look
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
-from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 from needle_tracker.tracking.acquisition import Acquisition
 from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, VisibilityAverage, is_sound
 from needle_tracker.tracking.following import (
@@ -69,10 +69,7 @@ class StereoTracker:
         cv2.setNumThreads(1)
         cameras = (calibration.left, calibration.right)
         self.settings = settings
-        self.views = (
-            RefractedCamera(cameras[0], calibration.phantom),
-            RefractedCamera(cameras[1], calibration.phantom),
-        )
+        self.views = stereo_views(calibration)
         self._detection = (self._look(self.views[0]), self._look(self.views[1]))
         self._follower = Follower(
             self.views,
@@ -320,7 +317,8 @@ class StereoTracker:
     def _look(self, view: RefractedCamera) -> DetectionSettings:
         settings = self.settings
         middle = np.array([0.0, 0.0, 0.5 * settings.gates.reach.length])
-        pixels_per_metre = float(np.linalg.norm(view.jacobian(middle)[:, 1:], axis=0).mean())
+        facing = np.stack([view.sideways, [0.0, 0.0, 1.0]], axis=-1)
+        pixels_per_metre = float(np.linalg.norm(view.jacobian(middle) @ facing, axis=0).mean())
         return DetectionSettings(
             bright=settings.bright,
             needle_width_px=settings.needle_width * pixels_per_metre,

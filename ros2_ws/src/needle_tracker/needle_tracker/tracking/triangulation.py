@@ -100,7 +100,7 @@ def triangulate(
     Returns
     -------
     SpatialTip or None
-        None where the two views do not determine a point (or one above the surface).
+        None where the two views do not determine a point.
     """
     position = midpoint(views, (tips[0].point, tips[1].point))
     if not np.all(np.isfinite(position)):
@@ -111,7 +111,7 @@ def triangulate(
     sigmas = np.array([s for tip in tips for s in (tip.sigma_across, tip.sigma_along)])
     position = np.array(position)
     converged, normal, residual, jacobians = solve_position(
-        np.stack([view.packed for view in views]),
+        (views[0].packed, views[1].packed),
         np.stack([tip.point for tip in tips]),
         axes,
         sigmas,

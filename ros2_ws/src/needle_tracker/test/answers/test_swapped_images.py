@@ -44,7 +44,7 @@ class Looks:
     """A tracker and what suspects beside it."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
-        settings = default_settings(calibration.phantom)
+        settings = default_settings(calibration)
         self.tracker = StereoTracker(calibration, settings)
         self.watch = SwapWatch(calibration, settings)
         self.ever = False
@@ -106,7 +106,7 @@ def test_it_is_over_when_the_cameras_are_exchanged(looks: Looks, calibration_pat
 def test_the_answers_stay_as_they_are(
     calibration: StereoCalibration, calibration_path: Path
 ) -> None:
-    settings = default_settings(calibration.phantom)
+    settings = default_settings(calibration)
     alone = StereoTracker(calibration, settings)
     answers = PairAnswers(calibration, settings, PairingSettings(0, 0.2, 0.0))
     for k, (insertion, left, right) in enumerate(pairs(calibration_path, "heavy_clutter", 1), 1):

@@ -15,12 +15,18 @@ from scipy.spatial.transform import Rotation
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.calibrating.rig_model import BoardView, Corners
+from needle_tracker.optics.window import Window, surface_from_above
 
 Array = NDArray[np.float64]
 
 SIDES = ("left", "right")
 BOARD = CharucoBoard()
 SIZE = (1024, 768)
+
+
+def given(height: float, index: float) -> tuple[Window, Window]:
+    """What a session file says of the phantom that both cameras look through."""
+    return surface_from_above(height, index), surface_from_above(height, index)
 
 
 def board_image(square_px: int) -> NDArray[np.uint8]:

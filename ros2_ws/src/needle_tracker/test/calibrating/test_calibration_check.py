@@ -13,9 +13,9 @@ from needle_tracker.calibrating.calibration_check import CheckResult, check
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.rig_calibration import calibrate
 from needle_tracker.calibrating.rig_model import BoardView
-from needle_tracker.optics.calibration import SIDES, Phantom, load_calibration
+from needle_tracker.optics.calibration import SIDES, load_calibration
 
-from .synthetic_rig import SIZE, TrueRig, flat_pose, free_pose, scatter, take
+from .synthetic_rig import SIZE, TrueRig, flat_pose, free_pose, given, scatter, take
 
 LIMIT = 0.15e-3
 SIGMA = 2e-5
@@ -52,7 +52,7 @@ def test_a_good_calibration_passes(calibration_path: Path, rig: TrueRig, seed: i
 
 def test_a_calibration_from_images_passes(rig: TrueRig) -> None:
     views = take(rig, np.random.default_rng(7))
-    calibration = calibrate(views, dict.fromkeys(SIDES, SIZE), Phantom(0.0175, 1.33)).calibration
+    calibration = calibrate(views, dict.fromkeys(SIDES, SIZE), given(0.0175, 1.33)).calibration
     result = check(calibration, target(rig, 8), LIMIT)
     assert result.ok, result.problems
 

@@ -58,7 +58,7 @@ def test_from_images_to_a_calibration_that_its_check_accepts(
     for line in ("left camera, under boards", "surface_height: 17.", "left.k3: not asked"):
         assert line in text
     calibration = load_calibration(output)
-    assert calibration.phantom.refractive_index == pytest.approx(1.3, abs=0.003)
+    assert calibration.left.window.inside == pytest.approx(1.3, abs=0.003)
     for picture in ("rig.rig.png", "rig.residuals.png"):
         image = cv2.imread(str(tmp_path / picture))
         assert image is not None

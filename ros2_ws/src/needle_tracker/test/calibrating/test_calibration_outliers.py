@@ -12,9 +12,8 @@ from needle_common.errors import UserError
 from needle_tracker.calibrating.calibration_outliers import doubts, square_error
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import BoardView, Corners
-from needle_tracker.optics.calibration import Phantom
 
-from .synthetic_rig import SIDES, SIZE, TrueRig, take
+from .synthetic_rig import SIDES, SIZE, TrueRig, given, take
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +22,7 @@ def views(calibration_path: Path) -> list[BoardView]:
 
 
 def calibrated(views: list[BoardView]) -> RigCalibration:
-    return calibrate(views, dict.fromkeys(SIDES, SIZE), Phantom(0.0175, 1.3))
+    return calibrate(views, dict.fromkeys(SIDES, SIZE), given(0.0175, 1.3))
 
 
 def said_larger(view: BoardView, share: float) -> BoardView:

@@ -14,11 +14,11 @@ from needle_tracker.calibrating.calibration_start import first_calibration
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
 from needle_tracker.calibrating.tip_error import measured_points
-from needle_tracker.optics.calibration import SIDES, Phantom, StereoCalibration, load_calibration
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 
-from .synthetic_rig import SIZE, TrueRig, free_pose, take
+from .synthetic_rig import SIZE, TrueRig, free_pose, given, take
 
-GIVEN = Phantom(0.0175, 1.33)
+GIVEN = given(0.0175, 1.33)
 SIZES = dict.fromkeys(SIDES, SIZE)
 
 
@@ -69,8 +69,9 @@ def test_what_it_says_of_itself_is_true(rig: TrueRig, result: RigCalibration) ->
 
 def test_without_a_board_under_the_surface_nothing_is_invented(rig: TrueRig) -> None:
     views = take(rig, np.random.default_rng(1), free=8, under=False)
-    phantom = calibrate(views, SIZES, Phantom(0.0175, 1.37)).calibration.phantom
-    assert (phantom.surface_height, phantom.refractive_index) == (0.0175, 1.37)
+    surface = calibrate(views, SIZES, given(0.0175, 1.37)).calibration.surface
+    assert surface is not None
+    assert (surface.point[0], surface.inside) == (0.0175, 1.37)
 
 
 def test_one_flat_board_does_not_tell_index_from_height(rig: TrueRig) -> None:
@@ -79,7 +80,7 @@ def test_one_flat_board_does_not_tell_index_from_height(rig: TrueRig) -> None:
         for view in take(rig, np.random.default_rng(2), free=8)
         if not view.under_surface or view.name == "under_deep"
     ]
-    result = calibrate(views, SIZES, Phantom(0.0175, 1.33))
+    result = calibrate(views, SIZES, given(0.0175, 1.33))
     height, index = (result.parameters[n] for n in ("surface_height", "refractive_index"))
     assert height.kept
     assert height.value == 0.0175
@@ -100,7 +101,7 @@ def test_outliers_do_not_bend_it(rig: TrueRig) -> None:
 
 def test_the_jacobian_is_that_of_the_residuals(rig: TrueRig) -> None:
     views = take(rig, np.random.default_rng(4), free=6, noise=0.0)
-    start, boards = first_calibration(views, SIZES, Phantom(0.0175, 1.3))
+    start, boards = first_calibration(views, SIZES, given(0.0175, 1.3))
     model = RigModel(start, views, boards)
     everything = np.ones(len(model.start), dtype=bool)
     jacobian = model.jacobian(model.start, everything)
@@ -115,9 +116,8 @@ def test_the_file_written_is_the_calibration_read(result: RigCalibration, tmp_pa
     path = tmp_path / "rig.yaml"
     save_calibration(path, result.calibration, ["made by a test"])
     read = load_calibration(path)
-    assert read.phantom.refractive_index == pytest.approx(
-        result.calibration.phantom.refractive_index, abs=1e-6
-    )
+    assert read.surface is not None
+    assert read.surface.inside == pytest.approx(result.calibration.left.window.inside, abs=1e-6)
     for side in SIDES:
         was, is_now = getattr(result.calibration, side), getattr(read, side)
         np.testing.assert_allclose(is_now.T_optical_rig, was.T_optical_rig, atol=1e-9)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_tracker.calibrating.rig_model import SHARED_PARAMETERS, RigModel, shared_names
+from needle_tracker.calibrating.rig_model import RigModel
 from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
 from needle_tracker.optics.calibration import StereoCalibration
 
@@ -16,11 +16,11 @@ def test_the_expected_error_is_that_of_tips_triangulated_with_it(
     calibration: StereoCalibration, name: str, step: float
 ) -> None:
     model = RigModel(calibration, [], np.zeros((0, 4, 4)))
-    column = shared_names().index(name)
+    column = model.names.index(name)
     parameters = model.start.copy()
     parameters[column] += step
     shifts = np.linalg.norm(tip_shifts(model.calibration(parameters), calibration), axis=-1)
-    covariance = np.zeros((SHARED_PARAMETERS, SHARED_PARAMETERS))
+    covariance = np.zeros((model.shared, model.shared))
     covariance[column, column] = step**2
     normal = np.abs(np.random.default_rng(1).standard_normal((4000, 1)))
     expected = np.percentile(normal * shifts, 95.0)

@@ -22,6 +22,7 @@ def small_grid(rows: int, columns: int, *, angle_pitch: float) -> SearchGrid:
     low = np.minimum.accumulate(pixels.min(axis=1))
     high = np.maximum.accumulate(pixels.max(axis=1))
     return SearchGrid(
+        np.array([0.0, 1.0, 0.0]),
         np.asarray(4e-3 + 0.5e-3 * np.arange(rows), dtype=np.float64),
         np.asarray(angle_pitch * (np.arange(columns) - columns // 2), dtype=np.float64),
         pixels,

@@ -23,7 +23,7 @@ def content(calibration_path: Path) -> Any:
 
 def test_cameras_look_down_from_above_the_surface(calibration_path: Path) -> None:
     calibration = load_calibration(calibration_path)
-    assert calibration.left.centre[0] > calibration.phantom.surface_height
+    assert calibration.left.window.height(calibration.left.centre) > 0.0
     viewing = calibration.left.T_optical_rig[2, :3]
     assert viewing[0] < -0.9
 
@@ -113,6 +113,86 @@ def test_bad_content_is_named(
         load_calibration(path)
     assert "\n" not in str(caught.value)
     assert str(path) in str(caught.value)
+
+
+@pytest.fixture
+def own_windows(calibration_path: Path) -> Any:
+    path = calibration_path.with_name("calibration_top_and_side.yaml")
+    return yaml.safe_load(path.read_text(encoding="utf-8"))
+
+
+def test_the_one_surface_is_both_windows(content: Any) -> None:
+    calibration = parse_calibration(content)
+    for camera in (calibration.left, calibration.right):
+        assert camera.window.point.tolist() == [0.0175, 0.0, 0.0]
+        assert camera.window.normal.tolist() == [1.0, 0.0, 0.0]
+        assert (camera.window.layers, camera.window.inside) == ((), 1.3)
+    assert calibration.surface is calibration.left.window
+    # Said of each camera, it is the same surface.
+    del content["phantom"]
+    window = {"point": [0.0175, 0.1, 0.2], "normal": [1, 0, 0], "layers": [], "inside": 1.3}
+    for side in ("left", "right"):
+        content[side]["window"] = window
+    surface = parse_calibration(content).surface
+    assert surface is not None
+    assert (surface.point[0], surface.inside) == (0.0175, 1.3)
+
+
+def test_windows_are_read_as_they_stand(own_windows: Any) -> None:
+    calibration = parse_calibration(own_windows)
+    assert calibration.surface is None
+    window = calibration.right.window
+    assert window.point.tolist() == [0.0, 0.035, 0.0625]
+    assert window.normal[1] == pytest.approx(0.99998, abs=1e-5)
+    assert [(layer.thickness, layer.refractive_index) for layer in window.layers] == [(0.005, 1.49)]
+    assert window.inside == 1.34
+    # 500 mm before the outer faces.
+    for camera in (calibration.left, calibration.right):
+        assert float(camera.window.height(camera.centre)) == pytest.approx(0.5, abs=1e-3)
+
+
+def put(*keys: Any) -> Callable[[Any], None]:
+    """Return what sets the value at the last key but one to the last."""
+
+    def change(content: Any) -> None:
+        for key in keys[:-2]:
+            content = content[key]
+        content[keys[-2]] = keys[-1]
+
+    return change
+
+
+def _no_window(content: Any) -> None:
+    for side in ("left", "right"):
+        del content[side]["window"]
+
+
+def _one_window(content: Any) -> None:
+    del content["right"]["window"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "named"),
+    [
+        (put("phantom", {"surface_height": 0.01, "refractive_index": 1.3}), "take phantom out"),
+        (_no_window, "phantom is missing.*give phantom .*or each camera its window"),
+        (_one_window, "right.window.point is missing"),
+        (put("left", "window", "normal", [2.0, 0.0, 0.0]), "length of left.window.normal"),
+        (put("left", "window", "normal", [0.0, 0.1, 0.995]), "needle's axis"),
+        (put("left", "window", "normal", [-1.0, 0.0, 0.0]), "normal points to the camera"),
+        (put("left", "window", "layers", None), "layers = None is not a list"),
+        (put("left", "window", "layers", [{"thickness": 0.005}]), "layers.0..refractive_index"),
+        (put("right", "window", "layers", 0, "thickness", -1e-3), "layers.0..thickness"),
+        (put("right", "window", "layers", 0, "thickness", 5), "right.window.layers.0..thickness"),
+        (put("right", "window", "inside", 0.9), "right.window.inside"),
+        (put("right", "window", "point", [0.0, 0.035]), "right.window.point wants 3 numbers"),
+    ],
+)
+def test_bad_windows_are_named(own_windows: Any, spoil: Callable[[Any], None], named: str) -> None:
+    spoil(own_windows)
+    with pytest.raises(UserError, match=named) as caught:
+        parse_calibration(own_windows)
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["", "[1, 2]", "{a: [", "phantom: 3"])

@@ -8,17 +8,24 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_tracker.optics.calibration import Phantom, StereoCalibration
+from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.optics.camera_model import distort, optical_rays, project_optical, undistort
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.window import surface_from_above
 
 Views = tuple[RefractedCamera, RefractedCamera]
+
+
+def dry(camera: Camera) -> RefractedCamera:
+    """Return a camera whose window refracts nothing."""
+    window = surface_from_above(float(camera.window.point[0]), 1.0)
+    return RefractedCamera(dataclasses.replace(camera, window=window))
 
 
 @pytest.fixture
 def points(calibration: StereoCalibration) -> np.ndarray:
     rng = np.random.default_rng(0)
-    top = calibration.phantom.surface_height
+    top = calibration.left.window.point[0]
     return rng.uniform([-top, -0.05, 0.0], [top - 1e-4, 0.05, 0.12], (500, 3))
 
 
@@ -43,15 +50,15 @@ def test_projection_agrees_with_opencv(calibration: StereoCalibration, points: n
     own = project_optical(camera, points @ pose[:3, :3].T + pose[:3, 3])
     np.testing.assert_allclose(own, expected.reshape(-1, 2), atol=1e-9)
     # An index of 1 is no surface at all.
-    air = RefractedCamera(camera, Phantom(calibration.phantom.surface_height, 1.0))
+    air = dry(calibration.left)
     np.testing.assert_allclose(air.project(points), expected.reshape(-1, 2), atol=1e-8)
 
 
 def test_points_above_the_surface_are_seen_straight(
     calibration: StereoCalibration, views: Views
 ) -> None:
-    above = np.array([[calibration.phantom.surface_height + 0.01, 0.01, 0.05]])
-    air = RefractedCamera(calibration.left, Phantom(-1.0, 1.0))
+    above = np.array([[calibration.left.window.point[0] + 0.01, 0.01, 0.05]])
+    air = dry(calibration.left)
     np.testing.assert_allclose(views[0].project(above), air.project(above), atol=1e-9)
 
 
@@ -65,10 +72,10 @@ def test_rays_obey_snells_law(calibration: StereoCalibration, views: Views) -> N
     view = views[1]
     origins, body = view.rays(pixels)
     air = optical_rays(view.camera, pixels) @ view.camera.T_optical_rig[:3, :3]
-    np.testing.assert_allclose(origins[:, 0], calibration.phantom.surface_height, atol=1e-15)
+    np.testing.assert_allclose(origins[:, 0], calibration.left.window.point[0], atol=1e-15)
     np.testing.assert_allclose(
         np.cross(normal, air),
-        calibration.phantom.refractive_index * np.cross(normal, body),
+        calibration.left.window.inside * np.cross(normal, body),
         atol=1e-14,
     )
     assert np.all(body[:, 0] < 0.0)
@@ -77,18 +84,19 @@ def test_rays_obey_snells_law(calibration: StereoCalibration, views: Views) -> N
 def test_ignoring_refraction_costs_millimetres(
     calibration: StereoCalibration, points: np.ndarray
 ) -> None:
-    air = RefractedCamera(calibration.left, dataclasses.replace(calibration.phantom))
-    dry = RefractedCamera(calibration.left, Phantom(calibration.phantom.surface_height, 1.0))
+    wet = RefractedCamera(calibration.left)
     deep = points[points[:, 0] < -0.01]
-    assert np.linalg.norm(air.project(deep) - dry.project(deep), axis=-1).max() > 1.0
+    assert (
+        np.linalg.norm(wet.project(deep) - dry(calibration.left).project(deep), axis=-1).max() > 1.0
+    )
 
 
 def test_a_point_straight_below_the_camera_is_seen_straight(
     calibration: StereoCalibration, views: Views
 ) -> None:
     below = views[0].camera.centre * [0.0, 1.0, 1.0]
-    dry = RefractedCamera(calibration.left, Phantom(calibration.phantom.surface_height, 1.0))
-    np.testing.assert_allclose(views[0].project(below), dry.project(below), atol=1e-9)
+    straight = dry(calibration.left).project(below)
+    np.testing.assert_allclose(views[0].project(below), straight, atol=1e-9)
 
 
 def test_jacobian_predicts_small_moves(views: Views) -> None:

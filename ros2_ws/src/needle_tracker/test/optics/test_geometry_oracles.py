@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 from scipy.optimize import root
 
-from needle_tracker.optics.calibration import Camera, Phantom, StereoCalibration
+from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.optics.compiled_projection import pixel_ray, project_point
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.optics.window import surface_from_above
 
 # aquacal's world has z down into the water: x = rig y, y = -rig z, z = -rig x.
 R_AQUACAL_RIG = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]])
@@ -33,19 +34,19 @@ class Rig:
 
 def bench_rig(calibration: StereoCalibration, side: str) -> Rig:
     camera = calibration.left if side == "left" else calibration.right
-    top = calibration.phantom.surface_height
+    top = camera.window.point[0]
     points = np.random.default_rng(0).uniform(
         [-top, -0.05, 0.0], [top - 1e-4, 0.05, 0.12], (200, 3)
     )
-    return Rig(RefractedCamera(camera, calibration.phantom), points)
+    return Rig(RefractedCamera(camera), points)
 
 
 def random_rig(seed: int) -> Rig:
     """Return a rig of another kind: up to 45 deg oblique, index 1.05 to 1.6, 0.1 to 1.5 m away."""
     rng = np.random.default_rng(seed)
-    phantom = Phantom(float(rng.uniform(-0.1, 0.1)), float(rng.uniform(1.05, 1.6)))
+    window = surface_from_above(float(rng.uniform(-0.1, 0.1)), float(rng.uniform(1.05, 1.6)))
     distance, tilt, round_about = rng.uniform([0.1, 0.0, 0.0], [1.5, 0.8, 2.0 * np.pi])
-    target = np.array([phantom.surface_height, *rng.uniform(-0.1, 0.1, 2)])
+    target = np.array([window.point[0], *rng.uniform(-0.1, 0.1, 2)])
     side = np.array([0.0, np.cos(round_about), np.sin(round_about)])
     centre = target + distance * (np.cos(tilt) * np.array([1.0, 0.0, 0.0]) + np.sin(tilt) * side)
     ahead = (target - centre) / distance
@@ -60,7 +61,7 @@ def random_rig(seed: int) -> Rig:
     reach = 0.1 * distance
     top = target + np.array([-1e-6, reach, reach])
     points = rng.uniform(target - reach, top, (200, 3))
-    return Rig(RefractedCamera(Camera(1024, 768, matrix, distortion, transform), phantom), points)
+    return Rig(RefractedCamera(Camera(1024, 768, matrix, distortion, transform, window)), points)
 
 
 @pytest.fixture(params=["left", "right", *range(12)], ids=str)
@@ -87,7 +88,7 @@ def aquacal() -> Any:
 def aquacal_rig(aquacal: Any, rig: Rig) -> tuple[Any, Any]:
     """Return aquacal's camera and surface for a rig of ours."""
     schema = importlib.import_module("aquacal.config.schema")
-    camera, phantom = rig.view.camera, rig.view.phantom
+    camera, window = rig.view.camera, rig.view.camera.window
     pose = camera.T_optical_rig
     intrinsics = schema.CameraIntrinsics(
         camera.camera_matrix, camera.distortion, (camera.width, camera.height)
@@ -95,9 +96,9 @@ def aquacal_rig(aquacal: Any, rig: Rig) -> tuple[Any, Any]:
     extrinsics = schema.CameraExtrinsics(pose[:3, :3] @ R_AQUACAL_RIG.T, pose[:3, 3])
     surface = aquacal.Interface(
         normal=np.array([0.0, 0.0, -1.0]),
-        camera_distances={CAMERA: -phantom.surface_height},
+        camera_distances={CAMERA: -window.point[0]},
         n_air=1.0,
-        n_water=phantom.refractive_index,
+        n_water=window.inside,
     )
     return aquacal.Camera(CAMERA, intrinsics, extrinsics), surface
 
@@ -132,7 +133,7 @@ def test_pixels_are_those_of_aquacal(aquacal: Any, rig: Rig) -> None:
 def test_rays_are_those_of_aquacal(aquacal: Any, rig: Rig) -> None:
     # Its lenses are undistorted by OpenCV's few iterations, hence a perfect lens here.
     plain = dataclasses.replace(rig.view.camera, distortion=np.zeros(5))
-    rig = Rig(RefractedCamera(plain, rig.view.phantom), rig.points)
+    rig = Rig(RefractedCamera(plain), rig.points)
     camera, surface = aquacal_rig(aquacal, rig)
     pixels = rig.view.project(rig.points)
     expected = np.array([aquacal.refractive_back_project(camera, surface, p) for p in pixels])
@@ -143,23 +144,21 @@ def test_rays_are_those_of_aquacal(aquacal: Any, rig: Rig) -> None:
 
 def test_light_takes_the_fastest_of_all_paths(rig: Rig) -> None:
     """Fermat: the optical path is stationary in both directions along the surface."""
-    camera, phantom = rig.view.camera, rig.view.phantom
+    camera, window = rig.view.camera, rig.view.camera.window
     pose = camera.T_optical_rig
     for point, pixel in zip(rig.points[:40], rig.view.project(rig.points[:40]), strict=True):
 
         def slope(place: np.ndarray, point: np.ndarray = point) -> np.ndarray:
-            crossing = np.array([phantom.surface_height, *place])
+            crossing = np.array([window.point[0], *place])
             air, body = crossing - camera.centre, crossing - point
-            path = air / np.linalg.norm(air) + phantom.refractive_index * (
-                body / np.linalg.norm(body)
-            )
+            path = air / np.linalg.norm(air) + window.inside * (body / np.linalg.norm(body))
             return np.asarray(path[1:])
 
         # In units of the depth: just below the surface the crossing is right above the point.
-        depth = phantom.surface_height - point[0]
+        depth = window.point[0] - point[0]
         found = root(lambda x, p=point, d=depth: slope(p[1:] + d * x), np.zeros(2), tol=1e-14)
         assert np.linalg.norm(found.fun) < 1e-12
-        crossing = np.array([phantom.surface_height, *(point[1:] + depth * found.x)])
+        crossing = np.array([window.point[0], *(point[1:] + depth * found.x)])
         rotation, _ = cv2.Rodrigues(pose[:3, :3])
         expected, _ = cv2.projectPoints(
             crossing[None], rotation, pose[:3, 3], camera.camera_matrix, camera.distortion
@@ -186,7 +185,7 @@ def test_what_has_no_ray_has_none_compiled_either(rig: Rig) -> None:
     barrel = dataclasses.replace(rig.view.camera, distortion=np.array([-0.5, 0.0, 0.0, 0.0, 0.0]))
     matrix = barrel.camera_matrix
     far = np.array([[matrix[0, 2] + 3.0 * matrix[0, 0], matrix[1, 2] + 3.0 * matrix[1, 1]]])
-    view = RefractedCamera(barrel, rig.view.phantom)
+    view = RefractedCamera(barrel)
     assert np.all(np.isnan(compiled_rays(Rig(view, rig.points), far)[1]))
     assert np.all(np.isnan(view.rays(far)[1]))
     # A camera turned round looks up, away from the surface.
@@ -195,7 +194,7 @@ def test_what_has_no_ray_has_none_compiled_either(rig: Rig) -> None:
     centre = rig.view.camera.centre
     pose[:3, :3] = flip @ pose[:3, :3]
     pose[:3, 3] = -pose[:3, :3] @ centre
-    up = RefractedCamera(dataclasses.replace(rig.view.camera, T_optical_rig=pose), rig.view.phantom)
+    up = RefractedCamera(dataclasses.replace(rig.view.camera, T_optical_rig=pose))
     middle = up.camera.camera_matrix[:2, 2][None]
     assert np.all(np.isnan(compiled_rays(Rig(up, rig.points), middle)[1]))
     assert np.isnan(up.rays(middle)[1][0, 0])

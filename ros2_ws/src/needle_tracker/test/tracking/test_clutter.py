@@ -24,7 +24,7 @@ Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]
 
 @pytest.fixture
 def tracker(calibration: StereoCalibration) -> StereoTracker:
-    return StereoTracker(calibration, default_settings(calibration.phantom))
+    return StereoTracker(calibration, default_settings(calibration))
 
 
 def insertion(
@@ -85,7 +85,7 @@ def test_cameras_may_be_turned(calibration_path: Path, calibration: StereoCalibr
                 turned = quarter_turned(turned)
             cameras.append(turned)
         rig = dataclasses.replace(calibration, left=cameras[0], right=cameras[1])
-        tracker = StereoTracker(rig, default_settings(rig.phantom))
+        tracker = StereoTracker(rig, default_settings(rig))
         for length, truth, left, right in exposures:
             pair = [np.ascontiguousarray(np.rot90(image, -quarters)) for image in (left, right)]
             measured = tracker.process(pair[0], pair[1], length)

@@ -36,7 +36,7 @@ Views = tuple[RefractedCamera, RefractedCamera]
 
 @pytest.fixture
 def tracker(calibration: StereoCalibration) -> StereoTracker:
-    return StereoTracker(calibration, default_settings(calibration.phantom))
+    return StereoTracker(calibration, default_settings(calibration))
 
 
 def with_cable(image: Image, pixel: np.ndarray, degrees: float) -> Image:

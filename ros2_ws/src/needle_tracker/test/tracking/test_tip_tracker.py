@@ -49,7 +49,7 @@ def test_a_needle_that_mirrors_a_lamp_is_found_where_lines_show_none(
     make_arc: MakeArc,
     make_line: Callable[..., np.ndarray],
 ) -> None:
-    settings = default_settings(calibration.phantom)
+    settings = default_settings(calibration)
     lines, both = StereoTracker(calibration, settings), TipTracker(calibration, settings)
     seen_by_lines = found = 0
     for mm in range(60, 68):

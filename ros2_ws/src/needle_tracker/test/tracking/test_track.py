@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from needle_tracker.image.search_grid import Reach
+from needle_tracker.optics.window import Layer, Window
 from needle_tracker.tracking.gates import GateSettings, refusal, tip_at_entry
+from needle_tracker.tracking.refusals import Refusal
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -44,9 +46,18 @@ def test_every_reachable_arc_passes(
 ) -> None:
     for roll in np.linspace(-3.0, 0.0, 5):
         end = make_arc(length, curvature, roll, angle)[-1]
-        if end[0] < gates.surface_height:
+        if all(window.depth(end) > 0.0 for window in gates.windows):
             assert refusal(tip(*end), length, gates) is None
             assert refusal(tip(*end), None, gates) is None
+
+
+def test_a_tip_is_behind_both_windows(gates: GateSettings) -> None:
+    wall = Window(np.array([0.0, 0.015, 0.0]), np.array([0.0, 1.0, 0.0]), (Layer(5e-3, 1.5),), 1.3)
+    gates = dataclasses.replace(gates, windows=(gates.windows[0], wall))
+    assert refusal(tip(y=9e-3, z=0.08), None, gates) is None
+    assert refusal(tip(y=11e-3, z=0.08), None, gates) == Refusal.OUTSIDE
+    assert refusal(tip(y=-11e-3, z=0.08), None, gates) is None
+    assert refusal(tip(x=18e-3, z=0.08), None, gates) == Refusal.OUTSIDE
 
 
 @pytest.mark.parametrize(
@@ -55,7 +66,7 @@ def test_every_reachable_arc_passes(
         ({"disagreement": 3e-3}, None, "along the needle"),
         ({"disagreement_across": 5.0}, None, "across the needle"),
         ({"covariance": np.eye(3) * 1e-4}, None, "uncertain"),
-        ({"position": np.array([0.02, 0.0, 0.08])}, None, "above the surface"),
+        ({"position": np.array([0.02, 0.0, 0.08])}, None, "outside the phantom"),
         ({"position": np.array([0.0, 0.0, 0.002])}, None, "too close to the entry"),
         ({"position": np.array([0.0, 0.0, 0.3])}, None, "longest insertion"),
         ({"position": np.array([0.0, 0.05, 0.03])}, None, "reachable cone"),

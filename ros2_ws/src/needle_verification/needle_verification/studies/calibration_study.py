@@ -9,13 +9,14 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from needle_sim.camera.projection import project
-from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
+from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.calibrating.rig_calibration import calibrate
 from needle_tracker.calibrating.rig_model import BoardView, Corners
-from needle_tracker.calibrating.tip_error import measured_points, phantom_points
-from needle_tracker.optics.calibration import Phantom
+from needle_tracker.calibrating.tip_error import measured_points, needle_points
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.optics.window import surface_from_above
 
 Array = NDArray[np.float64]
 
@@ -55,7 +56,7 @@ def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> 
     for i in range(_FREE):
         left, right = _corners(rig, _held(rng), rng, corner_sigma)
         views.append(BoardView(f"free_{i:02d}", None, left, right))
-    for name, place in _places(rig.surface_height).items():
+    for name, place in _places(rig.half_height).items():
         pose = _as_it_lies(place, rng) if place.under_surface else place.T_rig_board
         left, right = _corners(rig, pose, rng, corner_sigma)
         views.append(BoardView(name, place, left, right))
@@ -63,15 +64,12 @@ def calibrated_tip_errors(calibration: Path, seed: int, corner_sigma: float) -> 
         side: (camera.image_width, camera.image_height)
         for side, camera in (("left", rig.left), ("right", rig.right))
     }
-    found = calibrate(views, sizes, Phantom(rig.surface_height, _TABLE_INDEX)).calibration
-    points = phantom_points(rig.surface_height)
-    left_pixels, right_pixels = (_pixels(rig, camera, points) for camera in (rig.left, rig.right))
+    surface = surface_from_above(rig.half_height, _TABLE_INDEX)
+    found = calibrate(views, sizes, (surface, surface)).calibration
+    points = needle_points(load_calibration(calibration))
+    left_pixels, right_pixels = (project(points, camera) for camera in (rig.left, rig.right))
     tips = measured_points(found, left_pixels, right_pixels)
     return np.asarray(np.linalg.norm(tips - points, axis=1))
-
-
-def _pixels(rig: StereoRig, camera: Camera, points: Array) -> Array:
-    return project(points, camera, rig.surface_height, rig.refractive_index)
 
 
 def _corners(
@@ -80,7 +78,7 @@ def _corners(
     """Return the corners that the left and the right camera see of a board, each with its error."""
     seen = []
     for camera in (rig.left, rig.right):
-        exact = _pixels(rig, camera, BOARD.corners @ pose[:3, :3].T + pose[:3, 3])
+        exact = project(BOARD.corners @ pose[:3, :3].T + pose[:3, 3], camera)
         pixels = exact + rng.normal(0.0, corner_sigma, exact.shape)
         most = np.array([camera.image_width, camera.image_height]) - _BORDER_PX
         inside = np.all((pixels > _BORDER_PX) & (pixels < most), axis=1)

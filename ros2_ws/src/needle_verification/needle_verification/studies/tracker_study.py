@@ -72,7 +72,7 @@ class TrackedRun:
 
 def new_tracker(calibration: StereoCalibration) -> TipTracker:
     """Return a tracker as the node's defaults make it."""
-    return TipTracker(calibration, default_settings(calibration.phantom))
+    return TipTracker(calibration, default_settings(calibration))
 
 
 def track_run(
