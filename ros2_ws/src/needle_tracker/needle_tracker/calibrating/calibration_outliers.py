@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_fit import (
     LEAST_CORNER_SIGMA_PX,
+    given_rows,
     outlier_weights,
     place_deviations,
-    place_rows,
 )
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES
@@ -114,7 +114,7 @@ def square_error(result: RigCalibration) -> tuple[float, float]:
     whitened = fitted.residuals / sigma_px
     roots = np.sqrt(outlier_weights(whitened)) / sigma_px
     others = model.jacobian(fitted.parameters, fitted.free) * roots[:, None]
-    held = place_rows(model, fitted.free)
+    held = given_rows(model, fitted.free)
     lengths = np.maximum(np.linalg.norm(others, axis=0), 1e-12)
     matrix = np.concatenate([others, held]) / lengths
     target = np.concatenate([by_size * roots, np.zeros(len(held))])

@@ -27,8 +27,7 @@ from needle_tracker.optics.window import Window
 Array = NDArray[np.float64]
 
 # A standard deviation above these, and the parameter is kept at its given value: about 0.04 mm of
-# depth for the surface's, about a pixel at the image's corner for the lens's (f = 16 mm). A window
-# moved along its normal hardly shows, and hardly moves tips: worse than a ruler tells it is no use.
+# depth for the surface's, about a pixel at the image's corner for the lens's (f = 16 mm).
 LIMITS = {
     "refractive_index": 0.003,
     "surface_height": 0.15e-3,
@@ -36,12 +35,10 @@ LIMITS = {
     "k2": 1.0,
     "p1": 0.003,
     "p2": 0.003,
-    "window_offset": 2e-3,
-    "window_tilt_1": 0.03,
-    "window_tilt_2": 0.03,
 }
 _FIRST_SIGMA_PX = 10.0  # of corners, while cameras and boards come near
-_FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
+_FOCAL_LIMIT = 0.005  # of the focal length
+_CENTRE_LIMIT = 0.01  # of the image's width, for the principal point: a turned camera is much alike
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,8 +193,10 @@ def _check_cameras(names: list[str], result: RigFit, sizes: dict[str, tuple[int,
     for side in SIDES:
         for name in ("fx", "fy", "cx", "cy"):
             i = names.index(f"{side}.{name}")
-            scale = result.parameters[i] if name[0] == "f" else float(sizes[side][0])
-            if not result.sigma[i] <= _FOCAL_LIMIT * abs(scale):
+            largest = _CENTRE_LIMIT * float(sizes[side][0])
+            if name[0] == "f":
+                largest = _FOCAL_LIMIT * abs(float(result.parameters[i]))
+            if not result.sigma[i] <= largest:
                 raise UserError(
                     f"{side} camera: {name} is determined to +-{result.sigma[i]:.0f} px only "
                     f"({result.parameters[i]:.0f} px): more views, tilted by 30 to 45 deg"

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.calibrating.rig_model import RigModel
+from needle_tracker.calibrating.rig_model import WINDOW, RigModel
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -66,7 +66,7 @@ def board_parameters_free(model: RigModel) -> Mask:
 def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None = None) -> RigFit:
     """Fit the free parameters to what was seen.
 
-    Boards of known place are held to it by its standard deviation.
+    Boards of known place, and windows, are held to what is given by its standard deviation.
 
     Parameters
     ----------
@@ -87,12 +87,12 @@ def fit(model: RigModel, start: Array, free: Mask, corner_sigma_px: float | None
     start = np.array(start)
     known = corner_sigma_px is not None
     sigma = corner_sigma_px if corner_sigma_px is not None else 0.3
-    place_rows, place_sigma = _place_priors(model, free)
+    rows, given_sigma = _priors(model, free)
     passes = 1 if known else 2
     for _ in range(passes):
-        parameters, normal, cost = _minimise(model, start, free, sigma, (place_rows, place_sigma))
+        parameters, normal, cost = _minimise(model, start, free, sigma, (rows, given_sigma))
         residuals = model.residuals(parameters)
-        spare = residuals.size - int(np.count_nonzero(free)) + len(place_rows)
+        spare = residuals.size - int(np.count_nonzero(free)) + len(rows)
         seen = _spread(residuals) * float(np.sqrt(residuals.size / max(spare, 1)))
         start = parameters
         if not known:
@@ -107,9 +107,9 @@ def outlier_weights(whitened: Array) -> Array:
     return np.asarray(1.0 / np.sqrt(1.0 + (whitened / _OUTLIER) ** 2))
 
 
-def place_rows(model: RigModel, free: Mask) -> Array:
-    """Return the rows that known places add to the whitened Jacobian, shape (6 * places, free)."""
-    rows, sigmas = _place_priors(model, free)
+def given_rows(model: RigModel, free: Mask) -> Array:
+    """Return the rows that known places and windows add to the whitened Jacobian, (n, free)."""
+    rows, sigmas = _priors(model, free)
     result = np.zeros((len(rows), int(np.count_nonzero(free))))
     result[np.arange(len(rows)), np.searchsorted(np.flatnonzero(free), rows)] = 1.0 / sigmas
     return result
@@ -197,6 +197,18 @@ def _solve(normal: Array, gradient: Array, damping: float) -> Array:
     scale = _scale(normal)
     scaled = normal / np.outer(scale, scale) + damping * np.eye(len(scale))
     return np.asarray(np.linalg.lstsq(scaled, gradient / scale, rcond=1e-15)[0] / scale)
+
+
+def _priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:
+    """Return the parameters that what is given holds, and how tightly."""
+    rows, sigmas = _place_priors(model, free)
+    of_window = {
+        row: WINDOW[name.split(".")[-1]]
+        for row, name in enumerate(model.names)
+        if free[row] and name.split(".")[-1] in WINDOW
+    }
+    window_rows = np.array(list(of_window), dtype=np.intp)
+    return np.append(window_rows, rows), np.append(list(of_window.values()), sigmas)
 
 
 def _place_priors(model: RigModel, free: Mask) -> tuple[NDArray[np.intp], Array]:

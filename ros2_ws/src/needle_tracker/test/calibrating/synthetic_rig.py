@@ -29,24 +29,25 @@ def given(height: float, index: float) -> tuple[Window, Window]:
     return surface_from_above(height, index), surface_from_above(height, index)
 
 
-def board_image(square_px: int) -> NDArray[np.uint8]:
+def board_image(board: CharucoBoard, square_px: int) -> NDArray[np.uint8]:
     """The pattern as OpenCV draws it, without a margin."""
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, BOARD.dictionary))
-    shape = (BOARD.columns, BOARD.rows)
-    board = cv2.aruco.CharucoBoard(shape, BOARD.square, BOARD.marker, dictionary)
-    image = board.generateImage((shape[0] * square_px, shape[1] * square_px))
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    shape = (board.columns, board.rows)
+    pattern = cv2.aruco.CharucoBoard(shape, board.square, board.marker, dictionary)
+    image = pattern.generateImage((shape[0] * square_px, shape[1] * square_px))
     return np.asarray(image, dtype=np.uint8)
 
 
 @dataclasses.dataclass
 class TrueRig:
-    """What a calibration file says, read without the code under test."""
+    """What a calibration file says, read without the code under test, and the board it sees."""
 
     content: dict[str, Any]
+    board: CharucoBoard = BOARD
 
     @classmethod
-    def read(cls, path: Path) -> TrueRig:
-        return cls(yaml.safe_load(path.read_text()))
+    def read(cls, path: Path, board: CharucoBoard = BOARD) -> TrueRig:
+        return cls(yaml.safe_load(path.read_text()), board)
 
     @property
     def height(self) -> float:
@@ -71,39 +72,53 @@ class TrueRig:
         turn = Rotation.from_euler(axis, degrees, degrees=True)
         pose["rotation"] = (turn * Rotation.from_quat(pose["rotation"])).as_quat().tolist()
         pose["translation"] = turn.apply(pose["translation"]).tolist()
-        return TrueRig(content)
+        return dataclasses.replace(self, content=content)
 
     def with_phantom(self, **values: float) -> TrueRig:
         content = yaml.safe_load(yaml.safe_dump(self.content))
         content["phantom"].update(values)
-        return TrueRig(content)
+        return dataclasses.replace(self, content=content)
 
     def project(self, side: str, points: Array, under: bool) -> Array:
-        """Pixels of points in rig; `under` says that they are seen through the surface."""
+        """Pixels of points in rig; `under` says that they are seen through the window."""
         matrix, distortion, rotation, translation = self.camera(side)
         points = np.asarray(points, dtype=float).reshape(-1, 3)
         if under:
-            points = self._crossings(-rotation.T @ translation, points)
+            points = self._crossings(side, -rotation.T @ translation, points)
         pixels, _ = cv2.projectPoints(
             points, cv2.Rodrigues(rotation)[0], translation, matrix, distortion
         )
         return np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
 
-    def _crossings(self, centre: Array, points: Array) -> Array:
-        """Where light crosses the surface: least time, by bisection on its derivative."""
-        side = points[:, 1:] - centre[1:]
-        distance = np.linalg.norm(side, axis=1)
-        up, down = centre[0] - self.height, self.height - points[:, 0]
-        low, high = np.zeros(len(points)), distance.copy()
-        for _ in range(70):
-            r = 0.5 * (low + high)
-            late = r / np.hypot(r, up) > self.index * (distance - r) / np.hypot(distance - r, down)
-            low, high = np.where(late, low, r), np.where(late, r, high)
-        fraction = np.divide(r, distance, out=np.zeros_like(r), where=distance > 0)
-        crossing = np.empty_like(points)
-        crossing[:, 0] = self.height
-        crossing[:, 1:] = centre[1:] + side * fraction[:, None]
-        return crossing
+    def window(self, side: str) -> tuple[Array, Array, list[float], list[float]]:
+        """Point, normal; thicknesses and indices from outside inwards, the body's index last."""
+        if "phantom" in self.content:
+            return np.array([self.height, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), [], [self.index]
+        window = self.content[side]["window"]
+        thicknesses = [layer["thickness"] for layer in window["layers"]]
+        indices = [layer["refractive_index"] for layer in window["layers"]] + [window["inside"]]
+        return np.array(window["point"]), np.array(window["normal"]), thicknesses, indices
+
+    def _crossings(self, side: str, centre: Array, points: Array) -> Array:
+        """Where light crosses the outer face: by bisection on the sine of its angle in air."""
+        face, normal, thicknesses, indices = self.window(side)
+        deep = -(points - face) @ normal - sum(thicknesses)
+        up = float((centre - face) @ normal)
+        foot = centre - up * normal
+        aside = points - foot
+        aside = aside - (aside @ normal)[:, None] * normal
+        distance = np.linalg.norm(aside, axis=1)
+        low, high = np.zeros(len(points)), np.ones(len(points))
+        for _ in range(80):
+            sine = 0.5 * (low + high)
+            reach = up * sine / np.sqrt(1.0 - sine**2)
+            total = reach
+            for t, n in zip([*thicknesses, deep], indices, strict=True):
+                total = total + t * np.tan(np.arcsin(sine / n))
+            far = total > distance
+            low, high = np.where(far, low, sine), np.where(far, sine, high)
+        fraction = np.divide(reach, distance, out=np.zeros_like(reach), where=distance > 0)
+        return np.asarray(foot + aside * fraction[:, None])
 
     def view(
         self,
@@ -114,7 +129,7 @@ class TrueRig:
         noise: float = 0.1,
     ) -> BoardView:
         """The board's corners inside both images, with noise."""
-        points = BOARD.corners
+        points = self.board.corners
         under = place is not None and place.under_surface
         seen = []
         for side in SIDES:
@@ -131,15 +146,15 @@ class TrueRig:
         shape = (SIZE[1] * super_px, SIZE[0] * super_px)
         square_px = 40 * super_px
         pattern = cv2.copyMakeBorder(
-            board_image(square_px), square_px, square_px, square_px, square_px,
+            board_image(self.board, square_px), square_px, square_px, square_px, square_px,
             cv2.BORDER_CONSTANT, value=255,
         )  # fmt: skip
         # The board's plane, as a fine mesh; between its knots the map is smooth.
         n = 4
-        u = np.linspace(-1, BOARD.columns + 1, n * (BOARD.columns + 2) + 1)
-        v = np.linspace(-1, BOARD.rows + 1, n * (BOARD.rows + 2) + 1)
+        u = np.linspace(-1, self.board.columns + 1, n * (self.board.columns + 2) + 1)
+        v = np.linspace(-1, self.board.rows + 1, n * (self.board.rows + 2) + 1)
         mesh = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-        flat = np.column_stack([mesh * BOARD.square, np.zeros(len(mesh))])
+        flat = np.column_stack([mesh * self.board.square, np.zeros(len(mesh))])
         pixels = self.project(side, flat @ pose[:3, :3].T + pose[:3, 3], under)
         pixels = (pixels + 0.5) * super_px - 0.5
         source = ((mesh + 1) * square_px - 0.5).astype(np.float32)

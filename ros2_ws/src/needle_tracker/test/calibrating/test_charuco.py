@@ -13,7 +13,9 @@ from .synthetic_rig import BOARD, board_image
 
 
 def test_corners_are_found_where_they_are_drawn() -> None:
-    image = cv2.copyMakeBorder(board_image(60), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    image = cv2.copyMakeBorder(
+        board_image(BOARD, 60), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255
+    )
     blurred = np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0), dtype=np.uint8)
     numbers, pixels = BOARD.find(blurred)
     np.testing.assert_array_equal(numbers, np.arange(88))
@@ -26,7 +28,7 @@ def test_corners_are_found_where_they_are_drawn() -> None:
 def test_an_image_with_little_or_nothing_of_the_board(visible: int) -> None:
     image = np.full((400, 400), 200, np.uint8)
     if visible:
-        image[:150, :150] = board_image(60)[:150, :150]
+        image[:150, :150] = board_image(BOARD, 60)[:150, :150]
     numbers, pixels = BOARD.find(image)
     assert pixels.shape == (len(numbers), 2)
     assert len(numbers) <= 4
@@ -56,7 +58,9 @@ def test_the_printed_board_has_its_true_size(tmp_path: Path) -> None:
     # 600 dots an inch.
     np.testing.assert_allclose(np.ptp(pixels, axis=0) * 0.0254 / 600, [0.10, 0.07], rtol=5e-5)
     # Modules too are where OpenCV has them, at 56 dots a square and 6 a module.
-    expected = cv2.resize(board_image(56), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    expected = cv2.resize(
+        board_image(BOARD, 56), None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA
+    )
     margin = round(0.01 / 0.0254 * 600)
     printed = cv2.resize(
         image[margin:-margin, margin:-margin], expected.shape[::-1], interpolation=cv2.INTER_AREA
