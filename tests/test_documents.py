@@ -96,6 +96,17 @@ def draw_session(folder: Path) -> None:
     (folder / "right").rename(folder / "R")
 
 
+def test_the_session_of_a_box_is_one() -> None:
+    """Its board is seen from above and from aside; no rig of ours draws it for the page."""
+    page = blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
+    (text,) = (block.text for block in page if block.name == "box_session.yaml")
+    session = parse_session(yaml.safe_load(text))
+    stand, held = session.place_of("stand"), session.place_of("box_3")
+    assert stand is not None
+    assert held is not None
+    assert (stand.is_known, held.is_known) == (True, False)
+
+
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("page", PAGES)
 def test_every_block_works_as_written(

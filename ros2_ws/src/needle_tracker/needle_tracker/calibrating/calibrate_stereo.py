@@ -47,6 +47,14 @@ twice, a measured way apart, it tells whether the squares have the size that is 
 An image whose name has no place is a board held freely in air: at least 6, better 20, tilted by 15
 to 45 deg in all directions. Boards under the surface, of known place and at different depths (a
 wedge), tell refractive index and surface height; `sigma` is how well the place is known.
+
+Cameras that look through walls, or from aside, have a window each in place of phantom:
+
+  left: {window: {point: [0.0225, 0, 0], normal: [1, 0, 0],
+                  layers: [{thickness: 0.005, refractive_index: 1.49}], inside: 1.34}}
+
+likewise right. A board at one known place in the box defines `rig`; others are held in it freely:
+a place `box_*: {under_surface: true}` without an origin. See docs/calibration.md.
 """
 _SCALE_TOLD = 0.1  # [%]
 _EPILOG = """\

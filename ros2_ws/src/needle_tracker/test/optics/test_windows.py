@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
+from needle_tracker.image.corridor import within_corridor
 from needle_tracker.image.search_grid import Reach, make_search_grid
 from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.optics.camera_model import optical_rays, project_optical
@@ -185,6 +186,7 @@ def test_a_view_from_aside_is_that_from_above_turned(
     calibration: StereoCalibration, degrees: float
 ) -> None:
     above = RefractedCamera(calibration.left)
+    assert above.sideways.tolist() == [0.0, 1.0, 0.0]
     turn = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
     aside = RefractedCamera(turned(calibration.left, turn))
     points = np.random.default_rng(0).uniform([-0.017, -0.03, 0.0], [0.03, 0.03, 0.12], (50, 3))
@@ -210,6 +212,18 @@ def test_a_side_view_of_the_shipped_rig_searches_where_needles_go(
         tip = np.array([0.0, 0.0, 0.1]) + 0.01 * view.sideways
         column = np.linalg.norm(grid.pixels[grid.row_of(0.1)] - view.project(tip), axis=-1).argmin()
         assert grid.angles[column] == pytest.approx(0.1, abs=np.deg2rad(0.5))
+
+
+def test_a_corridor_lies_where_each_view_sees_the_way(top_and_side: StereoCalibration) -> None:
+    length = np.linspace(0.005, 0.1, 30)
+    way = np.stack([1.0 * length**2, -0.7 * length**2, length], axis=-1)
+    for view in stereo_views(top_and_side):
+        grid = make_search_grid(view, REACH, first_distance=2e-3)
+        near = within_corridor(grid, view, way, np.full(len(way), 1e-3))
+        for point in way[3:-1]:
+            off = np.linalg.norm(grid.pixels - view.project(point), axis=-1)
+            assert near.reachable[np.unravel_index(off.argmin(), off.shape)]
+        assert near.reachable.sum() < 0.2 * grid.reachable.sum()
 
 
 def test_height_and_depth_are_along_the_normal() -> None:
