@@ -25,7 +25,7 @@ SMALL_BOARD = CharucoBoard(columns=12, rows=5, square=0.008, marker=0.006)
 _WALL = (Layer(5e-3, 1.49),)
 GIVEN = (
     Window(np.array([0.0235, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), _WALL, 1.34),
-    Window(np.array([0.0, 0.034, 0.0]), np.array([0.0, 1.0, 0.0]), _WALL, 1.34),
+    Window(np.array([0.0, 0.059, 0.0]), np.array([0.0, 1.0, 0.0]), _WALL, 1.34),
 )
 
 
@@ -52,7 +52,9 @@ def pose_in_air(number: int, rng: np.random.Generator) -> Array:
     axis = np.cos(round_about) * across + np.sin(round_about) * np.array([0.0, 0.0, 1.0])
     spin = Rotation.from_rotvec(np.deg2rad(rng.uniform(-60.0, 60.0)) * up)
     turn = Rotation.from_rotvec(tilt * axis) * spin
-    middle = rng.uniform(0.07, 0.20) * up + rng.uniform(-0.03, 0.03) * across
+    middle = (rng.uniform(0.07, 0.20) + 0.04 * (number % 2)) * up + rng.uniform(
+        -0.03, 0.03
+    ) * across
     middle[2] += rng.uniform(0.035, 0.09)
     return _held(turn.as_matrix() @ _facing(up), middle)
 

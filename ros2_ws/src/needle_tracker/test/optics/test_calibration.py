@@ -142,7 +142,7 @@ def test_windows_are_read_as_they_stand(own_windows: Any) -> None:
     calibration = parse_calibration(own_windows)
     assert calibration.surface is None
     window = calibration.right.window
-    assert window.point.tolist() == [0.0, 0.035, 0.0625]
+    assert window.point.tolist() == [0.0, 0.06, 0.0625]
     assert window.normal[1] == pytest.approx(0.99998, abs=1e-5)
     assert [(layer.thickness, layer.refractive_index) for layer in window.layers] == [(0.005, 1.49)]
     assert window.inside == 1.34
@@ -185,7 +185,7 @@ def _one_window(content: Any) -> None:
         (put("right", "window", "layers", 0, "thickness", -1e-3), "layers.0..thickness"),
         (put("right", "window", "layers", 0, "thickness", 5), "right.window.layers.0..thickness"),
         (put("right", "window", "inside", 0.9), "right.window.inside"),
-        (put("right", "window", "point", [0.0, 0.035]), "right.window.point wants 3 numbers"),
+        (put("right", "window", "point", [0.0, 0.06]), "right.window.point wants 3 numbers"),
     ],
 )
 def test_bad_windows_are_named(own_windows: Any, spoil: Callable[[Any], None], named: str) -> None:
