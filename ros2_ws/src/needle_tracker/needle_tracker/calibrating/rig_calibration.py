@@ -37,8 +37,10 @@ LIMITS = {
     "p2": 0.003,
 }
 _FIRST_SIGMA_PX = 10.0  # of corners, while cameras and boards come near
-_FOCAL_LIMIT = 0.005  # of the focal length
-_CENTRE_LIMIT = 0.01  # of the image's width, for the principal point: a turned camera is much alike
+_FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
+# Of the image's width: boards on a surface hold the cameras that look through it, a small one in a
+# box does less; there a shifted principal point and a turned camera are much alike, and harmless.
+_OWN_WINDOWS_CENTRE_LIMIT = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +152,8 @@ def calibrate(
         parameters = result.parameters.copy()
         parameters[worst] = given[worst]
         free[worst] = False
-    _check_cameras(names, result, sizes)
+    centre_limit = _OWN_WINDOWS_CENTRE_LIMIT if start.surface is None else _FOCAL_LIMIT
+    _check_cameras(names, result, sizes, centre_limit)
     calibration = model.calibration(result.parameters)
     if np.linalg.norm(calibration.left.centre - calibration.right.centre) < LEAST_BASELINE:
         raise UserError("both cameras come out in one place: are left and right the same images?")
@@ -189,11 +192,13 @@ def _least_determined(names: list[str], result: RigFit) -> int | None:
     return worst
 
 
-def _check_cameras(names: list[str], result: RigFit, sizes: dict[str, tuple[int, int]]) -> None:
+def _check_cameras(
+    names: list[str], result: RigFit, sizes: dict[str, tuple[int, int]], centre_limit: float
+) -> None:
     for side in SIDES:
         for name in ("fx", "fy", "cx", "cy"):
             i = names.index(f"{side}.{name}")
-            largest = _CENTRE_LIMIT * float(sizes[side][0])
+            largest = centre_limit * float(sizes[side][0])
             if name[0] == "f":
                 largest = _FOCAL_LIMIT * abs(float(result.parameters[i]))
             if not result.sigma[i] <= largest:
