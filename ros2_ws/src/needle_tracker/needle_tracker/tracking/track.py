@@ -194,7 +194,9 @@ class Track:
         """
         predicted = self.predict(insertion)
         if self.state is not TrackState.TRACKING:
-            self._agreeing = self._agreeing + 1 if self.state is TrackState.CONFIRMING else 1
+            agreed = self._agreeing if self.state is TrackState.CONFIRMING else 0
+            # What has won has been seen in agreement with itself before.
+            self._agreeing = max(agreed, self._next_rivals - 1 if anew else 0) + 1
             wanted = self._settings.confirm_pairs
             if insertion is not None:
                 wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
@@ -291,7 +293,7 @@ class Track:
     def is_excluded(self, tip: SpatialTip, insertion: float | None) -> bool:
         """Return whether a needle that was seen so well before cannot have got to a tip."""
         predicted = self.predict(insertion)
-        if predicted is None or not self.is_established:
+        if predicted is None or not predicted.known or not self.is_established:
             return False
         miss = float(np.linalg.norm(tip.position - predicted.motion.position))
         return miss > _FAR and predicted.motion.surprise(tip) > _NO_SURPRISE
@@ -315,11 +317,13 @@ class Track:
         """
         rival = self._rival
         agrees = False
-        if rival is not None and insertion is not None and rival.insertion is not None:
-            ahead = insertion - rival.insertion
+        if rival is not None:
+            ahead, allowed = 0.0, self._settings.free_step
+            if insertion is not None and rival.insertion is not None:
+                ahead = insertion - rival.insertion
+                allowed = self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
             motion = rival.motion.advanced(ahead, self._settings.reach.curvature)
-            miss = float(np.linalg.norm(tip.position - motion.position))
-            agrees = miss <= self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
+            agrees = float(np.linalg.norm(tip.position - motion.position)) <= allowed
         # Of what one pair shows several may agree with the pair before: that is one sight of it.
         count = self._rivals + 1 if agrees else 1
         if count > self._next_rivals:

@@ -189,6 +189,21 @@ def test_one_blocked_camera_loses_the_track_and_sight_restores_it(
     assert again.tip is not None
 
 
+def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
+    tracker: StereoTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    for mm in range(40, 52):
+        tracker.process(*draw_pair(make_arc(1e-3 * mm, 5.0, 1.0), seed=mm), None)
+    unseen = draw_pair(None)
+    while (answer := tracker.process(*unseen, None)).state is not TrackState.LOST:
+        assert answer.tip is None
+    for mm in range(65, 68):
+        path = make_arc(1e-3 * mm, 5.0, 1.0)
+        answer = tracker.process(*draw_pair(path, seed=mm), None)
+    assert answer.tip is not None
+    assert np.linalg.norm(answer.tip.position - path[-1]) < 1e-4
+
+
 def test_images_of_two_exposures_are_refused(
     tracker: StereoTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
