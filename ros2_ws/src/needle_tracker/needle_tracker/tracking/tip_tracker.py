@@ -15,6 +15,7 @@ from needle_tracker.image.detection import Image
 from needle_tracker.image.looks import MapLook
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -88,7 +89,8 @@ class TipTracker:
         if not (self._maps_count or self._maps_are_due(lines)):
             return lines
         maps = self._maps.process(left, right, insertion)
-        self._in_vain = 0 if maps.tip is not None else self._in_vain + 1
+        shown = maps.tip is not None or maps.state is TrackState.CONFIRMING
+        self._in_vain = 0 if shown else self._in_vain + 1
         if lines.tip is None or maps.tip is None:
             self._agreed = 0
             self._maps_count = self._maps_count or maps.tip is not None

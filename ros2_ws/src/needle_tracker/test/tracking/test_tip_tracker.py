@@ -84,11 +84,12 @@ class Told:
 
     def __init__(self) -> None:
         self.tip: SpatialTip | None = None
+        self.state = TrackState.SEARCHING
         self.asked = 0
 
     def process(self, _: Image, __: Image, ___: float | None) -> Measurement:
         self.asked += 1
-        return Measurement(self.tip, TrackState.TRACKING, "" if self.tip else "no needle")
+        return Measurement(self.tip, self.state, "" if self.tip else "no needle")
 
     def skip(self, reason: str) -> Measurement:
         return Measurement(None, TrackState.SEARCHING, reason)
@@ -174,6 +175,18 @@ def test_maps_that_show_nothing_are_drawn_of_every_third_pair(
     assert maps.asked == 5 + 30 // 3
     maps.tip = tip_at(0.06, 2e-4)
     assert any(answer(tracker) is maps.tip for _ in range(3))
+
+
+def test_maps_that_show_something_are_drawn_until_it_is_confirmed(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, _, maps = told
+    for _ in range(30):
+        assert answer(tracker) is None
+    maps.state, before = TrackState.CONFIRMING, maps.asked
+    for _ in range(6):
+        assert answer(tracker) is None
+    assert maps.asked >= before + 4
 
 
 def test_a_new_insertion_begins_with_lines(
