@@ -15,33 +15,35 @@ from needle_common.ros.conversions import to_stamp
 from needle_tracker.answers.orientation import orientation, rotation_covariance
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
+from needle_tracker.sources.image_encodings import ENCODINGS, WANTED, bytes_per_pixel, grey_image
 from needle_tracker.tracking.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
 INSERTION_JOINT = "insertion_joint"
-_ENCODINGS = ("mono8", "8UC1")
 _QUOTED = 40  # characters of a text that is not known
 
 
 def to_frame(message: Image, side: str, camera: Camera) -> Frame:
     """Return the image in a message, or why it is not one of this camera."""
-    if message.encoding not in _ENCODINGS:
-        return Frame(None, f"{side} image is {message.encoding[:_QUOTED]!r}, wants 'mono8'")
+    if message.encoding not in ENCODINGS:
+        encoding = message.encoding[:_QUOTED]
+        return Frame(None, f"{side} image is {encoding!r}, wants {WANTED}")
     if (message.width, message.height) != (camera.width, camera.height):
         return Frame(
             None,
             f"{side} image is {message.width}x{message.height}, the calibration is for "
             f"{camera.width}x{camera.height}",
         )
-    if message.step < message.width or len(message.data) != message.step * message.height:
+    least = message.width * bytes_per_pixel(message.encoding)
+    if message.step < least or len(message.data) != message.step * message.height:
         return Frame(
             None,
             f"{side} image has {len(message.data)} bytes in rows of {message.step}, "
-            f"{message.height} rows of {message.width} wanted",
+            f"{message.height} rows of {least} wanted",
         )
     rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
-    return Frame(rows[:, : message.width])
+    return Frame(grey_image(rows, message.width, message.encoding))
 
 
 def other_resolution(message: CameraInfo, side: str, camera: Camera) -> str:
