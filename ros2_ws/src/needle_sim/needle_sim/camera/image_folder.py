@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TextIO
@@ -74,6 +75,8 @@ class ImageFolder:
         New or empty.
     calibration_file : Path
         Copied.
+    more_columns : tuple of str
+        Of truth.csv, behind those that are always there.
 
     Raises
     ------
@@ -81,7 +84,9 @@ class ImageFolder:
         If the folder has something in it, or cannot be written.
     """
 
-    def __init__(self, folder: Path, calibration_file: Path) -> None:
+    def __init__(
+        self, folder: Path, calibration_file: Path, more_columns: tuple[str, ...] = ()
+    ) -> None:
         self._folder = folder
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -92,7 +97,7 @@ class ImageFolder:
             for side in ("left", "right"):
                 (folder / side).mkdir()
             self._insertions = self._table(INSERTION, _INSERTION_COLUMNS)
-            self._truths = self._table(TRUTH, _TRUTH_COLUMNS)
+            self._truths = self._table(TRUTH, _TRUTH_COLUMNS + more_columns)
         except OSError as error:
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
 
@@ -114,6 +119,8 @@ class ImageFolder:
         insertion: float,
         truth: Truth | None,
         share_seen: tuple[float, float],
+        *,
+        more: Sequence[float | str] = (),
     ) -> str:
         """Add one exposure; return its name.
 
@@ -129,6 +136,8 @@ class ImageFolder:
             None where there is no needle: empty fields.
         share_seen : pair of float
             Of the needle's last 10 mm, by the left and the right camera.
+        more : sequence of float or str
+            For the further columns of truth.csv.
 
         Raises
         ------
@@ -150,7 +159,8 @@ class ImageFolder:
             angles = (truth.pitch, truth.yaw, truth.shaft_pitch, truth.shaft_yaw)
             values = [*truth.tip.tolist(), *angles]
         self._add(self._insertions, name, [float(insertion)])
-        self._add(self._truths, name, [*values, *(round(share, 3) for share in share_seen)])
+        seen = [round(share, 3) for share in share_seen]
+        self._add(self._truths, name, [*values, *seen, *more])
         return name
 
     def close(self) -> None:
@@ -164,7 +174,7 @@ class ImageFolder:
         stream.flush()
         return stream
 
-    def _add(self, stream: TextIO, name: str, values: list[float | str] | list[float]) -> None:
+    def _add(self, stream: TextIO, name: str, values: Sequence[float | str]) -> None:
         try:
             # repr: what is read back is what was written, to the last bit.
             csv.writer(stream, lineterminator="\n").writerow(

@@ -133,6 +133,7 @@ def render_insertion(
     depth: float = 0.120,
     step: float = 0.001,
     curvature: float = CURVATURE,
+    begin: float = 0.0,
 ) -> Iterator[RenderedPair]:
     """Render a random insertion; the stage rests at its end if more frames are wanted.
 
@@ -145,13 +146,15 @@ def render_insertion(
     seed : int
         Keys path and images.
     frames : int
-        How many exposures; the first at insertion 0.
+        How many exposures.
     depth : float
         Where the stage stops [m].
     step : float
         Insertion from one exposure to the next [m].
     curvature : float
         Of the needle's path [1/m].
+    begin : float
+        Insertion of the first exposure [m].
 
     Returns
     -------
@@ -169,8 +172,8 @@ def render_insertion(
     def pairs() -> Iterator[RenderedPair]:
         plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=curvature)
         for number in range(frames):
-            insertion = min(number * step, depth)
-            _advance_to(plant, insertion, path.rotation)
+            insertion = min(begin + number * step, depth)
+            advance_to(plant, insertion, path.rotation)
             pose, line = plant.T_rig_tip, plant.centreline(_SPACING)
             yield RenderedPair(
                 number,
@@ -183,8 +186,18 @@ def render_insertion(
     return pairs()
 
 
-def _advance_to(plant: NeedlePlant, insertion: float, rotation: FloatArray) -> None:
-    """Push the needle along its path's pieces."""
+def advance_to(plant: NeedlePlant, insertion: float, rotation: FloatArray) -> None:
+    """Push a needle along a random path's pieces.
+
+    Parameters
+    ----------
+    plant : NeedlePlant
+        A single needle on that path.
+    insertion : float
+        How far in it is to be, at least as far as it is [m].
+    rotation : ndarray, shape (N,)
+        Of the base over each piece, as `RandomPath` has it [rad].
+    """
     while True:
         now = float(plant.insertion)
         piece = min(int(np.floor(now / _SPACING + 1e-9)), len(rotation) - 1)

@@ -6,6 +6,7 @@ import csv
 import itertools
 import json
 import math
+import sys
 from pathlib import Path
 
 import cv2
@@ -15,13 +16,14 @@ import pytest
 from needle_common.errors import UserError
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.insertions import random_path, render_insertion
-from needle_sim.camera.render_images import main
 from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.sequences.render_images import main
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
+TRACED = ("--renderer", "path_traced")
 COORDINATES = ("x_m", "y_m", "z_m", "pitch_rad", "yaw_rad", "shaft_pitch_rad", "shaft_yaw_rad")
 
 
@@ -83,6 +85,43 @@ def test_the_stage_rests_at_its_depth() -> None:
     np.testing.assert_array_equal(third.tip, fourth.tip)
 
 
+def test_the_first_frame_may_be_deep_in(tmp_path: Path) -> None:
+    words = ["--start-mm", "50", "--depth-mm", "52"]
+    assert main(arguments(tmp_path / "deep", *words)) == 0
+    whole = list(
+        render_insertion(
+            load_stereo_rig(CALIBRATION),
+            SCENARIOS["clean"],
+            seed=0,
+            frames=3,
+            depth=0.052,
+            step=0.026,
+        )
+    )
+    truths = rows(tmp_path / "deep" / "truth.csv")
+    assert [row["name"] for row in truths] == [f"{n:06d}.png" for n in range(3)]
+    assert whole[-1].truth is not None
+    assert [float(truths[-1][key]) for key in COORDINATES[:3]] == pytest.approx(
+        whole[-1].truth.tip, abs=1e-12
+    )
+
+
+@pytest.mark.parametrize("missing", ["mitsuba", "drjit"])
+def test_a_missing_extra_is_one_line_and_writes_nothing(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    missing: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    assert main(arguments(tmp_path / "out", *TRACED)) == 2
+    error = capsys.readouterr().err
+    assert "renderer path_traced needs Mitsuba 3, which is not installed" in error
+    assert "docs/dependencies.md" in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
 def test_random_paths_stay_inside_differ_and_are_smooth() -> None:
     ends = []
     for seed in range(12):
@@ -134,6 +173,12 @@ def test_truth_s_angles_give_the_directions_back() -> None:
         (["--step-mm", "0"], "--step-mm = 0 mm is outside"),
         (["--noise", "60"], "--noise = 60 grey levels is outside [0, 50]"),
         (["--calibration", "/nowhere.yaml"], "cannot read calibration /nowhere.yaml"),
+        (["--start-mm", "130"], "--start-mm = 130 mm is outside [0, 120]"),
+        (["--renderer", "slow"], "--renderer 'slow' is not one of quick, path_traced"),
+        (["--appearance", "random"], "--appearance is for renderer path_traced"),
+        ([*TRACED, "--scenario", "clean"], "--scenario is for renderer quick"),
+        ([*TRACED, "--noise", "2"], "--noise is for renderer quick"),
+        ([*TRACED, "--appearance", "fog"], "appearance 'fog' is not one of random"),
         (["--what"], "unrecognized arguments: --what; see --help"),
         (["--json", "/nowhere/done.json"], "--json /nowhere/done.json"),
     ],

@@ -1,0 +1,222 @@
+"""What a sequence looks like: metal, light, floor and dirt, drawn at random or by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Literal, get_args
+
+import numpy as np
+
+from needle_common.errors import UserError
+
+Metal = Literal["polished", "drawn", "oxide", "painted"]
+Lamps = Literal["softbox", "softboxes", "strip", "room"]
+Floor = Literal["grey", "dark", "light", "graph", "brushed", "cloth", "print", "panel"]
+
+METALS: tuple[Metal, ...] = get_args(Metal)
+LAMPS: tuple[Lamps, ...] = get_args(Lamps)
+FLOORS: tuple[Floor, ...] = get_args(Floor)
+
+_STREAM = 20
+_PLAIN_DIAMETER = 0.0007
+# Grey level of the floor under full light, by kind.
+_LEVELS: dict[Floor, tuple[float, float]] = {
+    "grey": (95.0, 165.0),
+    "dark": (22.0, 60.0),
+    "light": (150.0, 195.0),
+    "graph": (105.0, 190.0),
+    "brushed": (80.0, 170.0),
+    "cloth": (60.0, 165.0),
+    "print": (110.0, 195.0),
+    "panel": (140.0, 215.0),
+}
+# Roughness (GGX alpha) along the shaft, across it and of the ground face, by metal.
+_ROUGHNESS: dict[Metal, tuple[tuple[float, float], ...]] = {
+    "polished": ((0.05, 0.15), (0.05, 0.15), (0.05, 0.2)),
+    "drawn": ((0.2, 0.4), (0.1, 0.3), (0.05, 0.3)),
+    "oxide": ((0.2, 0.45), (0.2, 0.45), (0.1, 0.4)),
+    "painted": ((0.06, 0.3), (0.06, 0.3), (0.1, 0.35)),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Appearance:
+    """Look of a sequence; what stands where follows from `seed`.
+
+    Attributes
+    ----------
+    name : str
+        `random`, or as in `APPEARANCES`.
+    seed : int
+        Keys lamps' places, texture, bubbles, lint and noise.
+    needle : bool
+        Whether there is one.
+    metal : str
+        Of the shaft: one of `METALS`.
+    roughness_along, roughness_across, face_roughness : float
+        GGX alpha of the shaft, along and across, 0.05 to 0.45, and of the ground face, 0.05 to 0.4.
+    diameter : float
+        Of the shaft: 0.7 mm three times in five, else 0.5 to 1 mm [m].
+    bevel_angle : float
+        Between ground face and axis, 18 to 45 deg [rad].
+    hollow : bool
+        Whether the needle is a tube inside, too.
+    lean : float
+        Of the pre-bent last 9 mm against the heading, 0 or 2 to 6 deg [rad].
+    lamps : str
+        One of `LAMPS`.
+    room_light : float
+        Light of the room over that of the lamps, 0.04 to 0.6.
+    floor : str
+        One of `FLOORS`.
+    floor_height : float
+        x of the floor in `rig`, -35 to -18 mm [m].
+    floor_level : float
+        Median of the image without needle [grey levels].
+    floor_blur_px : float
+        How much less sharp the floor is than the needle, 0 to 2.5 px [px].
+    bubbles, lint, tracks : int
+        How many: 0 to 90, 0 to 25, 0 to 3 (paths of older needles).
+    haze : float
+        Share of the light that the phantom scatters on the way to the camera, 0 to 0.35.
+    blur_px : float
+        Standard deviation of the lens's blur at the needle, 0.3 to 1.1 px [px].
+    bloom : float
+        Share of what is above full scale that spreads around, 0 to 0.05.
+    noise : float
+        Standard deviation of the sensor's noise in the dark, 0.4 to 4 [grey levels].
+    shot_noise : float
+        Of the noise at full scale, from the light itself, 0.5 to 5 [grey levels].
+    flicker : float
+        Standard deviation of the exposure from pair to pair, 0 to 0.03.
+    """
+
+    name: str
+    seed: int
+    needle: bool
+    metal: Metal
+    roughness_along: float
+    roughness_across: float
+    face_roughness: float
+    diameter: float
+    bevel_angle: float
+    hollow: bool
+    lean: float
+    lamps: Lamps
+    room_light: float
+    floor: Floor
+    floor_height: float
+    floor_level: float
+    floor_blur_px: float
+    bubbles: int
+    lint: int
+    tracks: int
+    haze: float
+    blur_px: float
+    bloom: float
+    noise: float
+    shot_noise: float
+    flicker: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    """What a name fixes of an appearance; the rest is drawn.
+
+    Attributes
+    ----------
+    summary : str
+        One line for a person.
+    metal, lamps, floor : str or None
+        None is drawn.
+    needle : bool
+        Whether there is one.
+    """
+
+    summary: str
+    metal: Metal | None = None
+    lamps: Lamps | None = None
+    floor: Floor | None = None
+    needle: bool = True
+
+
+RANDOM = "random"
+
+APPEARANCES = {
+    RANDOM: Fixed("everything is drawn by the seed"),
+    "drawn_on_grey": Fixed("drawn steel under two softboxes", "drawn", "softboxes", "grey"),
+    "drawn_on_dark": Fixed("drawn steel under two softboxes", "drawn", "softboxes", "dark"),
+    "drawn_on_light": Fixed("drawn steel under a softbox", "drawn", "softbox", "light"),
+    "drawn_on_graph_paper": Fixed("drawn steel under a strip", "drawn", "strip", "graph"),
+    "drawn_on_brushed": Fixed("drawn steel over brushed metal", "drawn", "softbox", "brushed"),
+    "polished_over_cloth": Fixed("polished steel over cloth", "polished", "softboxes", "cloth"),
+    "polished_in_a_room": Fixed("polished steel in even light", "polished", "room", "grey"),
+    "oxide_on_grey": Fixed("dark oxide under two softboxes", "oxide", "softboxes", "grey"),
+    "oxide_over_lit_panel": Fixed("dark oxide against a lit panel", "oxide", "softbox", "panel"),
+    "painted_on_print": Fixed("black paint over printed paper", "painted", "softbox", "print"),
+    "absent": Fixed("no needle: bubbles, lint, print; all drawn by the seed", needle=False),
+}
+"""The names, and what each fixes."""
+
+
+def draw_appearance(name: str, seed: int) -> Appearance:
+    """Return the look of a name; the same seed gives the same.
+
+    Parameters
+    ----------
+    name : str
+        A key of `APPEARANCES`.
+    seed : int
+        Not negative.
+
+    Raises
+    ------
+    UserError
+        If there is no such name.
+    """
+    fixed = APPEARANCES.get(name)
+    if fixed is None:
+        raise UserError(f"appearance {name!r} is not one of {', '.join(APPEARANCES)}")
+    rng = np.random.default_rng([seed, 0, _STREAM])
+
+    def between(lower: float, upper: float) -> float:
+        return float(rng.uniform(lower, upper))
+
+    def some(share: float, lower: float, upper: float) -> float:
+        """Draw between the bounds in a share of all cases, else 0."""
+        value = between(lower, upper)
+        return value if rng.random() < share else 0.0
+
+    metal = METALS[rng.choice(len(METALS), p=[0.3, 0.35, 0.2, 0.15])]
+    lamps = LAMPS[rng.choice(len(LAMPS), p=[0.25, 0.4, 0.2, 0.15])]
+    floor = FLOORS[rng.integers(len(FLOORS))]
+    metal, lamps, floor = fixed.metal or metal, fixed.lamps or lamps, fixed.floor or floor
+    along, across, face = (between(*bounds) for bounds in _ROUGHNESS[metal])
+    return Appearance(
+        name=name,
+        seed=seed,
+        needle=fixed.needle,
+        metal=metal,
+        roughness_along=along,
+        roughness_across=across,
+        face_roughness=face,
+        diameter=some(0.4, 0.0005, 0.001) or _PLAIN_DIAMETER,
+        bevel_angle=float(np.deg2rad(between(18.0, 45.0))),
+        hollow=bool(rng.random() < 0.35),
+        lean=float(np.deg2rad(some(0.4, 2.0, 6.0))),
+        lamps=lamps,
+        room_light=between(0.2, 1.0) ** 2 * 0.6,
+        floor=floor,
+        floor_height=between(-0.035, -0.018),
+        floor_level=between(*_LEVELS[floor]),
+        floor_blur_px=some(0.7, 0.2, 2.5),
+        bubbles=round(some(0.8, 3.0, 90.0)),
+        lint=round(some(0.7, 1.0, 25.0)),
+        tracks=round(some(0.4, 0.51, 3.49)),
+        haze=some(0.4, 0.05, 0.35),
+        blur_px=between(0.3, 1.1),
+        bloom=some(0.6, 0.005, 0.05),
+        noise=between(0.4, 4.0),
+        shot_noise=between(0.5, 5.0),
+        flicker=some(0.6, 0.003, 0.03),
+    )

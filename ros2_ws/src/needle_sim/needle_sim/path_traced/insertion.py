@@ -1,0 +1,168 @@
+"""Random insertions of a metal needle and their path-traced images, without any graph."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from needle_sim.camera.image_folder import Truth, truth_of
+from needle_sim.camera.insertions import CURVATURE, RandomPath, advance_to, random_path
+from needle_sim.camera.optics import Optics
+from needle_sim.camera.stereo_rig import StereoRig
+from needle_sim.camera.view import GreyImage
+from needle_sim.needle.needle_shape import NeedleShape
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.needle.se3 import FloatArray, exp_twist
+from needle_sim.path_traced.appearance import Appearance
+from needle_sim.path_traced.needle_mesh import NeedleEnd, NeedleMesh, needle_mesh
+from needle_sim.path_traced.renderer import PathTracedRenderer
+from needle_sim.path_traced.tracer import Mitsuba
+
+_STREAM = 11
+_LARGEST_ANGLE = np.deg2rad(5.0)
+_LARGEST_OFFSET = 0.0003
+_SPACING = 0.0003
+_DISTAL_LENGTH = 0.01
+# Of the shaft before the phantom, from the sheath on [m].
+_OUTSIDE = 0.03
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class TracedPair:
+    """One exposure of an insertion.
+
+    Attributes
+    ----------
+    number : int
+        Of the exposure.
+    images : pair of ndarray of uint8
+        Left and right.
+    insertion : float
+        What the stage says [m].
+    truth : Truth or None
+        None where there is no needle in the phantom.
+    mesh : NeedleMesh or None
+        The needle that was drawn, with its extreme point and the middle of its face.
+    share_seen : pair of float
+        Of the needle's last 10 mm, by the left and the right camera.
+    """
+
+    number: int
+    images: tuple[GreyImage, GreyImage]
+    insertion: float
+    truth: Truth | None
+    mesh: NeedleMesh | None
+    share_seen: tuple[float, float]
+
+
+def trace_insertion(
+    mitsuba: Mitsuba,
+    rig: StereoRig,
+    look: Appearance,
+    *,
+    frames: int,
+    depth: float,
+    step: float = 0.001,
+    begin: float = 0.0,
+    curvature: float = CURVATURE,
+) -> Iterator[TracedPair]:
+    """Render a random insertion; the stage rests at its end if more frames are wanted.
+
+    The needle enters within 0.3 mm of the entry point and, as far as pitch and yaw together go,
+    within 5 deg of its direction; its path is drawn as that of `render_insertion`.
+
+    Parameters
+    ----------
+    mitsuba : Mitsuba
+        As `load_mitsuba` gives it.
+    rig : StereoRig
+        Cameras and phantom.
+    look : Appearance
+        What it looks like; its seed keys the path, too.
+    frames : int
+        How many exposures.
+    depth : float
+        Where the stage stops [m].
+    step : float
+        Insertion from one exposure to the next [m].
+    begin : float
+        Insertion of the first exposure [m].
+    curvature : float
+        Of the needle's path [1/m].
+
+    Returns
+    -------
+    iterator of TracedPair
+        One exposure after the other.
+
+    Raises
+    ------
+    UserError
+        If no path of this depth stays inside the phantom.
+    """
+    path = random_path(look.seed, depth, rig.surface_height, curvature)
+    plant = NeedlePlant(_entry(look.seed, path), curvature=curvature)
+    optics = [Optics(rig, camera, None) for camera in (rig.left, rig.right)]
+
+    def pairs() -> Iterator[TracedPair]:
+        renderer = PathTracedRenderer(mitsuba, rig, look)
+        for number in range(frames):
+            insertion = min(begin + number * step, depth)
+            advance_to(plant, insertion, path.rotation)
+            truth = mesh = None
+            seen = (0.0, 0.0)
+            if look.needle and insertion > 0.0:
+                pose = plant.T_rig_tip
+                line = _middle_line(plant, look)
+                end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
+                # It bends towards its sharp side.
+                mesh = needle_mesh(line, -pose[:3, 1], end)
+                truth = truth_of(pose, _shape(look))
+                distal = line[-int(_DISTAL_LENGTH / _SPACING) :]
+                seen = (_share_seen(distal, optics[0]), _share_seen(distal, optics[1]))
+            images = renderer.render(mesh, number)
+            yield TracedPair(number, images, insertion, truth, mesh, seen)
+
+    return pairs()
+
+
+def _entry(seed: int, path: RandomPath) -> FloatArray:
+    """Return the tip's pose at the entry, shape (4, 4) [m]: beside the entry point, turned aside.
+
+    The yaw turns the whole path about rig's x axis: it stays as deep under the surface.
+    """
+    rng = np.random.default_rng([seed, 0, _STREAM])
+    around, away = rng.uniform(0.0, 2.0 * np.pi), _LARGEST_OFFSET * np.sqrt(rng.uniform())
+    largest = np.sqrt(max(_LARGEST_ANGLE**2 - path.pitch**2, 0.0))
+    aside = exp_twist([0.0, 0.0, 0.0, rng.uniform(-largest, largest), 0.0, 0.0])
+    pose = aside @ initial_pose(path.pitch, path.roll)
+    pose[:2, 3] += away * np.array([np.cos(around), np.sin(around)])
+    return np.asarray(pose)
+
+
+def _shape(look: Appearance) -> NeedleShape:
+    """Return the bend before the needle's end; straight, its shaft has the tip's heading."""
+    if look.lean == 0.0:
+        return NeedleShape(diameter=look.diameter, bend_angle=0.0, lean=0.0)
+    # Half of the bend leans the end to one side of the path, half the shaft to the other.
+    return NeedleShape(diameter=look.diameter, bend_angle=2.0 * look.lean, lean=look.lean)
+
+
+def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:
+    """Return the needle's middle line from before the phantom to the end, (M, 3) [m]."""
+    line = plant.centreline(_SPACING)
+    if look.lean > 0.0:
+        line = _shape(look).middle_line(plant.T_rig_tip, line, _SPACING)
+    back = line[0] - line[1]
+    back /= np.linalg.norm(back)
+    before = np.arange(int(_OUTSIDE / _SPACING), 0, -1)[:, np.newaxis] * _SPACING
+    return np.concatenate([line[0] + before * back, line])
+
+
+def _share_seen(points: FloatArray, optics: Optics) -> float:
+    """Return the share of points (N, 3) in `rig` that are in a camera's image."""
+    pixels = optics.project(points)
+    seen = np.all((pixels >= 0.0) & (pixels <= np.subtract(optics.image_size, 1.0)), axis=1)
+    return float(seen.mean())

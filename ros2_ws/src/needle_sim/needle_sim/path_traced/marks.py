@@ -1,0 +1,109 @@
+"""Thin things in the phantom that are drawn, not traced: lint, dust, and paths of older needles."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from needle_sim.camera.insertions import CURVATURE, advance_to, random_path
+from needle_sim.camera.optics import FloatImage, Optics
+from needle_sim.camera.stereo_rig import StereoRig
+from needle_sim.camera.stroke import stroke
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.path_traced.appearance import Appearance
+
+_STREAM = 32
+_SPACING = 0.0004
+# Where lint is: heights over the floor's, to both sides, along the needle [m].
+_SIDE = 0.055
+_LENGTHS = (0.004, 0.14)
+_FIBRE_LENGTHS = (0.0005, 0.007)
+_FIBRE_DIAMETERS = (0.00003, 0.00012)
+_DUST_SHARE = 0.5
+_DUST_LENGTH = 0.0001
+_DUST_DIAMETERS = (0.00008, 0.0003)
+_LINT_BLUR_PX = 0.4
+_TRACK_DIAMETERS = (0.0003, 0.0009)
+_TRACK_DEPTHS = (0.03, 0.12)
+_TRACK_STRENGTH = (0.03, 0.14)
+# Clouds come and go over such a length, and thin out over the last of it [m].
+_CLOUD_LENGTH = 0.005
+# A track's edge is no edge: it blurs over this [px].
+_TRACK_BLUR_PX = 1.5
+
+
+class Marks:
+    """Lint and old paths of one phantom; each camera sees the same ones.
+
+    Parameters
+    ----------
+    look : Appearance
+        How many, and the seed.
+    rig : StereoRig
+        The phantom.
+    """
+
+    def __init__(self, look: Appearance, rig: StereoRig) -> None:
+        rng = np.random.default_rng([look.seed, 0, _STREAM])
+        self._lines: list[tuple[FloatArray, float, FloatArray, float]] = []
+        for _ in range(look.tracks):
+            self._add_track(rng, rig)
+        for _ in range(look.lint):
+            self._add_lint(rng, look, rig)
+
+    def draw(self, image: FloatImage, optics: Optics, white: float) -> None:
+        """Draw them over an image of the floor.
+
+        Parameters
+        ----------
+        image : ndarray of float32
+            Radiance; changed.
+        optics : Optics
+            The camera.
+        white : float
+            Radiance of light lint and of clouded gel [of the image's unit].
+        """
+        for line, diameter, grey, blur in self._lines:
+            seen = stroke(
+                optics.project(line),
+                optics.radius_px(line, diameter / 2.0),
+                blur,
+                optics.image_size,
+            )
+            there = (seen.row, seen.column)
+            strength = np.abs(grey)[seen.sample]
+            colour = np.where(grey[seen.sample] > 0.0, white, 0.0)
+            image[there] += seen.coverage * strength * (colour - image[there])
+
+    def _add_lint(self, rng: np.random.Generator, look: Appearance, rig: StereoRig) -> None:
+        """Add a fibre that is bent and turned at random, or a speck; light or dark."""
+        low = [look.floor_height, -_SIDE, _LENGTHS[0]]
+        high = [rig.surface_height - 0.001, _SIDE, _LENGTHS[1]]
+        middle = rng.uniform(low, high)
+        is_dust = rng.random() < _DUST_SHARE
+        length = _DUST_LENGTH if is_dust else rng.uniform(*_FIBRE_LENGTHS)
+        diameter = rng.uniform(*(_DUST_DIAMETERS if is_dust else _FIBRE_DIAMETERS))
+        count = max(int(length / _SPACING), 2) + 1
+        at = np.linspace(-0.5, 0.5, count)[:, np.newaxis]
+        along, bent = rng.standard_normal((2, 3)) * [0.3, 1.0, 1.0]
+        along /= np.linalg.norm(along)
+        line = middle + length * (at * along + 0.5 * (at * at) * bent)
+        strength = rng.uniform(0.3, 1.0) * rng.choice([-1.0, 1.0])
+        self._lines.append((line, float(diameter), np.full(count, strength), _LINT_BLUR_PX))
+
+    def _add_track(self, rng: np.random.Generator, rig: StereoRig) -> None:
+        """Add the path of an older needle: gel that is torn and clouded, unevenly."""
+        depth = rng.uniform(*_TRACK_DEPTHS)
+        path = random_path(int(rng.integers(2**31)), depth, rig.surface_height, CURVATURE)
+        plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=CURVATURE)
+        advance_to(plant, depth, path.rotation)
+        line = plant.centreline(_SPACING)
+        line[:, 1] += rng.uniform(-0.01, 0.01)
+        smooth = np.hanning(round(2.0 * _CLOUD_LENGTH / _SPACING))
+        cloud = np.convolve(rng.standard_normal(len(line)), smooth / np.linalg.norm(smooth), "same")
+        strength = rng.uniform(*_TRACK_STRENGTH) * np.clip(1.0 + 0.6 * cloud, 0.0, 2.5)
+        left = np.arange(len(line))[::-1] * _SPACING
+        strength *= np.clip(left / _CLOUD_LENGTH, 0.0, 1.0)
+        sign = 1.0 if rng.random() < 0.7 else -1.0
+        diameter = float(rng.uniform(*_TRACK_DIAMETERS))
+        self._lines.append((line, diameter, sign * strength, _TRACK_BLUR_PX))

@@ -1,0 +1,190 @@
+"""Tracing of paths: what stands before the floor as a layer, and the light on the floor."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.path_traced.refracted_rays import refracted_rays
+from needle_sim.path_traced.scene import Scene
+from needle_sim.path_traced.tracer import MM, Mitsuba
+
+PixelArray = NDArray[np.int64]
+
+_DEPTH = 6
+# No path is brighter than this many times the brightest lamp: it would leave a spark.
+_BRIGHTEST = 1.5
+_MOST_PATHS = 4_000_000
+
+
+class PathTracer:
+    """Traces what a camera sees in a scene, and the light on its floor.
+
+    Parameters
+    ----------
+    mitsuba : Mitsuba
+        As `load_mitsuba` gives it.
+    """
+
+    def __init__(self, mitsuba: Mitsuba) -> None:
+        self._mi, self._dr = mitsuba
+        self._integrator = self._mi.load_dict({"type": "path", "max_depth": _DEPTH})
+
+    def layer(
+        self,
+        scene: Scene,
+        pixels: PixelArray,
+        camera: Camera,
+        rig: StereoRig,
+        *,
+        samples: int,
+        seed: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return light and coverage of what stands before the floor.
+
+        Parameters
+        ----------
+        scene : Scene
+            What is there.
+        pixels : ndarray of int, shape (N, 2)
+            u, v of the pixels [px].
+        camera : Camera
+            Who sees it.
+        rig : StereoRig
+            The phantom that it looks into.
+        samples : int
+            Paths a pixel, evenly over its area.
+        seed : int
+            Keys them.
+
+        Returns
+        -------
+        light : ndarray, shape (N,)
+            Mean radiance of a pixel's paths, those that meet the floor first counted as 0.
+        cover : ndarray, shape (N,)
+            Share of the paths that meet something else first.
+        """
+        parts = [
+            self._part(scene, part, camera, rig, samples=samples, seed=seed + number)
+            for number, part in enumerate(
+                np.array_split(pixels, max(1, -(-len(pixels) * samples // _MOST_PATHS)))
+            )
+            if len(part)
+        ]
+        if not parts:
+            return np.zeros(0), np.zeros(0)
+        light, cover = (np.concatenate(which) for which in zip(*parts, strict=True))
+        return light, cover
+
+    def covered(
+        self, scene: Scene, pixels: PixelArray, camera: Camera, rig: StereoRig
+    ) -> NDArray[np.bool_]:
+        """Return at which pixels, (N, 2), something stands before the floor, in their middle."""
+        mi = self._mi
+        rays = refracted_rays(pixels, camera, rig)
+        origin = mi.Point3f(*(MM * rays.origin.T).astype(np.float32))
+        direction = mi.Vector3f(*rays.direction.T.astype(np.float32))
+        hit = scene.tracer.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
+        before = hit.is_valid() & (hit.shape != mi.ShapePtr(scene.floor))
+        return np.asarray(before, dtype=np.bool_)
+
+    def floor_light(
+        self, scenes: list[Scene], points: FloatArray, *, samples: int, seed: int
+    ) -> list[FloatArray]:
+        """Return the light that falls on places of the floor in each of several scenes.
+
+        Only what comes straight from lamps and room counts. The scenes' light is sampled alike, so
+        that their ratio shows what stands in the way and no noise.
+
+        Parameters
+        ----------
+        scenes : list of Scene
+            With the same lamps.
+        points : ndarray, shape (N, 3)
+            In `rig` [m].
+        samples : int
+            Paths for each point.
+        seed : int
+            Keys them.
+
+        Returns
+        -------
+        list of ndarray, shape (N,)
+            Irradiance over pi: the radiance of a white floor.
+        """
+        mi = self._mi
+        sampler = self._sampler(seed, len(points) * samples)
+        index = self._index(len(points), samples)
+        at = self._dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
+        at.p = self._gather(MM * points, index)
+        at.n = mi.Normal3f(1.0, 0.0, 0.0)
+        towards, weight = scenes[0].tracer.sample_emitter_direction(
+            at, sampler.next_2d(), test_visibility=False
+        )
+        light = weight.x * self._dr.maximum(towards.d.x, 0.0) / np.pi
+        ray = at.spawn_ray_to(towards.p)
+        return [
+            self._mean(self._dr.select(scene.tracer.ray_test(ray), 0.0, light), samples)
+            for scene in scenes
+        ]
+
+    def _part(
+        self,
+        scene: Scene,
+        pixels: PixelArray,
+        camera: Camera,
+        rig: StereoRig,
+        *,
+        samples: int,
+        seed: int,
+    ) -> tuple[FloatArray, FloatArray]:
+        mi = self._mi
+        sampler = self._sampler(seed, len(pixels) * samples)
+        index = self._index(len(pixels), samples)
+        # Within a pixel origin and direction are as good as linear.
+        half = np.array([[0.5, 0.0], [0.0, 0.5]])
+        middle = refracted_rays(pixels, camera, rig)
+        right, left, down, up = (
+            refracted_rays(pixels + shift, camera, rig)
+            for shift in (half[0], -half[0], half[1], -half[1])
+        )
+        place = sampler.next_2d() - 0.5
+        origin = (
+            self._gather(MM * middle.origin, index)
+            + place.x * self._gather(MM * (right.origin - left.origin), index)
+            + place.y * self._gather(MM * (down.origin - up.origin), index)
+        )
+        direction = (
+            self._gather(middle.direction, index)
+            + place.x * self._gather(right.direction - left.direction, index)
+            + place.y * self._gather(down.direction - up.direction, index)
+        )
+        ray = mi.RayDifferential3f(
+            mi.Ray3f(mi.Point3f(origin), mi.Vector3f(self._dr.normalize(direction)))
+        )
+        hit = scene.tracer.ray_intersect_preliminary(ray, coherent=True)
+        before = hit.is_valid() & (hit.shape != mi.ShapePtr(scene.floor))
+        light, _, _ = self._integrator.sample(scene.tracer, sampler, ray, None, before)
+        cover = self._dr.select(before, mi.Float(1.0), 0.0)
+        return self._mean(cover * light.x, samples), self._mean(cover, samples)
+
+    def _sampler(self, seed: int, size: int) -> Any:
+        sampler = self._mi.load_dict({"type": "independent"})
+        sampler.seed(seed, size)
+        return sampler
+
+    def _index(self, count: int, samples: int) -> Any:
+        return self._dr.arange(self._mi.UInt32, count * samples) // samples
+
+    def _gather(self, points: FloatArray, index: Any) -> Any:
+        flat = self._mi.Float(points.astype(np.float32).ravel())
+        return self._dr.gather(self._mi.Vector3f, flat, index)
+
+    @staticmethod
+    def _mean(values: Any, samples: int) -> FloatArray:
+        each = np.clip(np.asarray(values).reshape(-1, samples), 0.0, _BRIGHTEST)
+        return np.asarray(each.mean(axis=1, dtype=np.float64))

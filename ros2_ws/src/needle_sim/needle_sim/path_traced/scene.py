@@ -1,0 +1,293 @@
+"""The scene that is traced: floor, box, bubbles, lamps, room and needle.
+
+Lines of sight are refracted before they get here (`refracted_rays`), so that the scene has no
+surface: the light comes straight from lamps that stand where the middle of the phantom sees them,
+and what would be reflected back into the phantom below the critical angle is a ring of the floor's
+brightness in the room's light.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from needle_sim.camera.bubbles import BubbleCloud
+from needle_sim.camera.stereo_rig import StereoRig
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.path_traced import floors
+from needle_sim.path_traced.appearance import Appearance, Metal
+from needle_sim.path_traced.floors import ALBEDO, FloorPicture
+from needle_sim.path_traced.lamps import MIDDLE, Lamp, apparent_centre, irradiance
+from needle_sim.path_traced.needle_mesh import Mesh
+from needle_sim.path_traced.tracer import MM, Mitsuba
+
+# Steel at 580 nm, against air.
+_STEEL_INDEX = 2.9
+_STEEL_EXTINCTION = 3.1
+_PAINT_INDEX = 1.5
+_DARK: dict[Metal, float] = {"oxide": 0.05, "painted": 0.02}
+_BOX_SIDE = 0.07
+_BOX_END = 0.155
+_BOX_WALLS = (0.003, 0.008)
+_SHEATH_LENGTH = 0.04
+_SHEATH_RADIUS = 0.0015
+# Pixels of the room's light: height over the horizon by direction around.
+_SKY = (64, 32)
+# The floor in the scene is only seen in mirrors: coarser than in the image.
+_COARSER = 4
+PANEL_RADIANCE = 1.0
+"""Of a lit panel, as of the brightest lamp."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class World:
+    """All that stands still in a sequence.
+
+    Attributes
+    ----------
+    rig : StereoRig
+        Phantom and cameras.
+    look : Appearance
+        Kinds and amounts.
+    lamps : list of Lamp
+        Where the light comes from.
+    room : float
+        Radiance of the room, against the brightest lamp's.
+    picture : FloorPicture
+        The floor.
+    bubbles : BubbleCloud or None
+        Air in the phantom.
+    wall : float
+        Thickness of the box's walls [m].
+    wall_albedo : float
+        Share of the light that they give back.
+    """
+
+    rig: StereoRig
+    look: Appearance
+    lamps: list[Lamp]
+    room: float
+    picture: FloorPicture
+    bubbles: BubbleCloud | None
+    wall: float
+    wall_albedo: float
+
+
+def room_radiance(look: Appearance, lamps: list[Lamp], rig: StereoRig) -> float:
+    """Return the radiance of the room that gives `look.room_light` of the lamps' light."""
+    if not lamps:
+        return 1.0
+    return look.room_light * irradiance(lamps, rig) / np.pi
+
+
+class Scene:
+    """A world in the tracer's hands, with or without a needle.
+
+    Parameters
+    ----------
+    mitsuba : Mitsuba
+        As `load_mitsuba` gives it.
+    world : World
+        What stands still.
+    needle : dict of str to Mesh, optional
+        Parts of the needle; their shape may change later, their number not.
+    """
+
+    def __init__(
+        self, mitsuba: Mitsuba, world: World, needle: dict[str, Mesh] | None = None
+    ) -> None:
+        self._mi = mitsuba.mi
+        parts: dict[str, Any] = {"type": "scene", **self._box(world), **self._light(world)}
+        self.floor = self._mi.load_dict(self._floor(world))
+        parts["floor"] = self.floor
+        if world.bubbles is not None:
+            parts |= self._bubbles(world.bubbles, world.rig.refractive_index)
+        for name, mesh in (needle or {}).items():
+            parts[name] = self._mesh(name, mesh, self._metal(world, name))
+        self.tracer = self._mi.load_dict(parts)
+        self._parameters = self._mi.traverse(self.tracer)
+
+    def bend(self, needle: dict[str, Mesh]) -> None:
+        """Put the needle's parts elsewhere."""
+        for name, mesh in needle.items():
+            self._set(self._parameters, f"{name}.", mesh)
+        self._parameters.update()
+
+    def _set(self, parameters: Any, prefix: str, mesh: Mesh) -> None:
+        flat = self._mi.Float
+        parameters[prefix + "vertex_positions"] = flat((MM * mesh.points).astype("f4").ravel())
+        parameters[prefix + "vertex_normals"] = flat(mesh.normals.astype("f4").ravel())
+
+    def _mesh(self, name: str, mesh: Mesh, material: dict[str, Any]) -> Any:
+        mi = self._mi
+        properties = mi.Properties()
+        properties["bsdf"] = mi.load_dict(material)
+        shape = mi.Mesh(
+            name,
+            len(mesh.points),
+            len(mesh.faces),
+            has_vertex_normals=True,
+            has_vertex_texcoords=True,
+            props=properties,
+        )
+        parameters = mi.traverse(shape)
+        self._set(parameters, "", mesh)
+        parameters["faces"] = mi.UInt32(mesh.faces.ravel())
+        parameters["vertex_texcoords"] = mi.Float(mesh.texture.astype("f4").ravel())
+        parameters.update()
+        return shape
+
+    def _metal(self, world: World, part: str) -> dict[str, Any]:
+        look, index = world.look, world.rig.refractive_index
+        if part == "bore":
+            return _both_sides({"type": "diffuse", "reflectance": 0.03})
+        along, across = look.roughness_along, look.roughness_across
+        if part == "face":
+            along = across = look.face_roughness
+        # Grinding takes paint off, and leaves oxide steel bare.
+        dark = None if part == "face" else _DARK.get(look.metal)
+        if dark is None:
+            return _both_sides(
+                {
+                    "type": "roughconductor",
+                    "distribution": "ggx",
+                    "eta": _STEEL_INDEX / index,
+                    "k": _STEEL_EXTINCTION / index,
+                    "alpha_u": along,
+                    "alpha_v": across,
+                }
+            )
+        return _both_sides(
+            {
+                "type": "roughplastic",
+                "distribution": "ggx",
+                "int_ior": _PAINT_INDEX,
+                "ext_ior": index,
+                "diffuse_reflectance": dark,
+                "alpha": along,
+            }
+        )
+
+    def _floor(self, world: World) -> dict[str, Any]:
+        height, half_z = world.look.floor_height, (floors.END - floors.BEGIN) / 2.0
+        transform = self._transform().look_at(
+            origin=_mm([height, 0.0, floors.BEGIN + half_z]),
+            target=_mm([height + 1.0, 0.0, floors.BEGIN + half_z]),
+            up=[0.0, 1.0, 0.0],
+        )
+        shape: dict[str, Any] = {
+            "type": "rectangle",
+            "to_world": transform @ self._transform().scale([MM * half_z, MM * floors.SIDE, 1.0]),
+        }
+        picture = world.picture.reflectance[::_COARSER, ::_COARSER, np.newaxis]
+        if world.look.floor == "panel":
+            shape["emitter"] = {"type": "area", "radiance": PANEL_RADIANCE}
+            picture = np.full_like(picture, ALBEDO["panel"])
+        shape["bsdf"] = {
+            "type": "diffuse",
+            "reflectance": {
+                "type": "bitmap",
+                "bitmap": self._mi.Bitmap(np.ascontiguousarray(picture[::-1])),
+                "raw": True,
+                "wrap_mode": "clamp",
+            },
+        }
+        return shape
+
+    def _box(self, world: World) -> dict[str, Any]:
+        """Return the box's walls and the sheath before it, through which the needle comes."""
+        top, bottom, wall = world.rig.surface_height, world.look.floor_height, world.wall
+        # Half sides and middles: front (where the needle enters), far end, both sides.
+        high = (top - bottom) / 2.0
+        middle = (top + bottom) / 2.0 - 1e-5
+        long = (_BOX_END + 2.0 * wall) / 2.0
+        walls = {
+            "front": ([middle, 0.0, -wall / 2.0], [high, _BOX_SIDE, wall / 2.0]),
+            "end": ([middle, 0.0, _BOX_END + wall / 2.0], [high, _BOX_SIDE, wall / 2.0]),
+            "left": ([middle, -_BOX_SIDE - wall / 2.0, long - wall], [high, wall / 2.0, long]),
+            "right": ([middle, _BOX_SIDE + wall / 2.0, long - wall], [high, wall / 2.0, long]),
+        }
+        material = self._mi.load_dict({"type": "diffuse", "reflectance": world.wall_albedo})
+        parts = {
+            name: {
+                "type": "cube",
+                "to_world": self._transform().translate(_mm(centre)).scale(_mm(half)),
+                "bsdf": material,
+            }
+            for name, (centre, half) in walls.items()
+        }
+        parts["sheath"] = {
+            "type": "cylinder",
+            "p0": _mm([0.0, 0.0, -_SHEATH_LENGTH - wall]),
+            "p1": _mm([0.0, 0.0, -wall]),
+            "radius": MM * _SHEATH_RADIUS,
+            "bsdf": _both_sides({"type": "roughconductor", "alpha": 0.2}),
+        }
+        return parts
+
+    def _light(self, world: World) -> dict[str, Any]:
+        parts: dict[str, Any] = {}
+        for number, lamp in enumerate(world.lamps):
+            centre = apparent_centre(lamp, world.rig)
+            transform = self._transform().look_at(
+                origin=_mm(centre), target=_mm(MIDDLE), up=[0.0, 0.0, 1.0]
+            )
+            across, along = lamp.half_sides[::-1] if lamp.turned else lamp.half_sides
+            parts[f"lamp_{number}"] = {
+                "type": "rectangle",
+                "to_world": transform @ self._transform().scale([MM * across, MM * along, 1.0]),
+                "emitter": {"type": "area", "radiance": lamp.radiance},
+            }
+        # The picture's up is y: turned to x.
+        parts["room"] = {
+            "type": "envmap",
+            "bitmap": self._mi.Bitmap(_sky(world)[..., np.newaxis]),
+            "to_world": self._transform().rotate([0.0, 0.0, 1.0], -90.0),
+        }
+        return parts
+
+    def _bubbles(self, cloud: BubbleCloud, index: float) -> dict[str, Any]:
+        air = self._mi.load_dict({"type": "dielectric", "int_ior": 1.0, "ext_ior": index})
+        return {
+            f"bubble_{number}": {
+                "type": "sphere",
+                "center": _mm(centre),
+                "radius": MM * float(radius),
+                "bsdf": air,
+            }
+            for number, (centre, radius) in enumerate(zip(cloud.centre, cloud.radius, strict=True))
+        }
+
+    def _transform(self) -> Any:
+        return self._mi.ScalarTransform4f()
+
+
+def _sky(world: World) -> FloatArray:
+    """Return the room's radiance by direction: rows from the zenith down, columns around."""
+    look, rng = world.look, np.random.default_rng([world.look.seed, 0, 31])
+    rows, columns = _SKY
+    polar = (np.arange(rows) + 0.5) / rows * np.pi
+    around = (np.arange(columns) + 0.5) / columns * 2.0 * np.pi
+    phase, strength = rng.uniform(0.0, 2.0 * np.pi, 3), rng.uniform(0.0, 0.5)
+    waves = sum(
+        np.cos((turns + 1) * around + shift) / (turns + 1) for turns, shift in enumerate(phase)
+    )
+    sky = world.room * (1.0 + strength * np.sin(polar)[:, np.newaxis] * waves / 1.9)
+    # Beyond the critical angle the surface mirrors what is in the phantom: mostly its floor.
+    light = irradiance(world.lamps, world.rig) / np.pi + world.room
+    mirrored = ALBEDO[look.floor] * light
+    if look.floor == "panel":
+        mirrored += PANEL_RADIANCE
+    total = np.sin(polar) > 1.0 / world.rig.refractive_index
+    sky[total] = mirrored
+    return np.asarray(np.maximum(sky, 0.0), dtype=np.float32)
+
+
+def _both_sides(material: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "twosided", "material": material}
+
+
+def _mm(point: Any) -> list[float]:
+    return [MM * float(part) for part in point]

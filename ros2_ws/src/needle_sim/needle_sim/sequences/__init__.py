@@ -1,0 +1,1 @@
+"""Image sequences on the command line, by either renderer."""

@@ -1,0 +1,243 @@
+"""`ros2 run needle_sim render_images`: image sequences without any graph."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from ament_index_python.packages import get_package_share_directory
+from tqdm import tqdm
+
+from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_common.commands.options import CommandParser, number, output_file, whole_number
+from needle_common.errors import UserError
+from needle_sim.camera.image_folder import ImageFolder
+from needle_sim.camera.insertions import CURVATURE, render_insertion
+from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
+from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
+from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, draw_appearance
+from needle_sim.path_traced.insertion import trace_insertion
+from needle_sim.path_traced.tracer import load_mitsuba
+from needle_sim.path_traced.truth_columns import TRUTH_COLUMNS, truth_values
+
+RENDERERS = ("quick", "path_traced")
+
+DESCRIPTION = """\
+Render the stereo images of a needle that goes into a phantom on a random, steered-like path.
+
+The folder gets left/NNNNNN.png, right/NNNNNN.png, calibration.yaml, insertion.csv (name,
+insertion_m) and truth.csv: the tip, pitch and yaw of heading and of the visible shaft's end, and
+the share of the last 10 mm that each camera sees. Fields are empty where there is no needle. The
+first frame is at insertion 0, or at --start-mm; where the depth is reached, the stage rests.
+
+Renderer quick draws a line of the needle's width with a scenario's troubles. Renderer path_traced
+follows the light in a scene of metal, lamps and floor, which an appearance names; truth.csv then
+has the bevel, too. It needs an extra that is not installed by default (docs/dependencies.md).
+"""
+
+EPILOG = """\
+examples:
+  ros2 run needle_sim render_images --output /tmp/clutter --scenario clutter
+  ros2 run needle_sim render_images --output /tmp/empty --scenario absent --frames 720 --step-mm 0.2
+  ros2 run needle_sim render_images --output /tmp/traced --renderer path_traced --seed 7 \\
+      --start-mm 54 --depth-mm 60
+
+exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class RenderOptions:
+    """Options of `render_images`; SI."""
+
+    output: Path
+    look: Scenario | Appearance
+    frames: int
+    seed: int
+    begin: float
+    depth: float
+    step: float
+    curvature: float
+    calibration: Path | None
+    json: Path | None
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `render_images`; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: render_images(parse(words)))
+
+
+def render_images(options: RenderOptions) -> int:
+    """Render what was asked for."""
+    begin = time.perf_counter()
+    calibration = options.calibration
+    if calibration is None:
+        shared = Path(get_package_share_directory("needle_tracker"))
+        calibration = shared / "config" / "calibration.yaml"
+    rig = load_stereo_rig(calibration)
+    look = options.look
+    if isinstance(look, Scenario):
+        done = _quick(rig, look, options, calibration)
+    else:
+        done = _path_traced(rig, look, options, calibration)
+    for _ in tqdm(
+        done,
+        total=options.frames,
+        unit="pair",
+        delay=1.0,
+        leave=False,
+        disable=not sys.stderr.isatty(),
+    ):
+        pass
+    wall = time.perf_counter() - begin
+    print(f"{options.frames} pairs of {look.name} in {options.output}, {wall:.1f} s")
+    if options.json is not None:
+        kind = "scenario" if isinstance(look, Scenario) else "appearance"
+        result: dict[str, JsonValue] = {
+            "renderer": RENDERERS[isinstance(look, Appearance)],
+            kind: look.name,
+            "frames": options.frames,
+            "seed": options.seed,
+            "output": str(options.output),
+            "wall_s": wall,
+        }
+        write_json(options.json, result)
+    return EXIT_DONE
+
+
+def parse(arguments: Sequence[str]) -> RenderOptions:
+    """Return the options of a command line (without the program's name).
+
+    Raises
+    ------
+    UserError
+        Anything that cannot be rendered as asked.
+    """
+    given = _parser().parse_args(arguments)
+    depth = number("--depth-mm", given.depth_mm, 1.0, 300.0, "mm") / 1e3
+    step = number("--step-mm", given.step_mm, 0.001, 50.0, "mm") / 1e3
+    begin = number("--start-mm", given.start_mm, 0.0, depth * 1e3, "mm") / 1e3
+    frames = math.ceil((depth - begin) / step - 1e-9) + 1
+    if given.frames is not None:
+        frames = whole_number("--frames", given.frames, 1, 999_999)
+    seed = whole_number("--seed", given.seed, 0, 2**31 - 1)
+    return RenderOptions(
+        output=Path(given.output).expanduser(),
+        look=_look(given.renderer, given.scenario, given.appearance, given.noise, seed),
+        frames=frames,
+        seed=seed,
+        begin=begin,
+        depth=depth,
+        step=step,
+        curvature=number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
+        calibration=None if given.calibration is None else Path(given.calibration).expanduser(),
+        json=output_file("--json", given.json),
+    )
+
+
+def _look(
+    renderer: str, scenario: str | None, appearance: str | None, noise: str | None, seed: int
+) -> Scenario | Appearance:
+    """Return what is to be seen; refuses options that belong to the other renderer."""
+    if renderer not in RENDERERS:
+        raise UserError(f"--renderer {renderer!r} is not one of {', '.join(RENDERERS)}")
+    if renderer == "path_traced":
+        for name, text in (("--scenario", scenario), ("--noise", noise)):
+            if text is not None:
+                raise UserError(f"{name} is for renderer quick; path_traced takes --appearance")
+        return draw_appearance(RANDOM if appearance is None else appearance, seed)
+    if appearance is not None:
+        raise UserError("--appearance is for renderer path_traced; quick takes --scenario")
+    look = find_scenario(CLEAN.name if scenario is None else scenario)
+    if noise is not None:
+        return dataclasses.replace(look, noise=number("--noise", noise, 0.0, 50.0, "grey levels"))
+    return look
+
+
+def _quick(
+    rig: StereoRig, scenario: Scenario, options: RenderOptions, calibration: Path
+) -> Iterator[None]:
+    """Write one quickly rendered pair after the other."""
+    pairs = render_insertion(
+        rig,
+        scenario,
+        seed=options.seed,
+        frames=options.frames,
+        depth=options.depth,
+        step=options.step,
+        curvature=options.curvature,
+        begin=options.begin,
+    )
+    with ImageFolder(options.output, calibration) as folder:
+        for pair in pairs:
+            folder.write(pair.number, pair.images, pair.insertion, pair.truth, pair.share_seen)
+            yield
+
+
+def _path_traced(
+    rig: StereoRig, look: Appearance, options: RenderOptions, calibration: Path
+) -> Iterator[None]:
+    """Write one path-traced pair after the other."""
+    pairs = trace_insertion(
+        load_mitsuba(),
+        rig,
+        look,
+        frames=options.frames,
+        depth=options.depth,
+        step=options.step,
+        curvature=options.curvature,
+        begin=options.begin,
+    )
+    with ImageFolder(options.output, calibration, TRUTH_COLUMNS) as folder:
+        for pair in pairs:
+            folder.write(
+                pair.number,
+                pair.images,
+                pair.insertion,
+                pair.truth,
+                pair.share_seen,
+                more=truth_values(look, pair),
+            )
+            yield
+
+
+def _parser() -> CommandParser:
+    parser = CommandParser(
+        "render_images",
+        DESCRIPTION,
+        "scenarios (renderer quick):\n"
+        + "".join(f"  {name:22}{one.summary}\n" for name, one in SCENARIOS.items())
+        + "\nappearances (renderer path_traced):\n"
+        + "".join(f"  {name:22}{one.summary}\n" for name, one in APPEARANCES.items())
+        + "\n"
+        + EPILOG,
+    )
+    add = parser.add_argument
+    add("--output", required=True, metavar="DIR", help="new or empty folder")
+    add("--renderer", default="quick", metavar="R", help="quick or path_traced (default: quick)")
+    add("--scenario", metavar="NAME", help="of quick, see below (default: clean)")
+    add("--appearance", metavar="NAME", help="of path_traced, see below (default: random)")
+    add("--frames", metavar="N", help="how many pairs (default: to the depth)")
+    add("--seed", default="0", metavar="N", help="keys path and images (default: 0)")
+    add("--start-mm", default="0", metavar="D", help="insertion of the first frame (default: 0)")
+    add("--depth-mm", default="120", metavar="D", help="where the stage stops (default: 120)")
+    add("--step-mm", default="1", metavar="S", help="insertion between frames (default: 1)")
+    add(
+        "--curvature",
+        default=repr(CURVATURE),
+        metavar="K",
+        help=f"of the needle's path [1/m] (default: {CURVATURE:.3f})",
+    )
+    add("--noise", metavar="SIGMA", help="of quick's sensor [grey levels] (default: scenario's)")
+    add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's own)")
+    add("--json", metavar="FILE", help="write what was done as one flat JSON object")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

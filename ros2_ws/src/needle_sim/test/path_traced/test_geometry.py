@@ -1,0 +1,97 @@
+"""Where things are: rays against the quick renderer's projection, the mesh against its words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from needle_sim.camera.projection import camera_centre, project
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.path_traced.appearance import LAMPS, Lamps
+from needle_sim.path_traced.lamps import MIDDLE, apparent_centre, place_lamps
+from needle_sim.path_traced.needle_mesh import NeedleEnd, needle_mesh
+from needle_sim.path_traced.refracted_rays import points_at_height, refracted_rays
+
+CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
+RIG = load_stereo_rig(CALIBRATION)
+
+
+def bent_line() -> tuple[np.ndarray, np.ndarray]:
+    """Return a middle line of curvature 8 / m in a slanting plane, and the side it bends to."""
+    aside = np.array([0.6, 0.8, 0.0])
+    angle = np.linspace(0.0, 0.4, 201)[:, np.newaxis]
+    line = 0.125 * (np.sin(angle) * [0.0, 0.0, 1.0] + (1.0 - np.cos(angle)) * aside)
+    return line, aside
+
+
+@pytest.mark.parametrize("height", [0.0174, 0.003, -0.035])
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_a_pixel_s_ray_meets_what_is_projected_there(side: str, height: float) -> None:
+    camera = RIG.left if side == "left" else RIG.right
+    u, v = np.meshgrid(np.linspace(150.0, 1023.0, 9), np.linspace(0.0, 767.0, 7))
+    pixels = np.stack([u, v], axis=-1)
+    rays = refracted_rays(pixels, camera, RIG)
+    points = points_at_height(rays, height)
+    seen = project(points, camera, RIG.surface_height, RIG.refractive_index)
+    np.testing.assert_allclose(seen, pixels, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=-1), 1.0, atol=1e-12)
+
+
+def test_before_the_phantom_rays_go_straight_on() -> None:
+    rays = refracted_rays([[5.0, 300.0], [500.0, 300.0]], RIG.left, RIG)
+    assert rays.origin[0, 2] < 0.0 < rays.origin[1, 2]
+    from_centre = rays.origin - camera_centre(RIG.left)
+    from_centre /= np.linalg.norm(from_centre, axis=-1, keepdims=True)
+    np.testing.assert_allclose(rays.direction[0], from_centre[0], atol=1e-12)
+    assert rays.direction[1, 0] < from_centre[1, 0] - 1e-4
+
+
+@pytest.mark.parametrize("hollow", [False, True])
+def test_the_mesh_ends_where_it_says(hollow: bool) -> None:
+    line, aside = bent_line()
+    end = NeedleEnd(0.0007, float(np.deg2rad(30.0)), hollow)
+    needle = needle_mesh(line, aside, end)
+    heading = (line[-1] - line[-2]) / np.linalg.norm(line[-1] - line[-2])
+    assert end.bevel_length == pytest.approx(0.0012124, abs=1e-7)
+    # Beside the axis's end, on the side it bends to, and level with it.
+    away = needle.extreme - line[-1]
+    assert np.linalg.norm(away) == pytest.approx(0.00035, abs=1e-8)
+    assert abs(away @ heading) < 1e-6
+    assert away @ aside > 0.0003
+    points = needle.parts["shaft"].points
+    assert ((points - needle.extreme) @ heading).max() < 1e-6
+    # The axis goes through the ground face half its length behind.
+    assert (line[-1] - needle.face_middle) @ heading == pytest.approx(0.0006062, abs=1e-6)
+    face = needle.parts["face"]
+    normal = face.normals[0]
+    assert normal @ heading == pytest.approx(np.sin(np.deg2rad(30.0)), abs=0.005)
+    assert np.abs((face.points - needle.extreme) @ normal).max() < 5e-6
+    assert set(needle.parts) == {"shaft", "face"} | ({"bore"} if hollow else set())
+
+
+def test_the_shaft_is_as_thick_as_it_says_all_along() -> None:
+    line, aside = bent_line()
+    needle = needle_mesh(line, aside, NeedleEnd(0.0007, 0.5, False))
+    shaft = needle.parts["shaft"]
+    away = np.linalg.norm(shaft.points[:, np.newaxis] - line[::4], axis=-1).min(axis=1)
+    assert away.min() > 0.000349
+    np.testing.assert_allclose(np.linalg.norm(shaft.normals, axis=1), 1.0, atol=1e-12)
+    corners = shaft.points[shaft.faces]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ij,ij->i", outward, shaft.normals[shaft.faces[:, 0]]) > -1e-14).all()
+
+
+@pytest.mark.parametrize("kind", LAMPS)
+def test_lamps_stand_above_and_seem_higher(kind: Lamps) -> None:
+    for seed in range(20):
+        for lamp in place_lamps(kind, np.random.default_rng(seed)):
+            there = apparent_centre(lamp, RIG)
+            assert lamp.centre[0] >= 0.15
+            # Snell: the sines of the angles, as seen from the middle and from the surface over it.
+            inside = there - MIDDLE
+            sine = np.linalg.norm(inside[1:]) / np.linalg.norm(inside)
+            assert sine < 1.0 / RIG.refractive_index
+            assert there[0] > lamp.centre[0]
+            np.testing.assert_array_equal(there[1:], lamp.centre[1:])

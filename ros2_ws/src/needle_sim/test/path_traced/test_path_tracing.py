@@ -1,0 +1,113 @@
+"""The tracer itself, where it is installed: an extra, which `scripts/test` does not bring along."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from needle_common.errors import UserError
+from needle_sim.camera.projection import project
+from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
+from needle_sim.path_traced.appearance import draw_appearance
+from needle_sim.path_traced.insertion import trace_insertion
+from needle_sim.path_traced.path_tracing import PathTracer
+from needle_sim.path_traced.tracer import MM, Mitsuba, load_mitsuba
+from needle_sim.sequences.render_images import main
+
+CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
+POINTS = np.array([[0.0, 0.0, 0.03], [0.012, 0.03, 0.09], [-0.014, -0.035, 0.12]])
+
+
+class BareScene(NamedTuple):
+    """What `PathTracer` needs of a scene."""
+
+    tracer: Any
+    floor: Any
+
+
+@pytest.fixture(scope="module")
+def mitsuba() -> Mitsuba:
+    pytest.importorskip("mitsuba", reason="Mitsuba is an extra: docs/dependencies.md")
+    try:
+        return load_mitsuba()
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+def quarter_size(rig: StereoRig) -> StereoRig:
+    """Return the rig with images of a quarter of the sides."""
+
+    def smaller(camera: Camera) -> Camera:
+        matrix = camera.camera_matrix.copy()
+        matrix[:2] /= 4.0
+        return dataclasses.replace(camera, image_width=256, image_height=192, camera_matrix=matrix)
+
+    return dataclasses.replace(rig, left=smaller(rig.left), right=smaller(rig.right))
+
+
+@pytest.mark.parametrize("point", POINTS)
+def test_a_small_bright_sphere_is_seen_where_snell_s_law_puts_it(
+    mitsuba: Mitsuba, point: np.ndarray
+) -> None:
+    rig = load_stereo_rig(CALIBRATION)
+    floor = mitsuba.mi.load_dict({"type": "rectangle"})
+    sphere = {
+        "type": "sphere",
+        "center": (MM * point).tolist(),
+        "radius": 0.1,
+        "emitter": {"type": "area", "radiance": 1.0},
+    }
+    scene = BareScene(mitsuba.mi.load_dict({"type": "scene", "sphere": sphere}), floor)
+    for camera in (rig.left, rig.right):
+        expected = project(point, camera, rig.surface_height, rig.refractive_index)
+        corner = np.rint(expected).astype(int) - 4
+        pixels = corner + np.mgrid[:9, :9].reshape(2, -1).T
+        light, cover = PathTracer(mitsuba).layer(
+            scene,  # type: ignore[arg-type]
+            pixels,
+            camera,
+            rig,
+            samples=256,
+            seed=1,
+        )
+        np.testing.assert_allclose(light, cover, atol=1e-5)
+        seen = (light[:, np.newaxis] * pixels).sum(axis=0) / light.sum()
+        assert np.abs(seen - expected).max() < 0.1
+
+
+def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsuba) -> None:
+    rig = quarter_size(load_stereo_rig(CALIBRATION))
+    look = dataclasses.replace(draw_appearance("oxide_on_grey", 3), noise=0.4, shot_noise=0.5)
+    bare = dataclasses.replace(look, needle=False)
+
+    def pairs(which: Any) -> list[Any]:
+        return list(trace_insertion(mitsuba, rig, which, frames=2, depth=0.05, begin=0.04))
+
+    first, second, without = pairs(look), pairs(look), pairs(bare)
+    for one, other, empty in zip(first, second, without, strict=True):
+        assert one.truth is not None
+        assert empty.truth is None
+        for image, same, nothing, camera in zip(
+            one.images, other.images, empty.images, (rig.left, rig.right), strict=True
+        ):
+            np.testing.assert_array_equal(image, same)
+            u, v = np.rint(
+                project(one.mesh.face_middle, camera, rig.surface_height, rig.refractive_index)
+            ).astype(int)
+            around = (slice(v - 3, v + 4), slice(u - 12, u + 4))
+            assert np.abs(image[around].astype(float) - nothing[around]).max() > 15.0
+
+
+def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
+    words = ["--renderer", "path_traced", "--appearance", "absent", "--frames", "1"]
+    output = tmp_path / "out"
+    assert main(["--output", str(output), "--calibration", str(CALIBRATION), *words]) == 0
+    with (output / "truth.csv").open(encoding="utf-8", newline="") as stream:
+        (row,) = csv.DictReader(stream)
+    assert row["axis_x_mm"] == row["needle"] == ""
+    assert row["bottom"] != ""
