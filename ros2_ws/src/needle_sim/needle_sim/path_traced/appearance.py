@@ -52,7 +52,7 @@ class Appearance:
     needle : bool
         Whether there is one.
     metal : str
-        Of the shaft: one of `METALS`.
+        Of the shaft: one of `METALS`; none that is dark over a dark floor.
     roughness_along, roughness_across, face_roughness : float
         GGX alpha of the shaft, along and across, 0.05 to 0.45, and of the ground face, 0.05 to 0.4.
     diameter : float
@@ -190,7 +190,11 @@ def draw_appearance(name: str, seed: int) -> Appearance:
     metal = METALS[rng.choice(len(METALS), p=[0.3, 0.35, 0.2, 0.15])]
     lamps = LAMPS[rng.choice(len(LAMPS), p=[0.25, 0.4, 0.2, 0.15])]
     floor = FLOORS[rng.integers(len(FLOORS))]
-    metal, lamps, floor = fixed.metal or metal, fixed.lamps or lamps, fixed.floor or floor
+    lamps, floor = fixed.lamps or lamps, fixed.floor or floor
+    if floor == "dark" and metal in ("oxide", "painted"):
+        # Nobody would see it.
+        metal = "drawn"
+    metal = fixed.metal or metal
     along, across, face = (between(*bounds) for bounds in _ROUGHNESS[metal])
     return Appearance(
         name=name,

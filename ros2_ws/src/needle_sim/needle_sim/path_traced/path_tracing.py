@@ -16,8 +16,8 @@ from needle_sim.path_traced.tracer import MM, Mitsuba
 PixelArray = NDArray[np.int64]
 
 _DEPTH = 6
-# No path is brighter than this many times the brightest lamp: it would leave a spark.
-_BRIGHTEST = 1.5
+# No path counts more than this many times the brightest lamp's radiance: it would leave a spark.
+_BRIGHTEST = 10.0
 _MOST_PATHS = 4_000_000
 
 
@@ -170,7 +170,8 @@ class PathTracer:
         before = hit.is_valid() & (hit.shape != mi.ShapePtr(scene.floor))
         light, _, _ = self._integrator.sample(scene.tracer, sampler, ray, None, before)
         cover = self._dr.select(before, mi.Float(1.0), 0.0)
-        return self._mean(cover * light.x, samples), self._mean(cover, samples)
+        bounded = self._dr.select(before, self._dr.minimum(light.x, _BRIGHTEST), 0.0)
+        return self._mean(bounded, samples), self._mean(cover, samples)
 
     def _sampler(self, seed: int, size: int) -> Any:
         sampler = self._mi.load_dict({"type": "independent"})
@@ -186,5 +187,5 @@ class PathTracer:
 
     @staticmethod
     def _mean(values: Any, samples: int) -> FloatArray:
-        each = np.clip(np.asarray(values).reshape(-1, samples), 0.0, _BRIGHTEST)
+        each = np.asarray(values).reshape(-1, samples)
         return np.asarray(each.mean(axis=1, dtype=np.float64))
