@@ -22,8 +22,8 @@ ROSDEP_KEYS = {
     "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
-# rosdep knows no key of them: they come from requirements-ros.lock alone.
-FROM_THE_LOCK_ALONE = {"canopen", "lz4", "mcap", "rosbags", "zstandard"}
+# rosdep knows no key of them: they come from requirements-ros.lock alone, or an extra's.
+FROM_THE_LOCK_ALONE = {"canopen", "drjit", "lz4", "mcap", "mitsuba", "rosbags", "zstandard"}
 
 
 def imports_of(folder: Path) -> set[str]:

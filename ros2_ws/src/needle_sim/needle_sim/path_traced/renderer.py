@@ -8,25 +8,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_sim.camera.bubbles import place_bubbles
 from needle_sim.camera.optics import FloatImage, Optics
-from needle_sim.camera.scenarios import Bubbles
 from needle_sim.camera.stereo_rig import Camera, StereoRig
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Appearance
-from needle_sim.path_traced.floors import ALBEDO, floor_picture
-from needle_sim.path_traced.lamps import place_lamps
+from needle_sim.path_traced.floors import ALBEDO
 from needle_sim.path_traced.marks import Marks
 from needle_sim.path_traced.needle_mesh import NeedleMesh
 from needle_sim.path_traced.path_tracing import PathTracer
 from needle_sim.path_traced.refracted_rays import points_at_height, refracted_rays
-from needle_sim.path_traced.scene import PANEL_RADIANCE, Scene, World, room_radiance
+from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.sensor import flicker, grey_image
 from needle_sim.path_traced.tracer import Mitsuba
+from needle_sim.path_traced.world import PANEL_RADIANCE, make_world
 
-_WORLD_STREAM = 30
-_BUBBLE_RADII = (0.0001, 0.0012)
+_GAIN_STREAM = 33
 # Paths a pixel of the needle, of what stands still, and of each place of the floor.
 _NEEDLE_SAMPLES = 96
 _STILL_SAMPLES = 24
@@ -71,7 +68,7 @@ class PathTracedRenderer:
 
     def __init__(self, mitsuba: Mitsuba, rig: StereoRig, look: Appearance) -> None:
         self._mitsuba, self._rig, self._look = mitsuba, rig, look
-        self._world = _world(rig, look)
+        self._world = make_world(rig, look)
         self._tracer = PathTracer(mitsuba)
         self._still = Scene(mitsuba, self._world)
         self._moving: Scene | None = None
@@ -90,7 +87,7 @@ class PathTracedRenderer:
         inside = np.concatenate(
             [view.floor[view.floor_points[..., 2] > 0.0] for view in self._views]
         )
-        rng = np.random.default_rng([look.seed, 0, _WORLD_STREAM + 1])
+        rng = np.random.default_rng([look.seed, 0, _GAIN_STREAM])
         self._black = float(rng.uniform(*_BLACK))
         self._gain = (look.floor_level - self._black) / float(np.median(inside))
         self._gains = self._gain * rng.normal(1.0, 0.03, 2)
@@ -228,20 +225,6 @@ class _View:
     floor: FloatImage
     light: FloatImage
     cover: FloatImage
-
-
-def _world(rig: StereoRig, look: Appearance) -> World:
-    rng = np.random.default_rng([look.seed, 0, _WORLD_STREAM])
-    lamps = place_lamps(look.lamps, rng)
-    wall, albedo = float(rng.uniform(0.003, 0.008)), float(rng.uniform(0.05, 0.8))
-    bubbles = None
-    if look.bubbles > 0:
-        largest = float(rng.uniform(0.0003, _BUBBLE_RADII[1]))
-        kinds = Bubbles(look.bubbles, _BUBBLE_RADII[0], largest)
-        bubbles = place_bubbles(kinds, rig.surface_height, rng)
-    room = room_radiance(look, lamps, rig)
-    picture = floor_picture(look.floor, rng)
-    return World(rig, look, lamps, room, picture, bubbles, wall, albedo)
 
 
 def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:

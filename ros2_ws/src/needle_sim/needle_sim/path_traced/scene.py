@@ -2,26 +2,23 @@
 
 Lines of sight are refracted before they get here (`refracted_rays`), so that the scene has no
 surface: the light comes straight from lamps that stand where the middle of the phantom sees them,
-and what would be reflected back into the phantom below the critical angle is a ring of the floor's
-brightness in the room's light.
+and from the room as it is seen from there.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import numpy as np
 
 from needle_sim.camera.bubbles import BubbleCloud
-from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced import floors
-from needle_sim.path_traced.appearance import Appearance, Metal
-from needle_sim.path_traced.floors import ALBEDO, FloorPicture
-from needle_sim.path_traced.lamps import MIDDLE, Lamp, apparent_centre, irradiance
+from needle_sim.path_traced.appearance import Metal
+from needle_sim.path_traced.floors import ALBEDO
+from needle_sim.path_traced.lamps import MIDDLE, apparent_centre
 from needle_sim.path_traced.needle_mesh import Mesh
 from needle_sim.path_traced.tracer import MM, Mitsuba
+from needle_sim.path_traced.world import PANEL_RADIANCE, World, room_light
 
 # Steel at 580 nm, against air.
 _STEEL_INDEX = 2.9
@@ -30,56 +27,10 @@ _PAINT_INDEX = 1.5
 _DARK: dict[Metal, float] = {"oxide": 0.05, "painted": 0.02}
 _BOX_SIDE = 0.07
 _BOX_END = 0.155
-_BOX_WALLS = (0.003, 0.008)
 _SHEATH_LENGTH = 0.04
 _SHEATH_RADIUS = 0.0015
-# Pixels of the room's light: height over the horizon by direction around.
-_SKY = (64, 32)
 # The floor in the scene is only seen in mirrors: coarser than in the image.
 _COARSER = 4
-PANEL_RADIANCE = 1.0
-"""Of a lit panel, as of the brightest lamp."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class World:
-    """All that stands still in a sequence.
-
-    Attributes
-    ----------
-    rig : StereoRig
-        Phantom and cameras.
-    look : Appearance
-        Kinds and amounts.
-    lamps : list of Lamp
-        Where the light comes from.
-    room : float
-        Radiance of the room, against the brightest lamp's.
-    picture : FloorPicture
-        The floor.
-    bubbles : BubbleCloud or None
-        Air in the phantom.
-    wall : float
-        Thickness of the box's walls [m].
-    wall_albedo : float
-        Share of the light that they give back.
-    """
-
-    rig: StereoRig
-    look: Appearance
-    lamps: list[Lamp]
-    room: float
-    picture: FloorPicture
-    bubbles: BubbleCloud | None
-    wall: float
-    wall_albedo: float
-
-
-def room_radiance(look: Appearance, lamps: list[Lamp], rig: StereoRig) -> float:
-    """Return the radiance of the room that gives `look.room_light` of the lamps' light."""
-    if not lamps:
-        return 1.0
-    return look.room_light * irradiance(lamps, rig) / np.pi
 
 
 class Scene:
@@ -189,7 +140,8 @@ class Scene:
             "type": "diffuse",
             "reflectance": {
                 "type": "bitmap",
-                "bitmap": self._mi.Bitmap(np.ascontiguousarray(picture[::-1])),
+                # The rectangle's first axis lies against z.
+                "bitmap": self._mi.Bitmap(np.ascontiguousarray(picture[:, ::-1])),
                 "raw": True,
                 "wrap_mode": "clamp",
             },
@@ -243,7 +195,7 @@ class Scene:
         # The picture's up is y: turned to x.
         parts["room"] = {
             "type": "envmap",
-            "bitmap": self._mi.Bitmap(_sky(world)[..., np.newaxis]),
+            "bitmap": self._mi.Bitmap(room_light(world)[..., np.newaxis]),
             "to_world": self._transform().rotate([0.0, 0.0, 1.0], -90.0),
         }
         return parts
@@ -262,27 +214,6 @@ class Scene:
 
     def _transform(self) -> Any:
         return self._mi.ScalarTransform4f()
-
-
-def _sky(world: World) -> FloatArray:
-    """Return the room's radiance by direction: rows from the zenith down, columns around."""
-    look, rng = world.look, np.random.default_rng([world.look.seed, 0, 31])
-    rows, columns = _SKY
-    polar = (np.arange(rows) + 0.5) / rows * np.pi
-    around = (np.arange(columns) + 0.5) / columns * 2.0 * np.pi
-    phase, strength = rng.uniform(0.0, 2.0 * np.pi, 3), rng.uniform(0.0, 0.5)
-    waves = sum(
-        np.cos((turns + 1) * around + shift) / (turns + 1) for turns, shift in enumerate(phase)
-    )
-    sky = world.room * (1.0 + strength * np.sin(polar)[:, np.newaxis] * waves / 1.9)
-    # Beyond the critical angle the surface mirrors what is in the phantom: mostly its floor.
-    light = irradiance(world.lamps, world.rig) / np.pi + world.room
-    mirrored = ALBEDO[look.floor] * light
-    if look.floor == "panel":
-        mirrored += PANEL_RADIANCE
-    total = np.sin(polar) > 1.0 / world.rig.refractive_index
-    sky[total] = mirrored
-    return np.asarray(np.maximum(sky, 0.0), dtype=np.float32)
 
 
 def _both_sides(material: dict[str, Any]) -> dict[str, Any]:

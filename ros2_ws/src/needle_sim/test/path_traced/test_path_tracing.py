@@ -14,9 +14,12 @@ from needle_common.errors import UserError
 from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance
+from needle_sim.path_traced.floors import FloorPicture
 from needle_sim.path_traced.insertion import trace_insertion
 from needle_sim.path_traced.path_tracing import PathTracer
+from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.tracer import MM, Mitsuba, load_mitsuba
+from needle_sim.path_traced.world import make_world
 from needle_sim.sequences.render_images import main
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
@@ -96,11 +99,11 @@ def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsu
             one.images, other.images, empty.images, (rig.left, rig.right), strict=True
         ):
             np.testing.assert_array_equal(image, same)
-            u, v = np.rint(
-                project(one.mesh.face_middle, camera, rig.surface_height, rig.refractive_index)
-            ).astype(int)
-            around = (slice(v - 3, v + 4), slice(u - 12, u + 4))
-            assert np.abs(image[around].astype(float) - nothing[around]).max() > 15.0
+            shaft = one.mesh.parts["shaft"].points[::40]
+            seen = project(shaft, camera, rig.surface_height, rig.refractive_index)
+            u, v = np.rint(seen[seen[:, 0] > 30.0]).astype(int).T
+            darker = nothing[v, u].astype(float) - image[v, u]
+            assert np.median(darker) > 20.0
 
 
 def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
@@ -111,3 +114,18 @@ def test_the_command_fills_a_folder(mitsuba: Mitsuba, tmp_path: Path) -> None:
         (row,) = csv.DictReader(stream)
     assert row["axis_x_mm"] == row["needle"] == ""
     assert row["bottom"] != ""
+
+
+def test_what_mirrors_the_floor_mirrors_its_picture(mitsuba: Mitsuba) -> None:
+    look = dataclasses.replace(draw_appearance("drawn_on_grey", 3), bubbles=0)
+    world = make_world(load_stereo_rig(CALIBRATION), look)
+    shape = world.picture.reflectance.shape
+    slanting = np.linspace(0.1, 0.5, shape[0])[:, np.newaxis] + np.linspace(0.0, 0.4, shape[1])
+    picture = FloorPicture(slanting.astype(np.float32))
+    scene = Scene(mitsuba, dataclasses.replace(world, picture=picture))
+    places = np.array([[look.floor_height, y, z] for y in (-0.04, 0.05) for z in (0.02, 0.12)])
+    above = (MM * (places + np.array([0.01, 0.0, 0.0]))).astype(np.float32)
+    down = mitsuba.mi.Vector3f(-1.0, 0.0, 0.0)
+    hit = scene.tracer.ray_intersect(mitsuba.mi.Ray3f(mitsuba.mi.Point3f(*above.T), down))
+    seen = np.asarray(hit.bsdf().eval_diffuse_reflectance(hit)).ravel()
+    np.testing.assert_allclose(seen, picture.at(places[np.newaxis])[0], atol=0.002)
