@@ -71,7 +71,7 @@ def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
     if floor == "panel":
         picture *= 1.0 + rng.uniform(0.0, 0.04) * _noise(rng, rng.uniform(0.02, 0.05))
     else:
-        picture *= 1.0 + rng.uniform(0.02, 0.09) * _noise(rng, rng.uniform(0.006, 0.02))
+        picture *= 1.0 + rng.uniform(0.01, 0.06) * _noise(rng, rng.uniform(0.006, 0.02))
         picture *= 1.0 + rng.uniform(0.005, 0.04) * _noise(rng, rng.uniform(0.0001, 0.0006))
     if floor == "graph":
         picture *= _lines(rng)
