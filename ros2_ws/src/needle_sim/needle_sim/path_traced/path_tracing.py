@@ -42,7 +42,7 @@ class PathTracer:
         rig: StereoRig,
         *,
         samples: int,
-        seed: int,
+        key: list[int],
     ) -> tuple[FloatArray, FloatArray]:
         """Return light and coverage of what stands before the floor.
 
@@ -58,7 +58,7 @@ class PathTracer:
             The phantom that it looks into.
         samples : int
             Paths a pixel, evenly over its area.
-        seed : int
+        key : list of int
             Keys them.
 
         Returns
@@ -69,7 +69,7 @@ class PathTracer:
             Share of the paths that meet something else first.
         """
         parts = [
-            self._part(scene, part, camera, rig, samples=samples, seed=seed + number)
+            self._part(scene, part, camera, rig, samples=samples, key=[*key, number])
             for number, part in enumerate(
                 np.array_split(pixels, max(1, -(-len(pixels) * samples // _MOST_PATHS)))
             )
@@ -93,7 +93,7 @@ class PathTracer:
         return np.asarray(before, dtype=np.bool_)
 
     def floor_light(
-        self, scenes: list[Scene], points: FloatArray, *, samples: int, seed: int
+        self, scenes: list[Scene], points: FloatArray, *, samples: int, key: list[int]
     ) -> list[FloatArray]:
         """Return the light that falls on places of the floor in each of several scenes.
 
@@ -108,7 +108,7 @@ class PathTracer:
             In `rig` [m].
         samples : int
             Paths for each point.
-        seed : int
+        key : list of int
             Keys them.
 
         Returns
@@ -117,7 +117,7 @@ class PathTracer:
             Irradiance over pi: the radiance of a white floor.
         """
         mi = self._mi
-        sampler = self._sampler(seed, len(points) * samples)
+        sampler = self._sampler(key, len(points) * samples)
         index = self._index(len(points), samples)
         at = self._dr.zeros(mi.SurfaceInteraction3f, len(points) * samples)
         at.p = self._gather(MM * points, index)
@@ -140,10 +140,10 @@ class PathTracer:
         rig: StereoRig,
         *,
         samples: int,
-        seed: int,
+        key: list[int],
     ) -> tuple[FloatArray, FloatArray]:
         mi = self._mi
-        sampler = self._sampler(seed, len(pixels) * samples)
+        sampler = self._sampler(key, len(pixels) * samples)
         index = self._index(len(pixels), samples)
         # Within a pixel origin and direction are as good as linear.
         half = np.array([[0.5, 0.0], [0.0, 0.5]])
@@ -173,9 +173,9 @@ class PathTracer:
         bounded = self._dr.select(before, self._dr.minimum(light.x, _BRIGHTEST), 0.0)
         return self._mean(bounded, samples), self._mean(cover, samples)
 
-    def _sampler(self, seed: int, size: int) -> Any:
+    def _sampler(self, key: list[int], size: int) -> Any:
         sampler = self._mi.load_dict({"type": "independent"})
-        sampler.seed(seed, size)
+        sampler.seed(int(np.random.SeedSequence(key).generate_state(1)[0]), size)
         return sampler
 
     def _index(self, count: int, samples: int) -> Any:

@@ -75,7 +75,7 @@ class PathTracedRenderer:
         self._grid = _floor_grid(look.floor_height)
         points = self._grid.reshape(-1, 3)
         (light,) = self._tracer.floor_light(
-            [self._still], points, samples=_FLOOR_SAMPLES, seed=look.seed
+            [self._still], points, samples=_FLOOR_SAMPLES, key=[look.seed]
         )
         # One sample's noise is finer than any shade of still things.
         self._light = cv2.GaussianBlur(
@@ -89,8 +89,8 @@ class PathTracedRenderer:
         )
         rng = np.random.default_rng([look.seed, 0, _GAIN_STREAM])
         self._black = float(rng.uniform(*_BLACK))
-        self._gain = (look.floor_level - self._black) / float(np.median(inside))
-        self._gains = self._gain * rng.normal(1.0, 0.03, 2)
+        gain = (look.floor_level - self._black) / float(np.median(inside))
+        self._gains = gain * rng.normal(1.0, 0.03, 2)
 
     def render(
         self, needle: NeedleMesh | None, exposure_number: int
@@ -110,15 +110,17 @@ class PathTracedRenderer:
             Grey images.
         """
         look, scene, shadow = self._look, self._still, None
-        seed = look.seed * 1000 + exposure_number
         if needle is not None:
             scene = self._scene_with(needle)
-            shadow = self._shadow(scene, seed)
+            # A lit panel outshines the lamps' shadows.
+            if look.floor != "panel":
+                shadow = self._shadow(scene, [look.seed, exposure_number])
         light = flicker(look, exposure_number)
         images = []
         for side, view in enumerate(self._views):
-            image = self._exposed(view, scene, needle, shadow, 2 * seed + side)
-            rng = np.random.default_rng([look.seed, exposure_number, side])
+            key = [look.seed, exposure_number, side]
+            image = self._exposed(view, scene, needle, shadow, key)
+            rng = np.random.default_rng(key)
             grey = np.asarray(image * (self._gains[side] * light), dtype=np.float32)
             images.append(grey_image(grey, look, self._black, rng))
         left, right = images
@@ -131,10 +133,10 @@ class PathTracedRenderer:
             self._moving.bend(needle.parts)
         return self._moving
 
-    def _shadow(self, scene: Scene, seed: int) -> FloatImage:
+    def _shadow(self, scene: Scene, key: list[int]) -> FloatImage:
         """Return which share of the light on the grid the needle leaves."""
         without, beside = self._tracer.floor_light(
-            [self._still, scene], self._grid.reshape(-1, 3), samples=_SHADOW_SAMPLES, seed=seed
+            [self._still, scene], self._grid.reshape(-1, 3), samples=_SHADOW_SAMPLES, key=key
         )
         left = beside / np.maximum(without, 1e-9)
         image = left.reshape(self._grid.shape[:2]).astype(np.float32)
@@ -146,16 +148,15 @@ class PathTracedRenderer:
         scene: Scene,
         needle: NeedleMesh | None,
         shadow: FloatImage | None,
-        seed: int,
+        key: list[int],
     ) -> FloatImage:
         floor, light, cover = view.floor, view.light, view.cover
         if shadow is not None:
-            lit = 1.0 if self._look.floor != "panel" else 0.0
-            floor = floor * (1.0 - lit + lit * _on_grid(shadow, view.floor_points))
+            floor = floor * _on_grid(shadow, view.floor_points)
         if needle is not None:
             pixels = _needle_pixels(view.optics, needle)
             traced = self._tracer.layer(
-                scene, pixels, view.camera, self._rig, samples=_NEEDLE_SAMPLES, seed=seed
+                scene, pixels, view.camera, self._rig, samples=_NEEDLE_SAMPLES, key=key
             )
             light, cover = light.copy(), cover.copy()
             light[pixels[:, 1], pixels[:, 0]], cover[pixels[:, 1], pixels[:, 0]] = traced
@@ -196,7 +197,7 @@ class PathTracedRenderer:
             camera,
             rig,
             samples=_STILL_SAMPLES,
-            seed=look.seed * 2 + side,
+            key=[look.seed, side],
         )
         return _View(camera, optics, points, np.asarray(floor, dtype=np.float32), light, cover)
 

@@ -76,7 +76,7 @@ def test_a_small_bright_sphere_is_seen_where_snell_s_law_puts_it(
             camera,
             rig,
             samples=256,
-            seed=1,
+            key=[1],
         )
         np.testing.assert_allclose(light, cover, atol=1e-5)
         seen = (light[:, np.newaxis] * pixels).sum(axis=0) / light.sum()
