@@ -1,7 +1,8 @@
 """Train the net that draws needle maps; scripts/train_needle_map runs this.
 
-Patches are drawn at random by needle_verification.training. What comes out depends a little on the
-machine: another run gives another net, about as good.
+Patches are drawn at random, or cut from scenes that are path-traced at random, by
+needle_verification.training. What comes out depends a little on the machine: another run gives
+another net, about as good.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import math
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,18 +21,23 @@ from torch import nn
 from torch.nn import functional
 from tqdm import tqdm
 
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.path_traced.tracer import load_mitsuba
 from needle_tracker.image.needle_map import normalized
 from needle_verification.training.patches import SIZE, patch
+from needle_verification.training.traced_patches import BORDER, traced_patch
+from needle_verification.training.traced_scenes import TracedScene, trace_scene
 
-Batch = tuple[NDArray[np.float16], NDArray[np.uint8]]
+Batch = tuple[NDArray[Any], NDArray[Any]]
 
-WEIGHTS = (
-    Path(__file__).parents[3] / "ros2_ws/src/needle_tracker/needle_tracker/image/needle_map.onnx"
-)
+TRACKER = Path(__file__).parents[3] / "ros2_ws/src/needle_tracker"
+WEIGHTS = TRACKER / "needle_tracker/image/needle_map.onnx"
+CALIBRATION = TRACKER / "config/calibration.yaml"
 _CHANNELS, _FINE_CHANNELS = 16, 8
 _DILATIONS = (1, 2, 4, 8, 4, 2, 1)
 _SHARD = 256
-_SMALL_SHARE = 0.2  # of the shards
+_TRACED_SHARE = 0.6  # of a batch
+_PLAIN_WIDTH_PX = 4.6  # of a needle where there is none
 _BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
 _NEEDLE_WEIGHT = 4.0  # most pixels are floor
 
@@ -73,24 +80,48 @@ class NeedleMapNet(nn.Module):
         return torch.sigmoid(self.net(image) - math.log(1.0 + _NEEDLE_WEIGHT))
 
 
-def draw_shard(number: int, *, small: bool) -> Batch:
-    """Return patches as the net sees them, and 255 times the share that is needle."""
-    drawn = [patch(np.random.default_rng([number, i]), small=small) for i in range(_SHARD)]
+def draw_shard(number: int) -> Batch:
+    """Return drawn patches as the net sees them, and 255 times the share that is needle."""
+    drawn = [patch(np.random.default_rng([number, i])) for i in range(_SHARD)]
     seen = np.stack([normalized(image) for image, _ in drawn]).astype(np.float16)
     return seen, np.stack([np.rint(255.0 * share).astype(np.uint8) for _, share in drawn])
 
 
 def draw_all(shards: int) -> Batch:
-    """Return all patches, drawn by all cores."""
-    small = round(_SMALL_SHARE * shards)
+    """Return all drawn patches, by all cores."""
     with ProcessPoolExecutor() as pool:
-        drawn = [pool.submit(draw_shard, i, small=i < small) for i in range(shards)]
-        parts = [each.result() for each in tqdm(drawn, "drawing patches", unit=f"x{_SHARD}")]
+        drawn = pool.map(draw_shard, range(shards))
+        parts = list(tqdm(drawn, "drawing patches", shards, unit=f"x{_SHARD}"))
     return np.concatenate([seen for seen, _ in parts]), np.concatenate([y for _, y in parts])
 
 
-def train(patches: Batch, steps: int) -> NeedleNet:
-    """Return a net trained on these patches, turned and mirrored at random."""
+def trace_all(count: int) -> list[TracedScene]:
+    """Return path-traced scenes."""
+    mitsuba, rig = load_mitsuba(), load_stereo_rig(CALIBRATION)
+    bar = tqdm(range(count), "tracing scenes", unit="scene")
+    return [trace_scene(mitsuba, rig, seed, _PLAIN_WIDTH_PX) for seed in bar]
+
+
+def batch(rng: np.random.Generator, drawn: Batch, scenes: list[TracedScene]) -> Batch:
+    """Return patches of both kinds, turned and mirrored at random, and 0 to 1 what is needle."""
+    seen = np.empty((_BATCH, 1, SIZE, SIZE), np.float32)
+    wanted = np.empty_like(seen)
+    traced = round(_TRACED_SHARE * _BATCH)
+    for k in range(_BATCH):
+        if k < traced:
+            image, share = traced_patch(rng, scenes[rng.integers(len(scenes))])
+            one = normalized(image)[BORDER:-BORDER, BORDER:-BORDER]
+        else:
+            i = rng.integers(len(drawn[0]))
+            one, share = drawn[0][i], drawn[1][i] / np.float32(255.0)
+        turns, mirror = int(rng.integers(4)), int(rng.choice([-1, 1]))
+        seen[k, 0] = np.rot90(one, turns)[::mirror]
+        wanted[k, 0] = np.rot90(share, turns)[::mirror]
+    return seen, wanted
+
+
+def train(drawn: Batch, scenes: list[TracedScene], steps: int) -> NeedleNet:
+    """Return a net trained on these."""
     torch.manual_seed(0)
     # More threads than that wait for each other longer than they work.
     torch.set_num_threads(1)
@@ -98,15 +129,10 @@ def train(patches: Batch, steps: int) -> NeedleNet:
     net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=_DECAY)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, total_steps=steps)
-    seen = np.empty((_BATCH, 1, SIZE, SIZE), np.float32)
-    wanted = np.empty_like(seen)
     bar = tqdm(range(steps), "training", unit="step")
     mean = 0.0
     for step in bar:
-        for k, i in enumerate(rng.integers(len(patches[0]), size=_BATCH)):
-            turns, mirror = int(rng.integers(4)), int(rng.choice([-1, 1]))
-            seen[k, 0] = np.rot90(patches[0][i], turns)[::mirror]
-            wanted[k, 0] = np.rot90(patches[1][i], turns)[::mirror] / 255.0
+        seen, wanted = batch(rng, drawn, scenes)
         target = torch.from_numpy(wanted)
         logits = net(torch.from_numpy(seen).to(memory_format=torch.channels_last))
         losses = functional.binary_cross_entropy_with_logits(logits, target, reduction="none")
@@ -115,7 +141,7 @@ def train(patches: Batch, steps: int) -> NeedleNet:
         loss.backward()
         optimizer.step()
         schedule.step()
-        mean += (float(loss) - mean) / min(step + 1, 100)
+        mean += (loss.item() - mean) / min(step + 1, 100)
         bar.set_postfix(loss=f"{mean:.4f}")
     return net
 
@@ -123,11 +149,12 @@ def train(patches: Batch, steps: int) -> NeedleNet:
 def main() -> int:
     """Train, and write the weights; returns the exit code."""
     parser = argparse.ArgumentParser(prog="scripts/train_needle_map", description=__doc__)
-    parser.add_argument("--steps", type=int, default=13000, metavar="N", help="default: 13000")
-    parser.add_argument("--shards", type=int, default=143, metavar="N", help="x256; default: 143")
+    parser.add_argument("--steps", type=int, default=20000, metavar="N", help="default: 20000")
+    parser.add_argument("--shards", type=int, default=72, metavar="N", help="x256; default: 72")
+    parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
     parser.add_argument("--output", type=Path, default=WEIGHTS, metavar="FILE.onnx")
     given = parser.parse_args()
-    net = train(draw_all(given.shards), given.steps).eval()
+    net = train(draw_all(given.shards), trace_all(given.scenes), given.steps).eval()
     size = {2: "height", 3: "width"}
     torch.onnx.export(
         NeedleMapNet(net),

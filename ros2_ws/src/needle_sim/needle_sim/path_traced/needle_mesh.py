@@ -69,6 +69,8 @@ class NeedleMesh:
 
     Attributes
     ----------
+    line : ndarray, shape (M, 3)
+        Its middle line in `rig`, the end of the axis last [m].
     parts : dict of str to Mesh
         `shaft`, the tube's outside; `face`, what was ground; of a hollow needle `bore`, its inside.
     extreme : ndarray, shape (3,)
@@ -77,6 +79,7 @@ class NeedleMesh:
         Where the axis goes through the plane of the ground face, in `rig` [m].
     """
 
+    line: FloatArray
     parts: dict[str, Mesh]
     extreme: FloatArray
     face_middle: FloatArray
@@ -147,7 +150,7 @@ def needle_mesh(line: FloatArray, sharp_side: FloatArray, end: NeedleEnd) -> Nee
         parts["bore"] = _bore(axis, inner, radius * _BORE_SHARE, angle, end)
     else:
         parts["face"] = _ring_face(rim, np.broadcast_to(face_middle, rim.shape), normal)
-    return NeedleMesh(parts, extreme, face_middle)
+    return NeedleMesh(line, parts, extreme, face_middle)
 
 
 def _tube(points: FloatArray, normals: FloatArray) -> Mesh:

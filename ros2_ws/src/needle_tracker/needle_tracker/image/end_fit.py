@@ -29,6 +29,7 @@ _SLOPE = 0.15
 _CORE = 0.3  # of the width: what is read for the end
 _PASSES = 3
 _EARLY = 0.841  # the chance to reach one standard deviation less than the middle
+_GAP_WIDTHS, _UNLIKELY = 1.5, 0.3  # where needle is less likely for so long, it has ended
 _LEAST_STEP = 0.2  # of the map from shaft to floor: less is no end
 
 
@@ -207,7 +208,7 @@ def _end_along(
         for j in range(-2, 3):
             total += _seen(image, point, direction, s, offset + slope * s + 0.5 * j * _CORE * width)
         chance[i] = total / 5.0
-    _make_decreasing(chance)
+    _make_survival(chance, int(math.ceil(_GAP_WIDTHS * width)))
     sure, left = chance[0], chance[count - 1]
     if sure - left < _LEAST_STEP:
         return end, _AHEAD_WIDTHS * width, 0.0
@@ -229,23 +230,17 @@ def _place_of(falling: Array, level: float) -> float:
     return len(falling) - 1.0
 
 
-@compiled
-def _make_decreasing(values: Array) -> None:
-    """Replace values by the nearest ones, least squares, that never increase."""
-    count = len(values)
-    means, sizes = np.empty(count), np.empty(count, np.int64)
-    blocks = 0
-    for i in range(count):
-        means[blocks], sizes[blocks] = values[i], 1
-        blocks += 1
-        while blocks > 1 and means[blocks - 1] > means[blocks - 2]:
-            size = sizes[blocks - 1] + sizes[blocks - 2]
-            means[blocks - 2] = (
-                means[blocks - 1] * sizes[blocks - 1] + means[blocks - 2] * sizes[blocks - 2]
-            ) / size
-            sizes[blocks - 2] = size
-            blocks -= 1
-    place = 0
-    for i in range(blocks):
-        values[place : place + sizes[i]] = means[i]
-        place += sizes[i]
+@inlined
+def _make_survival(chance: Array, gap: int) -> None:
+    """Replace the chance to be needle by that to reach so far: no less than what is joined to it.
+
+    Beyond a gap so long, in places, is another thing.
+    """
+    missing = 0
+    for i in range(len(chance)):
+        missing = missing + 1 if chance[i] < _UNLIKELY else 0
+        if missing >= gap:
+            chance[i:] = 0.0
+            break
+    for i in range(len(chance) - 2, -1, -1):
+        chance[i] = max(chance[i], chance[i + 1])

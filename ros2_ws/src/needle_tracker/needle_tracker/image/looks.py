@@ -27,9 +27,11 @@ Rows = tuple[int, int] | None
 _SURE_ENOUGH = 0.3  # of a line that may be the needle
 _MAP_CONTRAST = 80.0  # the same, of 255, where paths are looked for
 _CLEAR_INSIDE = 0.5
-_CLEAR_WIDTHS = 1.2  # an end known worse than that, in needle widths (one sigma), is not seen
+_CLEAR_WIDTHS = 2.0  # an end known worse than that, in needle widths (one sigma), is not seen
 _ALLOWANCE = 2.5
 _LINE_SYSTEMATIC_PX, _END_SYSTEMATIC_PX = 0.2, 0.7
+# In needle widths: beyond such a gap may be another thing, and beyond such a one there is.
+_GAP_WIDTHS, _HIDDEN_WIDTHS = 1.5, 8.0
 _ROOM_WIDTHS = 6.0  # drawn around an end that is fitted
 
 
@@ -99,9 +101,20 @@ class MapLook:
         rows = len(grid.distances) if ends is None else min(ends[1] + 1, len(grid.distances))
         box = grid.bounds(max(rows, 1), 4.0 * settings.needle_width_px, image.shape)
         sure = dataclasses.replace(
-            settings, bright=True, min_contrast=_MAP_CONTRAST, noise_factor=0.0
+            settings,
+            bright=True,
+            min_contrast=_MAP_CONTRAST,
+            noise_factor=0.0,
+            min_coverage=0.0,
         )
-        return detection.find_paths(self._map.coarse(image, box), grid, sure, ends=ends)
+        drawn = self._map.draw(image, box)
+        least = max(int(sure.min_length / grid.row_pitch), 2, 0 if ends is None else ends[0])
+        paths = [
+            part
+            for path in detection.find_paths(drawn, grid, sure, ends=ends)
+            for part in _parts(drawn, path, least, settings.needle_width_px)
+        ]
+        return sorted(paths, key=lambda path: -path.evidence)
 
     def fit(
         self, image: Image, expected: Expected, bright: bool, settings: DetectionSettings
@@ -121,7 +134,7 @@ class MapLook:
         box = (int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
         result = np.zeros(9)
         if not fit_end(
-            self._map.fine(image, box),
+            self._map.draw(image, box),
             np.ascontiguousarray(expected.point, dtype=np.float64),
             np.ascontiguousarray(expected.direction, dtype=np.float64),
             float(expected.room),
@@ -155,3 +168,37 @@ class MapLook:
             bright=True,
             allowance=_ALLOWANCE,
         )
+
+
+def _parts(drawn: Image, path: Path, least: int, width: float) -> list[Path]:
+    """Return the parts of a path, from its begin, that may be a needle.
+
+    It ends where it does, or where a gap begins: what follows may be another thing. What follows a
+    long gap is one.
+    """
+    columns, rows = np.rint(path.pixels).astype(np.int64).T
+    inside = (columns >= 0) & (rows >= 0) & (columns < drawn.shape[1]) & (rows < drawn.shape[0])
+    there = np.zeros(len(rows), np.bool_)
+    there[inside] = drawn[rows[inside], columns[inside]] > 255.0 * _SURE_ENOUGH
+    seen = np.flatnonzero(there)
+    if not len(seen):
+        return []
+    pitch = max(float(np.linalg.norm(np.diff(path.pixels, axis=0), axis=1).mean()), 1e-6)
+    gaps = np.diff(seen, prepend=0) * pitch / width
+    too_long = np.flatnonzero(gaps > _HIDDEN_WIDTHS)
+    reached = too_long[0] if len(too_long) else len(seen)
+    lasts = [i - 1 for i in np.flatnonzero(gaps[:reached] > _GAP_WIDTHS) if i > 0]
+    if reached:
+        lasts.append(reached - 1)
+    return [
+        dataclasses.replace(
+            path,
+            rows=path.rows[:count],
+            columns=path.columns[:count],
+            pixels=path.pixels[:count],
+            coverage=(i + 1) / count,
+            evidence=path.evidence * (i + 1) / len(seen),
+        )
+        for i in lasts
+        if (count := int(seen[i]) + 1) > least
+    ]

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 Image = NDArray[np.uint8]
 Box = tuple[int, int, int, int]
 
-_WIDTH_PX, _COARSE_WIDTH_PX = 5.0, 2.6
-"""Width of a needle in what the net sees, to fit its end and to find it."""
+_WIDTH_PX = 5.0
+"""Width of a needle in what the net sees."""
 _LIKE = (0.8, 1.3)  # widths so near to that, as a ratio, are not scaled
 _MARGIN_PX = 24  # what is seen around a box, in what the net sees: farther off matters little
 _TILE = 64
@@ -50,30 +50,14 @@ class NeedleMap:
 
     def __init__(self, needle_width_px: float) -> None:
         self._net = cv2.dnn.readNetFromONNX(_weights())
-        self._fine, self._coarse = (
-            _scale(width / needle_width_px) for width in (_WIDTH_PX, _COARSE_WIDTH_PX)
-        )
+        factor = _WIDTH_PX / needle_width_px
+        self._scale = 1.0 if _LIKE[0] < factor < _LIKE[1] else factor
         self._image: Image | None = None
         self._map = np.empty((0, 0), np.uint8)
         self._drawn = np.empty((0, 0), np.bool_)
 
-    def coarse(self, image: Image, box: Box) -> Image:
-        """Return a map to find a needle in, as large as the image, 0 outside of the box.
-
-        Parameters
-        ----------
-        image : ndarray of uint8, shape (height, width)
-            The camera's image.
-        box : tuple of int
-            First column and row, and those after the last.
-        """
-        drawn = np.zeros_like(image)
-        x0, y0, x1, y1 = box
-        drawn[y0:y1, x0:x1] = self._look(image, box, self._coarse)
-        return drawn
-
-    def fine(self, image: Image, box: Box) -> Image:
-        """Return a map to measure in, as large as the image, that holds at least in the box.
+    def draw(self, image: Image, box: Box) -> Image:
+        """Return the map, as large as the image, that holds at least in the box.
 
         Parameters
         ----------
@@ -98,13 +82,14 @@ class NeedleMap:
                 min(int(missing_columns.max() + columns.start + 1) * _TILE, width),
                 min(int(missing_rows.max() + rows.start + 1) * _TILE, height),
             )
-            drawn = self._look(image, tiles, self._fine)
+            drawn = self._look(image, tiles)
             self._map[tiles[1] : tiles[3], tiles[0] : tiles[2]] = drawn
             self._drawn[rows, columns] = True
         return self._map
 
-    def _look(self, image: Image, box: Box, scale: float) -> Image:
+    def _look(self, image: Image, box: Box) -> Image:
         """Return the map of a box."""
+        scale = self._scale
         height, width = image.shape
         margin = int(_MARGIN_PX / scale) + 1
         # An even number of pixels from an even one on: the net halves what it sees.
@@ -130,10 +115,6 @@ class NeedleMap:
         # Of an odd image the last line is left out.
         drawn[: inner.shape[0], : inner.shape[1]] = np.rint(255.0 * inner)
         return drawn
-
-
-def _scale(factor: float) -> float:
-    return 1.0 if _LIKE[0] < factor < _LIKE[1] else factor
 
 
 @cache

@@ -5,10 +5,9 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.optimize import isotonic_regression
 from scipy.stats import norm
 
-from needle_tracker.image.end_fit import _make_decreasing, fit_end
+from needle_tracker.image.end_fit import _make_survival, fit_end
 
 SHAPE = (80, 160)
 WIDTH = 5.0
@@ -71,8 +70,15 @@ def test_a_needle_that_goes_on_has_no_end_inside() -> None:
     assert result[8] < 0.1
 
 
-def test_the_nearest_falling_values_are_those_of_isotonic_regression() -> None:
-    values = np.random.default_rng(4).normal(np.linspace(1.0, 0.0, 30), 0.3)
-    wanted = isotonic_regression(values, increasing=False).x
-    _make_decreasing(values)
-    assert values == pytest.approx(wanted)
+def test_a_needle_reaches_what_is_joined_to_it_and_not_what_lies_beyond_a_gap() -> None:
+    chance = np.array([0.9, 0.6, 0.95, 0.1, 0.2, 0.8, 0.4, 0.1, 0.1, 0.1, 0.9])
+    _make_survival(chance, 3)
+    assert chance.tolist() == [0.95, 0.95, 0.95, 0.8, 0.8, 0.8, 0.4, 0.1, 0.1, 0.0, 0.0]
+
+
+def test_what_shines_beyond_the_end_is_not_the_needle() -> None:
+    image = drawn(0.0)
+    image[:, round(END[0]) + 10 : round(END[0]) + 18] = 255
+    result = fitted(image, 0.0)
+    assert result is not None
+    assert result[0] == pytest.approx(END[0], abs=0.3)

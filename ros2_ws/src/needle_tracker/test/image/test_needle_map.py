@@ -37,7 +37,7 @@ def on_shaft(needle_map: Image) -> float:
 )
 def test_shows_the_shaft_and_not_the_floor(shaft: float, core: float) -> None:
     image = drawn(shaft, core)
-    found = NeedleMap(5.0).fine(image, (0, 0, SHAPE[1], SHAPE[0]))
+    found = NeedleMap(5.0).draw(image, (0, 0, SHAPE[1], SHAPE[0]))
     assert on_shaft(found) > 200.0
     assert np.median(found) < 10.0
     assert (found[150:] > 128).mean() < 0.002
@@ -47,25 +47,19 @@ def test_shows_the_shaft_and_not_the_floor(shaft: float, core: float) -> None:
 
 def test_finds_a_wide_needle_at_its_own_scale() -> None:
     image = drawn(60.0, 230.0, width=13)
-    found = NeedleMap(13.0).coarse(image, (0, 0, SHAPE[1], SHAPE[0]))
+    found = NeedleMap(13.0).draw(image, (0, 0, SHAPE[1], SHAPE[0]))
     assert on_shaft(found) > 150.0
     assert np.median(found) < 10.0
 
 
 def test_is_drawn_where_it_is_asked_for_and_as_if_all_were() -> None:
     image = drawn(60.0, 230.0)
-    whole = NeedleMap(5.0).fine(image, (0, 0, SHAPE[1], SHAPE[0])).astype(int)
+    whole = NeedleMap(5.0).draw(image, (0, 0, SHAPE[1], SHAPE[0])).astype(int)
     one = NeedleMap(5.0)
-    part = one.fine(image, (150, 100, 230, 150)).astype(int)
+    part = one.draw(image, (150, 100, 230, 150)).astype(int)
     assert not part[:, :64].any()
     assert np.abs(part - whole)[100:150, 150:230].max() < 25
-    more = one.fine(image, (20, 100, 230, 150)).astype(int)
+    more = one.draw(image, (20, 100, 230, 150)).astype(int)
     assert np.abs(more - whole)[100:150, 20:230].max() < 25
     # Of another image nothing is kept.
-    assert not one.fine(np.full(SHAPE, 140, np.uint8), (0, 0, 30, 30))[64:].any()
-
-
-def test_outside_of_the_box_a_coarse_map_is_empty() -> None:
-    found = NeedleMap(5.0).coarse(drawn(40.0, 40.0), (100, 60, 180, 180))
-    assert found[:, :100].max() == 0
-    assert found[60:180, 100:180].max() > 150
+    assert not one.draw(np.full(SHAPE, 140, np.uint8), (0, 0, 30, 30))[64:].any()

@@ -13,11 +13,11 @@ Image = NDArray[np.float32]
 SIZE = 96
 WIDTH = 5.0
 """Of a needle in what the net sees [px]."""
+LIKE = (0.75, 1.3)
+"""Widths that it sees, as a ratio to that."""
 
 
-def patch(
-    rng: np.random.Generator, size: int = SIZE, *, small: bool = False
-) -> tuple[NDArray[np.uint8], Image]:
+def patch(rng: np.random.Generator, size: int = SIZE) -> tuple[NDArray[np.uint8], Image]:
     """Return an image, and the share of each pixel that is needle.
 
     Parameters
@@ -26,8 +26,6 @@ def patch(
         What draws them.
     size : int
         Width and height [px].
-    small : bool
-        Whether a needle is half as wide, as in what needles are searched for in.
 
     Returns
     -------
@@ -38,7 +36,7 @@ def patch(
     """
     image = floor(rng, size)
     wanted = np.zeros((size, size), np.float32)
-    radius = 0.5 * WIDTH * (rng.uniform(0.4, 0.75) if small else rng.uniform(0.75, 1.3))
+    radius = 0.5 * WIDTH * rng.uniform(*LIKE)
     pose = random_pose(rng, size, radius)
     there = rng.random() < 0.75
     if rng.random() < 0.6:
@@ -48,15 +46,15 @@ def patch(
         image = draw_needle(rng, image, pose)
         wanted = true_map(pose, size)
     image = clutter(rng, image) if rng.random() < 0.3 else image
-    return _exposed(rng, image, 0.8 if small else 1.3), wanted
+    return _exposed(rng, image), wanted
 
 
-def _exposed(rng: np.random.Generator, image: Image, blur: float) -> NDArray[np.uint8]:
+def _exposed(rng: np.random.Generator, image: Image) -> NDArray[np.uint8]:
     """Return what a camera makes of brightness: blur, haze, noise, 8 bits."""
     haze = rng.uniform(0.0, 0.4) if rng.random() < 0.3 else 0.0
     image = image * (1.0 - haze) + haze * rng.uniform(30.0, 200.0)
     image = image * rng.uniform(0.6, 1.3)
-    image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.35, blur)), np.float32)
+    image = np.asarray(cv2.GaussianBlur(image, (0, 0), rng.uniform(0.35, 1.3)), np.float32)
     noise = rng.standard_normal(image.shape).astype(np.float32)
     if rng.random() < 0.4:  # resampled, or sharpened by the camera
         noise = cv2.GaussianBlur(noise, (0, 0), rng.uniform(0.4, 1.0))

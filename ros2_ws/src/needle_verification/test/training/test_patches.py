@@ -58,7 +58,7 @@ def test_the_stored_net_shows_needles_that_it_was_not_trained_on() -> None:
     found, wanted, false = [], [], []
     for i in range(150):
         image, share = patch(np.random.default_rng([UNSEEN, i]))
-        shown = needle_map.fine(image, (0, 0, SIZE, SIZE)) / 255.0
+        shown = needle_map.draw(image, (0, 0, SIZE, SIZE)) / 255.0
         if share.sum() > 20.0:
             found.append(float(shown[share > 0.5].mean()))
         elif not share.any():
