@@ -16,6 +16,7 @@ from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray, exp_twist
 from needle_sim.path_traced.appearance import Appearance
+from needle_sim.path_traced.level_surface import check_level
 from needle_sim.path_traced.needle_mesh import NeedleEnd, NeedleMesh, needle_mesh
 from needle_sim.path_traced.renderer import PathTracedRenderer
 from needle_sim.path_traced.tracer import Mitsuba
@@ -100,11 +101,12 @@ def trace_insertion(
     Raises
     ------
     UserError
-        If no path of this depth stays inside the phantom.
+        If no path of this depth stays inside the phantom, or the rig has windows.
     """
-    path = random_path(look.seed, depth, rig.surface_height, curvature)
+    check_level(rig)
+    path = random_path(look.seed, depth, (rig.half_height, rig.half_width), curvature)
     plant = NeedlePlant(_entry(look.seed, path), curvature=curvature)
-    optics = [Optics(rig, camera, None) for camera in (rig.left, rig.right)]
+    optics = [Optics(camera, None) for camera in (rig.left, rig.right)]
 
     def pairs() -> Iterator[TracedPair]:
         renderer = PathTracedRenderer(mitsuba, rig, look)

@@ -10,6 +10,7 @@ from needle_sim.camera.projection import refraction_point
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Lamps
+from needle_sim.path_traced.level_surface import refractive_index
 
 MIDDLE = np.array([0.0, 0.0, 0.06])
 """Of what the cameras see of the phantom, in `rig` [m]: lamps point there."""
@@ -71,11 +72,11 @@ def apparent_centre(lamp: Lamp, rig: StereoRig) -> FloatArray:
     It is seen straight above its place on the ground, as much higher as Snell's law makes the light
     steeper inside.
     """
-    crossing = refraction_point(MIDDLE, lamp.centre, rig.surface_height, rig.refractive_index)
+    crossing = refraction_point(MIDDLE, lamp.centre, rig.left.window)
     inside = crossing - MIDDLE
     aside = lamp.centre[1:] - MIDDLE[1:]
     bent = float(np.linalg.norm(inside[1:]))
-    height = rig.refractive_index * lamp.centre[0]
+    height = refractive_index(rig) * lamp.centre[0]
     if bent > 1e-6:
         height = inside[0] / bent * float(np.linalg.norm(aside))
     return np.array([height, *lamp.centre[1:]])

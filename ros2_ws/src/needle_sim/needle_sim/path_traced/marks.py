@@ -78,7 +78,7 @@ class Marks:
     def _add_lint(self, rng: np.random.Generator, look: Appearance, rig: StereoRig) -> None:
         """Add a fibre that is bent and turned at random, or a speck; light or dark."""
         low = [look.floor_height, -_SIDE, _LENGTHS[0]]
-        high = [rig.surface_height - 0.001, _SIDE, _LENGTHS[1]]
+        high = [rig.half_height - 0.001, _SIDE, _LENGTHS[1]]
         middle = rng.uniform(low, high)
         is_dust = rng.random() < _DUST_SHARE
         length = _DUST_LENGTH if is_dust else rng.uniform(*_FIBRE_LENGTHS)
@@ -94,7 +94,9 @@ class Marks:
     def _add_track(self, rng: np.random.Generator, rig: StereoRig) -> None:
         """Add the path of an older needle: gel that is torn and clouded, unevenly."""
         depth = rng.uniform(*_TRACK_DEPTHS)
-        path = random_path(int(rng.integers(2**31)), depth, rig.surface_height, CURVATURE)
+        path = random_path(
+            int(rng.integers(2**31)), depth, (rig.half_height, rig.half_width), CURVATURE
+        )
         plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=CURVATURE)
         advance_to(plant, depth, path.rotation)
         line = plant.centreline(_SPACING)

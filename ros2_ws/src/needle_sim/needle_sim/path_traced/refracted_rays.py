@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from needle_sim.camera.projection import camera_centre
 from needle_sim.camera.stereo_rig import Camera, StereoRig
 from needle_sim.needle.se3 import FloatArray
+from needle_sim.path_traced.level_surface import refractive_index
 
 # Each iteration leaves less than a hundredth of the lens distortion's error.
 _UNDISTORTING_STEPS = 7
@@ -61,12 +61,12 @@ def refracted_rays(pixels: ArrayLike, camera: Camera, rig: StereoRig) -> Rays:
     incoming = seen @ pose[:3, :3]
     incoming /= np.linalg.norm(incoming, axis=-1, keepdims=True)
 
-    centre = camera_centre(camera)
-    length = (rig.surface_height - centre[0]) / incoming[..., 0]
+    centre = camera.centre
+    length = (rig.half_height - centre[0]) / incoming[..., 0]
     origin = centre + length[..., np.newaxis] * incoming
 
     # Snell: what lies in the surface shrinks by n, the rest of the unit length is downwards.
-    direction = incoming / rig.refractive_index
+    direction = incoming / refractive_index(rig)
     direction[..., 0] = -np.sqrt(1.0 - (direction[..., 1:] ** 2).sum(axis=-1))
     in_air = origin[..., 2] <= 0.0
     direction[in_air] = incoming[in_air]

@@ -164,7 +164,7 @@ class PathTracedRenderer:
 
     def _view(self, camera: Camera, side: int) -> _View:
         look, rig = self._look, self._rig
-        optics = Optics(rig, camera, None)
+        optics = Optics(camera, None)
         size = (camera.image_height, camera.image_width)
         row, column = np.mgrid[: size[0], : size[1]]
         pixels = np.stack([column, row], axis=-1)

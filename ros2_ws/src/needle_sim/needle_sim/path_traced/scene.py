@@ -16,6 +16,7 @@ from needle_sim.path_traced import floors
 from needle_sim.path_traced.appearance import Metal
 from needle_sim.path_traced.floors import ALBEDO
 from needle_sim.path_traced.lamps import MIDDLE, apparent_centre
+from needle_sim.path_traced.level_surface import refractive_index
 from needle_sim.path_traced.needle_mesh import Mesh
 from needle_sim.path_traced.tracer import MM, Mitsuba
 from needle_sim.path_traced.world import PANEL_RADIANCE, World, room_light
@@ -54,7 +55,7 @@ class Scene:
         self.floor = self._mi.load_dict(self._floor(world))
         parts["floor"] = self.floor
         if world.bubbles is not None:
-            parts |= self._bubbles(world.bubbles, world.rig.refractive_index)
+            parts |= self._bubbles(world.bubbles, refractive_index(world.rig))
         for name, mesh in (needle or {}).items():
             parts[name] = self._mesh(name, mesh, self._metal(world, name))
         self.tracer = self._mi.load_dict(parts)
@@ -91,7 +92,7 @@ class Scene:
         return shape
 
     def _metal(self, world: World, part: str) -> dict[str, Any]:
-        look, index = world.look, world.rig.refractive_index
+        look, index = world.look, refractive_index(world.rig)
         if part == "bore":
             return _both_sides({"type": "diffuse", "reflectance": 0.03})
         along, across = look.roughness_along, look.roughness_across
@@ -150,7 +151,7 @@ class Scene:
 
     def _box(self, world: World) -> dict[str, Any]:
         """Return the box's walls and the sheath before it, through which the needle comes."""
-        top, bottom, wall = world.rig.surface_height, world.look.floor_height, world.wall
+        top, bottom, wall = world.rig.half_height, world.look.floor_height, world.wall
         # Half sides and middles: front (where the needle enters), far end, both sides.
         high = (top - bottom) / 2.0
         middle = (top + bottom) / 2.0 - 1e-5

@@ -13,6 +13,7 @@ from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.path_traced.appearance import Appearance
 from needle_sim.path_traced.floors import ALBEDO, FloorPicture, floor_picture
 from needle_sim.path_traced.lamps import Lamp, irradiance, place_lamps
+from needle_sim.path_traced.level_surface import refractive_index
 
 PANEL_RADIANCE = 1.0
 """Of a lit panel, as of the brightest lamp."""
@@ -69,7 +70,7 @@ def make_world(rig: StereoRig, look: Appearance) -> World:
     bubbles = None
     if look.bubbles > 0:
         kinds = Bubbles(look.bubbles, _SMALLEST_BUBBLE, float(rng.uniform(*_LARGEST_BUBBLES)))
-        bubbles = place_bubbles(kinds, rig.surface_height, rng)
+        bubbles = place_bubbles(kinds, rig, rng)
     room = look.room_light * irradiance(lamps, rig) / np.pi if lamps else 1.0
     return World(rig, look, lamps, room, floor_picture(look.floor, rng), bubbles, wall, albedo)
 
@@ -94,6 +95,6 @@ def room_light(world: World) -> FloatImage:
     mirrored = ALBEDO[look.floor] * light
     if look.floor == "panel":
         mirrored += PANEL_RADIANCE
-    total = np.sin(polar) > 1.0 / world.rig.refractive_index
+    total = np.sin(polar) > 1.0 / refractive_index(world.rig)
     sky[total] = mirrored
     return np.asarray(np.maximum(sky, 0.0), dtype=np.float32)

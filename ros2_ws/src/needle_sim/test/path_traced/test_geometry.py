@@ -7,10 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_sim.camera.projection import camera_centre, project
+from needle_common.errors import UserError
+from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import LAMPS, Lamps
 from needle_sim.path_traced.lamps import MIDDLE, apparent_centre, place_lamps
+from needle_sim.path_traced.level_surface import check_level, refractive_index
 from needle_sim.path_traced.needle_mesh import NeedleEnd, needle_mesh
 from needle_sim.path_traced.refracted_rays import points_at_height, refracted_rays
 
@@ -34,7 +36,7 @@ def test_a_pixel_s_ray_meets_what_is_projected_there(side: str, height: float) -
     pixels = np.stack([u, v], axis=-1)
     rays = refracted_rays(pixels, camera, RIG)
     points = points_at_height(rays, height)
-    seen = project(points, camera, RIG.surface_height, RIG.refractive_index)
+    seen = project(points, camera)
     np.testing.assert_allclose(seen, pixels, atol=1e-6)
     np.testing.assert_allclose(np.linalg.norm(rays.direction, axis=-1), 1.0, atol=1e-12)
 
@@ -42,7 +44,7 @@ def test_a_pixel_s_ray_meets_what_is_projected_there(side: str, height: float) -
 def test_before_the_phantom_rays_go_straight_on() -> None:
     rays = refracted_rays([[5.0, 300.0], [500.0, 300.0]], RIG.left, RIG)
     assert rays.origin[0, 2] < 0.0 < rays.origin[1, 2]
-    from_centre = rays.origin - camera_centre(RIG.left)
+    from_centre = rays.origin - RIG.left.centre
     from_centre /= np.linalg.norm(from_centre, axis=-1, keepdims=True)
     np.testing.assert_allclose(rays.direction[0], from_centre[0], atol=1e-12)
     assert rays.direction[1, 0] < from_centre[1, 0] - 1e-4
@@ -92,6 +94,13 @@ def test_lamps_stand_above_and_seem_higher(kind: Lamps) -> None:
             # Snell: the sines of the angles, as seen from the middle and from the surface over it.
             inside = there - MIDDLE
             sine = np.linalg.norm(inside[1:]) / np.linalg.norm(inside)
-            assert sine < 1.0 / RIG.refractive_index
+            assert sine < 1.0 / refractive_index(RIG)
             assert there[0] > lamp.centre[0]
             np.testing.assert_array_equal(there[1:], lamp.centre[1:])
+
+
+def test_a_rig_with_windows_is_refused() -> None:
+    check_level(RIG)
+    windows = load_stereo_rig(CALIBRATION.with_name("calibration_top_and_side.yaml"))
+    with pytest.raises(UserError, match="one level surface"):
+        check_level(windows)

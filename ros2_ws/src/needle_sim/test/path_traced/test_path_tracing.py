@@ -67,7 +67,7 @@ def test_a_small_bright_sphere_is_seen_where_snell_s_law_puts_it(
     }
     scene = BareScene(mitsuba.mi.load_dict({"type": "scene", "sphere": sphere}), floor)
     for camera in (rig.left, rig.right):
-        expected = project(point, camera, rig.surface_height, rig.refractive_index)
+        expected = project(point, camera)
         corner = np.rint(expected).astype(int) - 4
         pixels = corner + np.mgrid[:9, :9].reshape(2, -1).T
         light, cover = PathTracer(mitsuba).layer(
@@ -100,7 +100,7 @@ def test_the_same_seed_gives_the_same_pairs_with_a_needle_in_them(mitsuba: Mitsu
         ):
             np.testing.assert_array_equal(image, same)
             shaft = one.mesh.parts["shaft"].points[::40]
-            seen = project(shaft, camera, rig.surface_height, rig.refractive_index)
+            seen = project(shaft, camera)
             u, v = np.rint(seen[seen[:, 0] > 30.0]).astype(int).T
             darker = nothing[v, u].astype(float) - image[v, u]
             assert np.median(darker) > 20.0

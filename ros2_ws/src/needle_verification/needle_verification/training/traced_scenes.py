@@ -82,7 +82,7 @@ def _shaft(
     """Return 255 times the share of each pixel, the end and the width [px]."""
 
     def seen(points: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.asarray(project(points, camera, rig.surface_height, rig.refractive_index))
+        return np.asarray(project(points, camera))
 
     middle = seen(line)
     ahead = np.gradient(line, axis=0)
