@@ -27,7 +27,7 @@ Rows = tuple[int, int] | None
 _SURE_ENOUGH = 0.3  # of a line that may be the needle
 _MAP_CONTRAST = 80.0  # the same, of 255, where paths are looked for
 _CLEAR_INSIDE = 0.5
-_CLEAR_WIDTHS = 2.0  # an end known worse than that, in needle widths (one sigma), is not seen
+_CLEAR_WIDTHS = 1.2
 _ALLOWANCE = 2.5
 _LINE_SYSTEMATIC_PX, _END_SYSTEMATIC_PX = 0.2, 0.7
 # In needle widths: beyond such a gap may be another thing, and beyond such a one there is.

@@ -56,7 +56,7 @@ def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
     """Return what a patch of an image is about [px]."""
     chance, end = rng.random(), scene.ends[i]
     if chance < _AT_END and np.isfinite(end).all():
-        return end
+        return np.asarray(end)
     rows, columns = np.nonzero(scene.shares[i] > 128)
     if chance < _AT_END + _ON_SHAFT and len(rows):
         k = int(rng.integers(len(rows)))
@@ -71,6 +71,6 @@ def _exposed_anew(rng: np.random.Generator, image: NDArray[np.uint8]) -> NDArray
     if rng.random() < 0.5:
         seen = 255.0 * (seen / 255.0) ** np.float32(rng.uniform(0.6, 1.5))
     if rng.random() < 0.4:
-        seen = cv2.GaussianBlur(seen, (0, 0), rng.uniform(0.3, 1.0))
-    seen = seen + rng.standard_normal(seen.shape) * rng.uniform(0.0, 4.0)
+        seen = np.asarray(cv2.GaussianBlur(seen, (0, 0), rng.uniform(0.3, 1.0)), np.float32)
+    seen += (rng.standard_normal(seen.shape) * rng.uniform(0.0, 4.0)).astype(np.float32)
     return np.clip(seen, 0.0, 255.0).astype(np.uint8)
