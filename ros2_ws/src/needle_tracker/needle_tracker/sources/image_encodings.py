@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_tracker.image.detection import Image
+Image = NDArray[np.uint8]
 
 _GREY = ("mono8", "8UC1")
 _COLOUR = {

@@ -22,7 +22,7 @@ def scene() -> NDArray[np.uint8]:
     """Return a smooth colour image, (60, 80, 3), red first."""
     y, x = np.mgrid[:60, :80] / 60.0
     channels = [90 + 80 * np.sin(2 * x), 120 + 90 * np.cos(3 * y), 60 + 50 * np.sin(x + 2 * y)]
-    return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
+    return np.asarray(np.rint(np.stack(channels, axis=-1)), np.uint8)
 
 
 def brightness(colour: NDArray[np.uint8]) -> NDArray[np.float64]:
