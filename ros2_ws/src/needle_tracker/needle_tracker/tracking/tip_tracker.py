@@ -1,8 +1,7 @@
 """Two trackers for one needle: one that looks at lines, and one that looks at needle maps.
 
 Lines are quicker and, of a plain needle, finer; they are what counts while both agree. Where lines
-show no needle, or one that ends where the maps deny it, the maps count. How far a face may reach
-that is not seen, maps alone can say.
+show no needle, or one that ends where the maps deny it, the maps count.
 """
 
 from __future__ import annotations
@@ -11,7 +10,6 @@ import dataclasses
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from needle_tracker.image.detection import Image
 from needle_tracker.image.looks import MapLook
@@ -32,8 +30,6 @@ _ALIKE = 7.8
 """Squared distance over the covariance that two measurements of one tip keep in 95 of 100."""
 _SHORT = 1.0
 """Standard deviations: lines that end so far before the maps' end may lack a face."""
-_FACE_WIDTHS = 0.5
-"""So far may a face reach that is not seen, in needle widths, before maps have said (one sigma)."""
 _AGREEMENTS = 3
 """So often in a row lines agree with maps that count, to count again."""
 
@@ -74,7 +70,6 @@ class TipTracker:
         self._agreed = 0
         self._pairs = self._in_vain = 0
         self._since_compared = _BOTH_EVERY
-        self._end_variance = (_FACE_WIDTHS * self.settings.needle_width) ** 2
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
@@ -92,31 +87,18 @@ class TipTracker:
         self._pairs += 1
         self._since_compared += 1
         if not (self._maps_count or self._maps_are_due(lines)):
-            return self._no_surer(lines)
+            return lines
         maps = self._maps.process(left, right, insertion)
         shown = maps.tip is not None or maps.state is TrackState.CONFIRMING
         self._in_vain = 0 if shown else self._in_vain + 1
         if lines.tip is None or maps.tip is None:
             self._agreed = 0
             self._maps_count = self._maps_count or maps.tip is not None
-            return self._no_surer(lines) if maps.tip is None else maps
+            return lines if maps.tip is None else maps
         self._since_compared = 0
-        self._end_variance = _along(maps.tip, maps.tip.direction)
         self._agreed = self._agreed + 1 if _agree(lines.tip, maps.tip) else 0
         self._maps_count = self._agreed < (_AGREEMENTS if self._maps_count else 1)
-        return maps if self._maps_count else self._no_surer(lines)
-
-    def _no_surer(self, lines: Measurement) -> Measurement:
-        """Return what lines say, along the needle no surer than maps were of its end.
-
-        A line ends where it is seen last; maps know of faces that are not seen.
-        """
-        tip = lines.tip
-        if tip is None:
-            return lines
-        more = max(self._end_variance - _along(tip, tip.direction), 0.0)
-        covariance = tip.covariance + more * np.outer(tip.direction, tip.direction)
-        return dataclasses.replace(lines, tip=dataclasses.replace(tip, covariance=covariance))
+        return maps if self._maps_count else lines
 
     def _maps_are_due(self, lines: Measurement) -> bool:
         """Return whether maps are drawn of a pair although lines count."""
@@ -132,8 +114,3 @@ def _agree(lines: SpatialTip, maps: SpatialTip) -> bool:
     ahead = maps.direction
     short = float(between @ ahead) > _SHORT * math.sqrt(float(ahead @ covariance @ ahead))
     return not short and float(between @ np.linalg.solve(covariance, between)) < _ALIKE
-
-
-def _along(tip: SpatialTip, direction: NDArray[np.float64]) -> float:
-    """Return the variance of a tip along a direction [m^2]."""
-    return float(direction @ tip.covariance @ direction)
