@@ -98,7 +98,7 @@ class StereoTracker:
         return left.needle_width_px, right.needle_width_px
 
     def warm_up(self) -> None:
-        """Compile, or load, all that is compiled, and take the memory: the first pair must not wait.
+        """Compile, or load, all that is compiled: the first pair must not wait for it.
 
         The tracker looks at a needle that it draws itself, and forgets it.
         """
@@ -115,9 +115,6 @@ class StereoTracker:
         # Found, confirmed, followed.
         for _ in range(3):
             self.process(images[0], images[1], length)
-        # Searched for everywhere.
-        self.reset()
-        self.process(images[0], images[1], None)
         self.reset()
 
     def reset(self) -> None:
