@@ -22,6 +22,7 @@ _WIDTH_PX = 5.0
 _LIKE = (0.8, 1.3)  # widths so near to that, as a ratio, are not scaled
 _MARGIN_PX = 24  # what is seen around a box, in what the net sees: farther off matters little
 _TILE = 64
+_PART_PX = 384  # what the net sees at once
 _SURROUNDINGS_PX, _DARK_NOISE, _CLIP = 10.0, 2.0, 4.0
 
 
@@ -88,7 +89,19 @@ class NeedleMap:
         return self._map
 
     def _look(self, image: Image, box: Box) -> Image:
-        """Return the map of a box."""
+        """Return the map of a box, part by part: the net's memory grows with what it sees."""
+        x0, y0, x1, y1 = box
+        size = max(int(_PART_PX / self._scale), 2) // 2 * 2
+        drawn = np.zeros((y1 - y0, x1 - x0), np.uint8)
+        for top in range(y0, y1, size):
+            for left in range(x0, x1, size):
+                part = (left, top, min(left + size, x1), min(top + size, y1))
+                drawn[top - y0 : part[3] - y0, left - x0 : part[2] - x0] = self._look_at_part(
+                    image, part
+                )
+        return drawn
+
+    def _look_at_part(self, image: Image, box: Box) -> Image:
         scale = self._scale
         height, width = image.shape
         margin = int(_MARGIN_PX / scale) + 1
