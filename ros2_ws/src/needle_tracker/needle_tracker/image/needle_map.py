@@ -50,7 +50,7 @@ class NeedleMap:
     """
 
     def __init__(self, needle_width_px: float) -> None:
-        self._net = cv2.dnn.readNetFromONNX(_weights())
+        self._net = _net()
         factor = _WIDTH_PX / needle_width_px
         self._scale = 1.0 if _LIKE[0] < factor < _LIKE[1] else factor
         self._image: Image | None = None
@@ -131,6 +131,15 @@ class NeedleMap:
 
 
 @cache
+def _net() -> cv2.dnn.Net:
+    """Return the net, for all maps; it has looked once, and so has all the memory that it takes."""
+    net = cv2.dnn.readNetFromONNX(_weights())
+    size = _PART_PX + 2 * (_MARGIN_PX + 2)
+    net.setInput(np.zeros((1, 1, size, size), np.float32))
+    net.forward()
+    return net
+
+
 def _weights() -> NDArray[np.uint8]:
     content = (files("needle_tracker") / "image" / "needle_map.onnx").read_bytes()
     return np.frombuffer(content, np.uint8)
