@@ -25,6 +25,7 @@ class Channel:
         self.length = 0.0
         self._count = 0
         self._starts = np.empty(64)
+        self._lengths = np.empty(64)
         self._poses = np.empty((64, 4, 4))
         self._twists = np.empty((64, 6))
         self._angles = np.empty((64, 2))
@@ -52,13 +53,15 @@ class Channel:
         """
         if self._count == len(self._starts):
             self._starts = np.concatenate([self._starts, np.empty_like(self._starts)])
+            self._lengths = np.concatenate([self._lengths, np.empty_like(self._lengths)])
             self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
             self._twists = np.concatenate([self._twists, np.empty_like(self._twists)])
             self._angles = np.concatenate([self._angles, np.empty_like(self._angles)])
         self._starts[self._count] = self.length
         self._poses[self._count] = T_rig_start
-        self._twists[self._count] = twist / length
-        self._angles[self._count] = angle, turned / length
+        self._lengths[self._count] = length
+        self._twists[self._count] = twist
+        self._angles[self._count] = angle, turned
         self._count += 1
         self.length += length
 
@@ -84,9 +87,11 @@ class Channel:
             return self._before_entry(insertion), np.full(insertion.shape, self._entry_angle)
         starts = self._starts[: self._count]
         index = np.clip(np.searchsorted(starts, insertion, side="right") - 1, 0, None)
-        beyond = (insertion - starts[index])[..., np.newaxis]
-        poses = self._poses[index] @ exp_twist(beyond * self._twists[index])
-        angles = self._angles[index, 0] + beyond[..., 0] * self._angles[index, 1]
+        # A share, since a rate over the shortest of stretches is beyond numbers.
+        lengths = self._lengths[index]
+        share = np.clip(insertion - starts[index], 0.0, lengths) / lengths
+        poses = self._poses[index] @ exp_twist(share[..., np.newaxis] * self._twists[index])
+        angles = self._angles[index, 0] + share * self._angles[index, 1]
         outside = insertion < 0.0
         poses[outside] = self._before_entry(insertion[outside])
         return poses, np.where(outside, self._entry_angle, angles)

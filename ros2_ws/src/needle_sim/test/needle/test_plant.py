@@ -159,6 +159,25 @@ def test_reinsertion_follows_the_channel_and_cuts_on_from_its_end() -> None:
     )
 
 
+def test_moves_however_short_or_fast_leave_a_pose() -> None:
+    rng = np.random.default_rng(1)
+    lengths, turns = [0.0, 1.0, -1.0, 1e-320, 1e-3], [0.0, 1e5, -1e5, 1e-320]
+    for lag in (0.0, 0.01):
+        needle = NeedlePlant(np.eye(4), curvature=10.0, torsion=Torsion(play=0.05, lag_length=lag))
+        at = np.zeros(2)
+        for _ in range(2000):
+            to = np.array(
+                [
+                    rng.choice([rng.choice(lengths), rng.uniform(-1.0, 1.0)]),
+                    rng.choice([rng.choice(turns), rng.uniform(-1.0, 1.0)]),
+                ]
+            )
+            needle.advance(*(to - at))
+            at = to
+            turned = needle.T_rig_tip[:3, :3]
+            np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-9)
+
+
 def test_a_needle_drawn_out_starts_a_new_channel() -> None:
     plant = inserted(NeedlePlant(initial_pose(0.1, 0.2), curvature=CURVATURE), 30)
     plant.advance(-0.032, 0.0)
