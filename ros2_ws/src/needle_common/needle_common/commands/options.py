@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import Any, NoReturn, overload
 
 from needle_common.commands.cli import STANDARD_OUTPUT
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 
 
 class CommandParser(argparse.ArgumentParser):
@@ -66,11 +67,8 @@ def number(name: str, text: str, lower: float, upper: float, unit: str) -> float
         value = float(text)
     except ValueError:
         raise UserError(f"{name} {text!r} is not a number") from None
-    if lower <= value <= upper:
-        return value
-    if not math.isfinite(value):
-        raise UserError(f"{name} {text!r} is not finite")
-    raise OutOfBoundsError(name, value, lower, upper, unit)
+    check_bounds(name, value, lower, upper, unit, unlimited=upper == math.inf)
+    return value
 
 
 def whole_number(name: str, text: str, lower: int, upper: int) -> int:
@@ -79,8 +77,7 @@ def whole_number(name: str, text: str, lower: int, upper: int) -> int:
         value = int(text)
     except ValueError:
         raise UserError(f"{name} {text!r} is not a whole number") from None
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, "-")
+    check_bounds(name, value, lower, upper, "-")
     return value
 
 
@@ -106,12 +103,18 @@ def output_file(name: str, text: str | Path | None) -> Path | None:
     return path
 
 
+_STARTS = ("--initial", "--target")
+
+
 def join_start(arguments: Sequence[str]) -> list[str]:
-    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option."""
+    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option.
+
+    Likewise `--target`.
+    """
     joined: list[str] = []
     for argument in arguments:
-        if joined and joined[-1] == "--initial" and argument[1:2] in "0123456789.ni":
-            joined[-1] = f"--initial={argument}"
+        if joined and joined[-1] in _STARTS and argument[1:2] in "0123456789.ni":
+            joined[-1] = f"{joined[-1]}={argument}"
         else:
             joined.append(argument)
     return joined

@@ -7,7 +7,8 @@ import math
 from collections.abc import Iterator
 from typing import Any, cast
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 
 _METADATA_KEY = "needle_parameter"
 
@@ -78,10 +79,7 @@ def check_fields(parameters: Any) -> None:
             )
         for element in value if isinstance(value, tuple) else (value,):
             if isinstance(element, (int, float)) and not isinstance(element, bool):
-                if not math.isfinite(element):
-                    raise UserError(f"{name} = {element} {spec.unit} is not finite")
-                if not spec.lower <= element <= spec.upper:
-                    raise OutOfBoundsError(name, element, spec.lower, spec.upper, spec.unit)
+                check_bounds(name, element, spec.lower, spec.upper, spec.unit)
             elif spec.choices and element not in spec.choices:
                 raise UserError(f"{name} = {element!r} is not one of {', '.join(spec.choices)}")
 

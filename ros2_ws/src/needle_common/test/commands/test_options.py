@@ -46,10 +46,14 @@ def test_a_number_lies_within_its_bounds() -> None:
 
 @pytest.mark.parametrize(
     ("text", "complaint"),
-    [("deep", "is not a number"), ("nan", "is not finite"), ("-inf", "is not finite")],
+    [
+        ("deep", "'deep' is not a number"),
+        ("nan", "= nan mm is not finite"),
+        ("-inf", "= -inf mm is not finite"),
+    ],
 )
 def test_what_is_no_number_is_refused(text: str, complaint: str) -> None:
-    with pytest.raises(UserError, match=f"--depth-mm '{text}' {complaint}"):
+    with pytest.raises(UserError, match=f"--depth-mm {complaint}"):
         number("--depth-mm", text, 1.0, 120.0, "mm")
 
 
