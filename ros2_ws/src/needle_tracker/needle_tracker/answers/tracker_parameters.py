@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.pair_answers import PairingSettings
+from needle_tracker.answers.reference_images import read_reference
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.gates import GateSettings
@@ -19,6 +21,12 @@ class StereoTrackerParameters:
 
     calibration_file: str = fixed_parameter(
         "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
+    )
+    reference_folder: str = fixed_parameter(
+        "",
+        "-",
+        "Folder with left/ and right/: images of the phantom without needle; empty: taken "
+        "from the pairs before each insertion.",
     )
     reliable_images: bool = fixed_parameter(
         True, "-", "Take images reliably, for simulation; false: best effort, for hardware."
@@ -177,7 +185,13 @@ class StereoTrackerParameters:
         -------
         TrackerSettings
             As the parameters say.
+
+        Raises
+        ------
+        UserError
+            If there are no reference images where they should be.
         """
+        folder = self.reference_folder
         gates = GateSettings(
             reach=Reach(
                 self.max_curvature, self.entry_angle, self.hole_tolerance, self.max_insertion
@@ -203,6 +217,7 @@ class StereoTrackerParameters:
             noise_factor=self.noise_factor,
             entry_zone=self.entry_zone,
             hole_clearance=self.hole_clearance,
+            reference=read_reference(Path(folder), calibration) if folder else None,
         )
 
 

@@ -12,7 +12,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 from needle_tracker.calibrating.charuco import CharucoBoard
 from needle_tracker.optics.calibration import SIDES, parse_windows, yaml_problem
 from needle_tracker.optics.window import Window, common_surface
@@ -227,8 +228,7 @@ def _number(
     value = content.get(key)
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
         raise UserError(f"{name}.{key} = {value!r} is not a finite number")
-    if not bounds[0] <= value <= bounds[1]:
-        raise OutOfBoundsError(f"{name}.{key}", value, *bounds, unit)
+    check_bounds(f"{name}.{key}", value, *bounds, unit)
     return float(value)
 
 

@@ -13,7 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 
 Array = NDArray[np.float64]
 
@@ -54,14 +55,9 @@ class CharucoBoard:
     def __post_init__(self) -> None:
         """Check the fields."""
         for name, count in (("columns", self.columns), ("rows", self.rows)):
-            if not 3 <= count <= 100:
-                raise OutOfBoundsError(f"board.{name}", count, 3, 100, "squares")
-        if not 0.5e-3 <= self.square <= 0.5:
-            raise OutOfBoundsError("board.square", self.square, 0.5e-3, 0.5, "m")
-        if not 0.3 * self.square <= self.marker <= 0.95 * self.square:
-            raise OutOfBoundsError(
-                "board.marker", self.marker, 0.3 * self.square, 0.95 * self.square, "m"
-            )
+            check_bounds(f"board.{name}", count, 3, 100, "squares")
+        check_bounds("board.square", self.square, 0.5e-3, 0.5, "m")
+        check_bounds("board.marker", self.marker, 0.3 * self.square, 0.95 * self.square, "m")
         number = getattr(cv2.aruco, self.dictionary, None)
         if not self.dictionary.startswith("DICT_") or not isinstance(number, int):
             raise UserError(f"board.dictionary = {self.dictionary!r} is none of OpenCV's")

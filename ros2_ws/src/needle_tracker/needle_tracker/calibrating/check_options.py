@@ -9,7 +9,8 @@ from pathlib import Path
 
 from needle_common.commands.cli import JsonValue
 from needle_common.commands.options import CommandParser
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 from needle_tracker.calibrating.calibration_check import (
     CAMERAS,
     NOTHING_SHOWN,
@@ -75,9 +76,7 @@ def parse(arguments: Sequence[str]) -> CheckOptions:
         ("pair_tolerance", 0.0, 0.1, "s"),
         ("limit_mm", 0.001, 10.0, "mm"),
     ):
-        value = getattr(given, name)
-        if not (math.isfinite(value) and lower <= value <= upper):
-            raise OutOfBoundsError(f"--{name.replace('_', '-')}", value, lower, upper, unit)
+        check_bounds(f"--{name.replace('_', '-')}", getattr(given, name), lower, upper, unit)
     return CheckOptions(
         calibration=given.calibration,
         session=given.session,

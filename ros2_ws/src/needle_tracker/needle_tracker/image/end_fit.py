@@ -26,8 +26,9 @@ LINE_WIDTHS = 8.0
 _BACK_WIDTHS, _AHEAD_WIDTHS = 4.0, 4.0  # the end is looked for so far about where it should be
 _SLOPES = 7  # directions that are tried, so far to either side [-]
 _SLOPE = 0.15
-_CORE = 0.3  # of the width: what is read for the end
+_CORE = 0.3  # of the width, to either side: the end is where it reaches farthest there
 _PASSES = 3
+_WHOLE = 0.8  # of the width: a map shows that much of a needle that it sees whole
 _EARLY = 0.841  # the chance to reach one standard deviation less than the middle
 _GAP_WIDTHS, _UNLIKELY = 1.5, 0.3  # where needle is less likely for so long, it has ended
 _LEAST_STEP = 0.2  # of the map from shaft to floor: less is no end
@@ -151,7 +152,7 @@ def _centre_line(
     """Fit the line to the middles of the needle; write (mass, offset, slope, sigmas, certainty)."""
     count = int(back)
     places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
-    certainty = 0.0
+    certainty = apparent = 0.0
     for i in range(count):
         s = end - i
         line = offset + slope * s
@@ -165,6 +166,7 @@ def _centre_line(
         places[i], weights[i] = s, min(0.5 * mass / width, 1.0)
         middles[i] = line + (moment / mass if mass > 0.0 else 0.0)
         certainty += _seen(image, point, direction, s, line)
+        apparent += 0.5 * mass / width
     total = weights.sum()
     sums[0] = total
     if total < 2.0:
@@ -179,7 +181,9 @@ def _centre_line(
     independent = max(total / width, 2.0)
     across = variance / (independent - 1.0) * (1.0 + (end - mean) ** 2 / max(spread / total, 1e-9))
     sums[1], sums[2] = middle - lean * mean, lean
-    sums[3] = math.sqrt(across)
+    # Where the map shows less than the needle's width, what is missing lies on one side of it.
+    missing = 0.5 * width * max(_WHOLE - apparent / count, 0.0)
+    sums[3] = math.sqrt(across + missing * missing)
     sums[4] = math.sqrt(variance / (independent - 1.0) / max(spread / total, 1e-9))
     sums[5] = certainty / count
 
@@ -204,10 +208,11 @@ def _end_along(
     chance = np.empty(count)
     for i in range(count):
         s = begin + i
-        total = 0.0
+        most = 0.0
         for j in range(-2, 3):
-            total += _seen(image, point, direction, s, offset + slope * s + 0.5 * j * _CORE * width)
-        chance[i] = total / 5.0
+            across = offset + slope * s + 0.5 * j * _CORE * width
+            most = max(most, _seen(image, point, direction, s, across))
+        chance[i] = most
     _make_survival(chance, int(math.ceil(_GAP_WIDTHS * width)))
     sure, left = chance[0], chance[count - 1]
     if sure - left < _LEAST_STEP:

@@ -13,11 +13,13 @@ import math
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from needle_tracker.image import detection, tip_fit
+from needle_tracker.image.background import Background
 from needle_tracker.image.detection import DetectionSettings, Image, Path
 from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end
-from needle_tracker.image.needle_map import NeedleMap
+from needle_tracker.image.needle_map import Box, NeedleMap
 from needle_tracker.image.search_grid import SearchGrid
 from needle_tracker.image.tip_fit import HIDDEN_END_PX, HIDDEN_FACTOR, Expected, ImageTip
 
@@ -85,10 +87,35 @@ class MapLook:
     ----------
     needle_width_px : float
         Width of the needle in the image [px].
+
+    Attributes
+    ----------
+    background : Background or None
+        What stands behind the needle, where that is known.
     """
 
     def __init__(self, needle_width_px: float) -> None:
         self._map = NeedleMap(needle_width_px)
+        self._map_of_difference = NeedleMap(needle_width_px)
+        self.background: Background | None = None
+
+    def _draw(self, image: Image, box: Box) -> Image:
+        """Return the map; before lines that were there before the needle, of what is new."""
+        background = self.background
+        difference = None if background is None else background.difference(image)
+        if background is None or difference is None:
+            return self._map.draw(image, box)
+        new = self._map_of_difference.draw(difference, box)
+        if background.is_empty:
+            return new
+        return background.joined(self._map.draw(image, box), new)
+
+    def _is_seam(self, image: Image, point: NDArray[np.float64], room: float) -> bool:
+        """Return whether the map is put together near a point [px]: no end is believed there."""
+        background = self.background
+        if background is None or background.difference(image) is None:
+            return False
+        return background.is_seam(point, room)
 
     def find_paths(
         self,
@@ -107,7 +134,7 @@ class MapLook:
             noise_factor=0.0,
             min_coverage=0.0,
         )
-        drawn = self._map.draw(image, box)
+        drawn = self._draw(image, box)
         least = max(int(sure.min_length / grid.row_pitch), 2, 0 if ends is None else ends[0])
         paths = [
             part
@@ -134,7 +161,7 @@ class MapLook:
         box = (int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
         result = np.zeros(9)
         if not fit_end(
-            self._map.draw(image, box),
+            self._draw(image, box),
             np.ascontiguousarray(expected.point, dtype=np.float64),
             np.ascontiguousarray(expected.direction, dtype=np.float64),
             float(expected.room),
@@ -150,6 +177,7 @@ class MapLook:
         point, along = np.array([u, v]), math.hypot(along, _END_SYSTEMATIC_PX)
         across = math.hypot(across, _LINE_SYSTEMATIC_PX)
         clear = inside > _CLEAR_INSIDE and along < _CLEAR_WIDTHS * width
+        clear = clear and not self._is_seam(image, point, width)
         if expected.sigma_along > 0.0:
             off = abs(float((point - expected.point) @ expected.direction))
             clear = clear and off < 3.0 * math.hypot(expected.sigma_along, along)

@@ -11,7 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
 SIDES = ("left", "right")
@@ -189,8 +190,7 @@ def _window(content: Any, side: str) -> Window:
     point = _numbers(content, 3, side, "window", "point")
     normal = _numbers(content, 3, side, "window", "normal")
     norm = float(np.linalg.norm(normal))
-    if not 0.99 <= norm <= 1.01:
-        raise OutOfBoundsError(f"length of {side}.window.normal", norm, 0.99, 1.01, "-")
+    check_bounds(f"length of {side}.window.normal", norm, 0.99, 1.01, "-")
     normal = normal / norm
     if math.hypot(normal[0], normal[1]) < _LEAST_ASIDE:
         raise UserError(
@@ -205,16 +205,14 @@ def _window(content: Any, side: str) -> Window:
     for number, layer in enumerate(layers):
         entry = {f"{name}[{number}]": layer}
         thickness = _number(entry, *entry, "thickness")
-        if not 0.0 < thickness <= _THICKEST:
-            raise OutOfBoundsError(f"{name}[{number}].thickness", thickness, 0.0, _THICKEST, "m")
+        check_bounds(f"{name}[{number}].thickness", thickness, ABOVE_0, _THICKEST, "m")
         found.append(Layer(thickness, _index(entry, *entry, "refractive_index")))
     return Window(point, normal, tuple(found), _index(content, side, "window", "inside"))
 
 
 def _index(content: Any, *keys: str) -> float:
     index = _number(content, *keys)
-    if not _INDICES[0] <= index <= _INDICES[1]:
-        raise OutOfBoundsError(".".join(keys), index, *_INDICES, "-")
+    check_bounds(".".join(keys), index, *_INDICES, "-")
     return index
 
 
@@ -233,8 +231,7 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
     translation = _numbers(content, 3, side, "T_optical_rig", "translation")
     quaternion = _numbers(content, 4, side, "T_optical_rig", "rotation")
     norm = float(np.linalg.norm(quaternion))
-    if not 0.99 <= norm <= 1.01:
-        raise OutOfBoundsError(f"norm of {side}.T_optical_rig.rotation", norm, 0.99, 1.01, "-")
+    check_bounds(f"norm of {side}.T_optical_rig.rotation", norm, 0.99, 1.01, "-")
     transform = np.eye(4)
     transform[:3, :3] = rotation_matrix(quaternion / norm)
     transform[:3, 3] = translation

@@ -38,7 +38,7 @@ from needle_tracker.tracking.evidence import (
 from needle_tracker.tracking.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
 from needle_tracker.tracking.guided_search import guided_pairs, leads, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import Anchor, Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -223,7 +223,7 @@ class Acquisition:
             return first
         # Where something crosses the needle in one view, the other's end may lead to it.
         alone = tuple(max(filter(None, tips.values()), key=leads, default=None) for tips in fitted)
-        reason: str = Refusal.NO_COMMON_POINT
+        reason: str = NoTip.NO_COMMON_POINT
         if None in alone:
             reason = f"no clear tip in the {SIDES[alone.index(None)]} image"
         return Measurement(None, state, reason, (alone[0], alone[1]))
@@ -241,13 +241,11 @@ class Acquisition:
         if on_way:
             found = self._usual.unmixed(found)
         measured = judged(self._views, self._track, found, insertion)
-        if measured.reason == Refusal.DISAGREE_ALONG and insertion is not None:
+        if measured.reason == NoTip.DISAGREE_ALONG and insertion is not None:
             measured = self._one_sided(found, insertion, last) or measured
         wanted = self._sights_wanted(measured, found, insertion, on_way=on_way)
         if wanted is None:
-            return dataclasses.replace(
-                measured, tip=None, reason=measured.reason or Refusal.UNCLEAR
-            )
+            return dataclasses.replace(measured, tip=None, reason=measured.reason or NoTip.UNCLEAR)
         tip = measured.contested if measured.tip is None and wanted else measured.tip
         if tip is None:
             return measured
@@ -266,7 +264,7 @@ class Acquisition:
             return measured
         if self._track.contest(tip, insertion, wanted):
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
-        return dataclasses.replace(measured, tip=None, reason=measured.reason or Refusal.UNCLEAR)
+        return dataclasses.replace(measured, tip=None, reason=measured.reason or NoTip.UNCLEAR)
 
     def _sights_wanted(
         self,
@@ -283,7 +281,11 @@ class Acquisition:
         if tip is not None and track.is_excluded(tip, insertion):
             return sights_to_exclude(track.state, found, alike=alike)
         if measured.tip is None:
-            refused = measured.reason in (Refusal.TOO_FAR, Refusal.SURPRISING, Refusal.UNCERTAIN)
+            refused = measured.reason in (
+                NoTip.TOO_FAR,
+                NoTip.SURPRISING,
+                NoTip.UNCERTAIN,
+            )
             return (
                 sights_to_contradict(track.state, found, alike=alike, on_way=on_way)
                 if refused

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.window import Window
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
@@ -89,25 +89,25 @@ def refusal(tip: SpatialTip, insertion: float | None, settings: GateSettings) ->
     # Steered ever the same way, and a little more for what the margins leave open.
     largest_turn = 1.3 * path_length * reach.curvature + reach.entry_angle + settings.tip_lean
     checks = [
-        (tip.disagreement > settings.max_disagreement, Refusal.DISAGREE_ALONG),
-        (tip.disagreement_across > settings.max_miss_px, Refusal.DISAGREE_ACROSS),
-        (largest_sigma > settings.max_depth_sigma, Refusal.UNCERTAIN),
+        (tip.disagreement > settings.max_disagreement, NoTip.DISAGREE_ALONG),
+        (tip.disagreement_across > settings.max_miss_px, NoTip.DISAGREE_ACROSS),
+        (largest_sigma > settings.max_depth_sigma, NoTip.UNCERTAIN),
         (
             any(window.depth(tip.position) < 0.0 for window in settings.windows),
-            Refusal.OUTSIDE,
+            NoTip.OUTSIDE,
         ),
-        (distance < settings.least_distance, Refusal.NEAR_ENTRY),
-        (distance > reach.length + margin, Refusal.BEYOND_REACH),
+        (distance < settings.least_distance, NoTip.NEAR_ENTRY),
+        (distance > reach.length + margin, NoTip.BEYOND_REACH),
         (
             _angle_to_z(tip.position / distance) > float(reach.chord_angle(np.array(distance))),
-            Refusal.OUTSIDE_CONE,
+            NoTip.OUTSIDE_CONE,
         ),
-        (_angle_to_z(tip.direction) > largest_turn, Refusal.DIRECTION),
+        (_angle_to_z(tip.direction) > largest_turn, NoTip.DIRECTION),
     ]
     if insertion is not None:
         shortest = reach.shortest_chord(insertion)
-        checks.append((distance > insertion + margin, Refusal.BEYOND_INSERTION))
-        checks.append((distance < shortest - margin, Refusal.SHORT_OF_INSERTION))
+        checks.append((distance > insertion + margin, NoTip.BEYOND_INSERTION))
+        checks.append((distance < shortest - margin, NoTip.SHORT_OF_INSERTION))
     return next((reason for failed, reason in checks if failed), None)
 
 

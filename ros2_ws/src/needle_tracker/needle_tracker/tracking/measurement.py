@@ -6,7 +6,7 @@ import dataclasses
 
 from needle_tracker.image.tip_fit import Expected, ImageTip
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.triangulation import SpatialTip, triangulate
 
@@ -61,7 +61,7 @@ def judged(
     """
     tip = triangulate(views, found)
     if tip is None:
-        return Measurement(None, track.state, Refusal.NO_COMMON_POINT, found)
+        return Measurement(None, track.state, NoTip.NO_COMMON_POINT, found)
     refused = track.judge(tip, insertion)
     if refused is None:
         return Measurement(tip, track.state, "", found)

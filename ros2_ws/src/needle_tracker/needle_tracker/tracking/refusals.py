@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 
 
-class Refusal(str, enum.Enum):
+class NoTip(str, enum.Enum):
     """A reason, as a person reads it."""
 
     def __str__(self) -> str:

@@ -1,19 +1,21 @@
 """Two trackers for one needle: one that looks at lines, and one that looks at needle maps.
 
 Lines are quicker and, of a plain needle, finer; they are what counts while both agree. Where lines
-show no needle, or one that ends where the maps deny it, the maps count.
+show no needle, or one that ends where the maps deny it, the maps count; and where what shines may
+be a lamp that the needle mirrors. Neither claims more than it can know.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
+from needle_tracker.image.backgrounds import Backgrounds
 from needle_tracker.image.detection import Image
 from needle_tracker.image.looks import MapLook
 from needle_tracker.optics.calibration import StereoCalibration
+from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
@@ -28,10 +30,8 @@ _DEPTH_SIGMA = 0.8e-3
 """A tip known so badly is better than none [m]: maps know what they do not see."""
 _ALIKE = 7.8
 """Squared distance over the covariance that two measurements of one tip keep in 95 of 100."""
-_SHORT = 1.0
-"""Standard deviations: lines that end so far before the maps' end may lack a face."""
-_AGREEMENTS = 3
-"""So often in a row lines agree with maps that count, to count again."""
+_IN_A_ROW = 3
+"""So often in a row maps confirm lines that did not count, or deny lines they have confirmed."""
 
 
 class TipTracker:
@@ -47,7 +47,12 @@ class TipTracker:
 
     def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
         self._lines = StereoTracker(calibration, settings)
-        left, right = (MapLook(width) for width in self._lines.needle_widths_px)
+        widths = self._lines.needle_widths_px
+        self._claims = Claims(self._lines.views, widths, settings.needle_width)
+        left, right = self._looks = (MapLook(widths[0]), MapLook(widths[1]))
+        self._backgrounds = Backgrounds(
+            self._lines.views, settings.hole_clearance, settings.reference
+        )
         gates = dataclasses.replace(settings.gates, max_depth_sigma=_DEPTH_SIGMA)
         wider = dataclasses.replace(settings, gates=gates)
         self._maps = StereoTracker(calibration, wider, (left, right))
@@ -60,14 +65,14 @@ class TipTracker:
         self._maps.warm_up()
 
     def reset(self) -> None:
-        """Forget the needle."""
+        """Forget the needle, not what stands behind it."""
         self._lines.reset()
         self._maps.reset()
         self._begin()
 
     def _begin(self) -> None:
-        self._maps_count = False
-        self._agreed = 0
+        self._maps_count = self._have_agreed = False
+        self._against = 0
         self._pairs = self._in_vain = 0
         self._since_compared = _BOTH_EVERY
 
@@ -79,38 +84,57 @@ class TipTracker:
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair; as `StereoTracker.process`."""
         lines = self._lines.process(left, right, insertion)
+        behind = self._backgrounds.see((left, right), insertion)
+        self._looks[0].background, self._looks[1].background = behind or (None, None)
         if insertion is not None and insertion < self.settings.entry_zone:
             # A new insertion: all that is known of the last one is over.
             self._maps.process(left, right, insertion)
             self._begin()
             return lines
+        mirrored = self._may_be_a_lamp(lines)
+        if lines.tip is not None:
+            unseen = OF_LAMP if mirrored else OF_OUTLINE
+            lines = dataclasses.replace(lines, tip=self._claims.widened(lines.tip, unseen))
         self._pairs += 1
         self._since_compared += 1
         if not (self._maps_count or self._maps_are_due(lines)):
             return lines
         maps = self._maps.process(left, right, insertion)
+        if maps.tip is not None:
+            maps = dataclasses.replace(maps, tip=self._claims.widened(maps.tip, OF_MAP))
         shown = maps.tip is not None or maps.state is TrackState.CONFIRMING
         self._in_vain = 0 if shown else self._in_vain + 1
         if lines.tip is None or maps.tip is None:
-            self._agreed = 0
+            self._against = 0
             self._maps_count = self._maps_count or maps.tip is not None
             return lines if maps.tip is None else maps
         self._since_compared = 0
-        self._agreed = self._agreed + 1 if _agree(lines.tip, maps.tip) else 0
-        self._maps_count = self._agreed < (_AGREEMENTS if self._maps_count else 1)
+        self._hear(agree=not mirrored and _agree(lines.tip, maps.tip))
         return maps if self._maps_count else lines
+
+    def _may_be_a_lamp(self, lines: Measurement) -> bool:
+        """Return whether lines are brighter than the floor though nobody said the needle is."""
+        if self.settings.bright:
+            return False
+        return any(tip is not None and tip.bright for tip in lines.image_tips)
+
+    def _hear(self, *, agree: bool) -> None:
+        """Note whether maps confirm the lines: decide which count."""
+        self._against = self._against + 1 if agree is self._maps_count else 0
+        untried = not (self._maps_count or self._have_agreed)
+        if self._against >= (1 if untried else _IN_A_ROW):
+            self._maps_count = not agree
+            self._against = 0
+        self._have_agreed = self._have_agreed or agree
 
     def _maps_are_due(self, lines: Measurement) -> bool:
         """Return whether maps are drawn of a pair although lines count."""
-        if lines.tip is not None and self._since_compared < _BOTH_EVERY:
+        if lines.tip is not None and not self._against and self._since_compared < _BOTH_EVERY:
             return False
         return self._in_vain < _IN_VAIN or self._pairs % _RESTS == 0
 
 
 def _agree(lines: SpatialTip, maps: SpatialTip) -> bool:
-    """Return whether both can be the same end, and lines do not end short of a face."""
+    """Return whether both can be the same end."""
     between = maps.position - lines.position
-    covariance = lines.covariance + maps.covariance
-    ahead = maps.direction
-    short = float(between @ ahead) > _SHORT * math.sqrt(float(ahead @ covariance @ ahead))
-    return not short and float(between @ np.linalg.solve(covariance, between)) < _ALIKE
+    return float(between @ np.linalg.solve(lines.covariance + maps.covariance, between)) < _ALIKE

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.tracking.gates import GateSettings, refusal
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -149,16 +149,16 @@ class Track:
         following = predicted is not None and predicted.known and self.state is TrackState.TRACKING
         merged = predicted.motion.merged(tip) if predicted is not None and following else tip
         reason = refusal(merged, insertion, self._settings)
-        if reason == Refusal.UNCERTAIN and refusal(tip, insertion, self._settings) is None:
+        if reason == NoTip.UNCERTAIN and refusal(tip, insertion, self._settings) is None:
             # Only the two together are: they contradict each other.
-            merged, reason = tip, Refusal.SURPRISING
-        if predicted is None or reason not in (None, Refusal.SURPRISING):
+            merged, reason = tip, NoTip.SURPRISING
+        if predicted is None or reason not in (None, NoTip.SURPRISING):
             return reason
         miss = float(np.linalg.norm(merged.position - predicted.motion.position))
         if miss > self.tolerance(predicted):
-            return Refusal.TOO_FAR
+            return NoTip.TOO_FAR
         if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
-            return Refusal.SURPRISING
+            return NoTip.SURPRISING
         return reason
 
     def accept(

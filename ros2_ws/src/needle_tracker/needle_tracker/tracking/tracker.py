@@ -30,7 +30,7 @@ from needle_tracker.tracking.following import (
 )
 from needle_tracker.tracking.gates import tip_at_entry
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.single_view import Seen, kept_up, seen_alone
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -179,7 +179,7 @@ class StereoTracker:
     ) -> Measurement:
         """Note that both views together give no tip; return what single ones say."""
         alone = self._update_from_single_view(images, insertion)
-        if measured.reason in (Refusal.HIDDEN, Refusal.UNCERTAIN):
+        if measured.reason in (NoTip.HIDDEN, NoTip.UNCERTAIN):
             self.track.hide()
         else:
             self.track.miss()
@@ -187,7 +187,7 @@ class StereoTracker:
             self._last = None
             self._usual.forget()
         measured = dataclasses.replace(measured, state=self.track.state)
-        elsewhere = measured.reason in (Refusal.TOO_FAR, Refusal.SURPRISING)
+        elsewhere = measured.reason in (NoTip.TOO_FAR, NoTip.SURPRISING)
         if alone is None or elsewhere or self.track.state is not TrackState.TRACKING:
             return measured
         tip, seen = alone
@@ -298,11 +298,11 @@ class StereoTracker:
                 return None
             found = sights.tips
         if not (found[0].clear or found[1].clear or self._goes_on(found, insertion)):
-            measured = Measurement(None, self.track.state, Refusal.HIDDEN, found)
+            measured = Measurement(None, self.track.state, NoTip.HIDDEN, found)
         else:
             measured = judged(self.views, self.track, found, insertion)
             sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
-            uncertain = measured.reason == Refusal.UNCERTAIN and self.track.is_unbroken
+            uncertain = measured.reason == NoTip.UNCERTAIN and self.track.is_unbroken
             if measured.tip is None and (sound or not uncertain):
                 return None
         return dataclasses.replace(measured, regions=regions)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from needle_tracker.image.detection import Image
 from needle_tracker.tracking.gates import GateSettings
 
 
@@ -27,6 +28,8 @@ class TrackerSettings:
         Insertion below which the needle is not looked for [m].
     hole_clearance : float
         Radius around the entry that is not looked at [m].
+    reference : pair of ndarray of uint8, shape (height, width), or None
+        Left and right image of the phantom without needle; None: taken as they come.
     """
 
     gates: GateSettings
@@ -36,3 +39,4 @@ class TrackerSettings:
     noise_factor: float
     entry_zone: float
     hole_clearance: float
+    reference: tuple[Image, Image] | None = dataclasses.field(default=None, compare=False)

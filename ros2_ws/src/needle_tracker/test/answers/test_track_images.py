@@ -235,3 +235,22 @@ def test_a_calibration_for_another_resolution_is_refused(
     code, _ = track(folder, other)
     assert code == 2
     assert "1280x768" in capsys.readouterr().err
+
+
+def test_images_of_the_empty_phantom_are_read_and_refused_by_name(
+    folder: Path, calibration_path: Path, drawn: Drawn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params, empty = folder / "params.yaml", folder / "empty"
+    params.write_text(
+        f"stereo_tracker: {{ros__parameters: {{reference_folder: {empty.as_posix()}}}}}\n"
+    )
+    for side in ("left", "right"):
+        (empty / side).mkdir(parents=True)
+        cv2.imwrite(str(empty / side / "0.png"), np.full_like(drawn[0][1], 200))
+    code, rows = track(folder, calibration_path, "--params", str(params))
+    assert code == 0
+    assert [row["valid"] for row in rows][-1] == "1"
+    cv2.imwrite(str(empty / "right" / "0.png"), np.zeros((480, 640), np.uint8))
+    code, _ = track(folder, calibration_path, "--params", str(params))
+    assert code == 2
+    assert "right/0.png: not an image of 1024x768" in capsys.readouterr().err

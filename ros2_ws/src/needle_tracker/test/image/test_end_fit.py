@@ -82,3 +82,14 @@ def test_what_shines_beyond_the_end_is_not_the_needle() -> None:
     result = fitted(image, 0.0)
     assert result is not None
     assert result[0] == pytest.approx(END[0], abs=0.3)
+
+
+def test_a_bevel_reaches_as_far_as_its_farthest_side() -> None:
+    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]].astype(float)
+    across = v - END[1]
+    # Ground from its upper edge, which ends a width earlier, to the extreme point below the axis.
+    end = END[0] - WIDTH * np.clip(0.3 - across / WIDTH, 0.0, 1.0)
+    chance = norm.sf((u - end) / 0.4) * np.clip(0.5 * WIDTH + 0.5 - np.abs(across), 0.0, 1.0)
+    result = fitted(np.asarray(np.rint(255.0 * chance), np.uint8), 0.0)
+    assert result is not None
+    assert result[0] == pytest.approx(END[0], abs=0.3)

@@ -22,7 +22,7 @@ from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.following import Follower
 from needle_tracker.tracking.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import Anchor, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
@@ -242,14 +242,14 @@ def test_after_a_gap_what_following_leaves_uncertain_is_searched_for(
     monkeypatch.setattr(
         following_tracker,
         "judged",
-        lambda _views, track, found, _: Measurement(None, track.state, Refusal.UNCERTAIN, found),
+        lambda _views, track, found, _: Measurement(None, track.state, NoTip.UNCERTAIN, found),
     )
     monkeypatch.setattr(following_tracker, "is_sound", lambda *_: False)
     mm = until + 1
     path = make_arc(mm * 1e-3, 6.0, 1.0)
     measured = tracker.process(*draw_pair(path), mm * 1e-3)
     if until == 52:
-        assert measured.reason.endswith(Refusal.UNCERTAIN)
+        assert measured.reason.endswith(NoTip.UNCERTAIN)
     else:
         assert measured.reason == ""
         assert measured.tip is not None

@@ -14,7 +14,7 @@ from needle_tracker.answers.health import Health
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.acquisition import Acquisition
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.single_view import seen_alone
 from needle_tracker.tracking.tip_prediction import TipMotion
 from needle_tracker.tracking.track import Anchor, TrackState
@@ -155,7 +155,7 @@ def test_views_that_only_one_by_one_show_the_needle_are_told_as_such(
     assert measured.reason == f"{EACH_VIEW}, views do not meet"
 
 
-@pytest.mark.parametrize("reason", [Refusal.TOO_FAR, Refusal.SURPRISING])
+@pytest.mark.parametrize("reason", [NoTip.TOO_FAR, NoTip.SURPRISING])
 def test_what_both_views_show_elsewhere_is_not_outvoted_by_one(
     tracker: StereoTracker,
     draw_pair: Drawer,

@@ -12,7 +12,7 @@ import pytest
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.window import Layer, Window
 from needle_tracker.tracking.gates import GateSettings, refusal, tip_at_entry
-from needle_tracker.tracking.refusals import Refusal
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -55,9 +55,9 @@ def test_a_tip_is_behind_both_windows(gates: GateSettings) -> None:
     wall = Window(np.array([0.0, 0.015, 0.0]), np.array([0.0, 1.0, 0.0]), (Layer(5e-3, 1.5),), 1.3)
     gates = dataclasses.replace(gates, windows=(gates.windows[0], wall))
     assert refusal(tip(y=9e-3, z=0.08), None, gates) is None
-    assert refusal(tip(y=11e-3, z=0.08), None, gates) == Refusal.OUTSIDE
+    assert refusal(tip(y=11e-3, z=0.08), None, gates) == NoTip.OUTSIDE
     assert refusal(tip(y=-11e-3, z=0.08), None, gates) is None
-    assert refusal(tip(x=18e-3, z=0.08), None, gates) == Refusal.OUTSIDE
+    assert refusal(tip(x=18e-3, z=0.08), None, gates) == NoTip.OUTSIDE
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,66 @@
+"""What stands behind the needle: taken away where it has lines, left where it has none."""
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from needle_tracker.image.background import Background
+
+Image = NDArray[np.uint8]
+SHAPE = (240, 320)
+ENTRY = np.array([20.0, 120.0])
+
+
+def floor(seed: int, *, lines: bool, light: float = 1.0, needle: bool = False) -> Image:
+    """Draw graph paper or a plain floor, with or without a needle from the entry on."""
+    image = np.full(SHAPE, 150.0, np.float32)
+    if lines:
+        for at in range(10, 320, 20):
+            cv2.line(image, (at, 0), (at, 239), 60.0, 2)
+            cv2.line(image, (0, at), (319, at), 60.0, 2)
+    if needle:
+        cv2.line(image, (20, 120), (200, 123), 20.0, 5, cv2.LINE_AA)
+    noise = np.random.default_rng(seed).normal(0.0, 2.0, SHAPE)
+    return np.asarray(np.clip(light * image + noise, 0.0, 255.0), np.uint8)
+
+
+@pytest.mark.parametrize("light", [0.8, 1.0, 1.15])
+def test_takes_the_lines_away_and_leaves_the_needle(light: float) -> None:
+    background = Background(floor(1, lines=True), ENTRY, 0.0)
+    rest = background.difference(floor(2, lines=True, light=light, needle=True))
+    assert rest is not None
+    around = rest[150:].astype(float)
+    assert around.mean() == pytest.approx(128.0, abs=3.0)
+    assert around.std() < 4.5
+    assert np.median(rest[120:123, 40:180]) < 40.0
+
+
+def test_a_plain_floor_is_better_as_it_is() -> None:
+    background = Background(floor(1, lines=False), ENTRY, 0.0)
+    assert background.difference(floor(2, lines=False, needle=True)) is None
+
+
+def test_a_camera_that_was_touched_leaves_the_image_as_it_is() -> None:
+    moved = np.roll(floor(1, lines=True), (9, 7), axis=(0, 1))
+    background = Background(np.ascontiguousarray(moved), ENTRY, 0.0)
+    assert background.difference(floor(2, lines=True, needle=True)) is None
+
+
+def test_the_map_of_the_image_holds_where_the_needle_was_before() -> None:
+    background = Background(floor(1, lines=True), ENTRY, 100.0)
+    whole, new = np.full(SHAPE, 200, np.uint8), np.full(SHAPE, 10, np.uint8)
+    new[120, 60] = 250
+    joined = background.joined(whole, new)
+    assert joined[120, 110] == 200
+    assert joined[120, 60] == 250
+    assert joined[120, 130] == 10
+    assert background.is_seam(np.array([118.0, 120.0]), 5.0)
+    assert not background.is_seam(np.array([110.0, 120.0]), 5.0)
+    assert not background.is_empty
+
+
+def test_an_empty_phantom_has_no_seam() -> None:
+    background = Background(floor(1, lines=True), ENTRY, 0.0)
+    assert background.is_empty
+    assert not background.is_seam(ENTRY, 5.0)

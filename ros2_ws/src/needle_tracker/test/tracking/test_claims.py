@@ -1,0 +1,52 @@
+"""What tips claim beyond their fit: shares of the needle's width, seen through the window."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, Unseen
+from needle_tracker.tracking.triangulation import SpatialTip, midpoint
+
+WIDTH, WIDTHS_PX = 0.7e-3, (4.6, 5.1)
+AHEAD = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
+POSITION = np.array([0.4e-3, -1.0e-3, 0.06])
+Views = tuple[RefractedCamera, RefractedCamera]
+
+
+def tip(covariance: np.ndarray) -> SpatialTip:
+    return SpatialTip(POSITION, covariance, AHEAD, np.eye(3) * 1e-4, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("unseen", [OF_OUTLINE, OF_LAMP, OF_MAP])
+def test_what_is_added_is_what_noise_of_that_share_does(views: Views, unseen: Unseen) -> None:
+    claims = Claims(views, WIDTHS_PX, WIDTH)
+    fit = np.diag([1e-10, 2e-10, 3e-10])
+    added = claims.widened(tip(fit), unseen).covariance - fit
+    assert float(AHEAD @ added @ AHEAD) == pytest.approx((unseen.along * WIDTH) ** 2, rel=1e-6)
+
+    # Both lines moved aside in their images, by chance: where do they then meet?
+    rng = np.random.default_rng(3)
+    met = []
+    for _ in range(4000):
+        moved = []
+        for view, width in zip(views, WIDTHS_PX, strict=True):
+            ends = view.project(np.stack([POSITION, POSITION + 1e-4 * AHEAD]))
+            line = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+            beside = np.array([-line[1], line[0]])
+            moved.append(ends[0] + beside * rng.normal(0.0, unseen.across * width))
+        met.append(midpoint(views, (moved[0], moved[1])) - POSITION)
+    # Only what is across the shaft: how far along it rays pass each other closest means nothing.
+    across_shaft = np.eye(3) - np.outer(AHEAD, AHEAD)
+    seen = np.linalg.eigvalsh(across_shaft @ np.cov(np.array(met).T) @ across_shaft)[1:]
+    claimed = np.linalg.eigvalsh(across_shaft @ added @ across_shaft)[1:]
+    assert claimed == pytest.approx(seen, rel=0.35)
+
+
+def test_a_tip_claims_no_more_than_its_fit(views: Views) -> None:
+    loose = np.diag([1e-6, 1e-6, 4e-6])
+    widened = Claims(views, WIDTHS_PX, WIDTH).widened(tip(loose), OF_OUTLINE)
+    assert np.linalg.eigvalsh(widened.covariance - loose).min() > 0.0
+    assert widened.covariance == pytest.approx(loose, rel=0.1, abs=1e-7)
+    assert np.array_equal(widened.position, POSITION)
