@@ -69,7 +69,7 @@ class Access(enum.Enum):
 
 
 @dataclasses.dataclass
-class Entry:
+class StoredObject:
     """One value.
 
     Attributes
@@ -104,7 +104,7 @@ class ObjectDictionary:
     """Values, what may be done with them, and what happens when a client writes one."""
 
     def __init__(self) -> None:
-        self._entries: dict[Key, Entry] = {}
+        self._entries: dict[Key, StoredObject] = {}
         self._indices: set[int] = set()
         self._checks: dict[Key, Callable[[int], None]] = {}
         self._reactions: dict[Key, Callable[[int], None]] = {}
@@ -120,8 +120,8 @@ class ObjectDictionary:
         mappable: bool = False,
         text: bytes = b"",
     ) -> None:
-        """Add an entry; the arguments are those of `Entry`."""
-        self._entries[index, subindex] = Entry(kind, value, access, mappable, text)
+        """Add an entry; the arguments are those of `StoredObject`."""
+        self._entries[index, subindex] = StoredObject(kind, value, access, mappable, text)
         self._indices.add(index)
 
     def on_write(
@@ -148,7 +148,7 @@ class ObjectDictionary:
         if then is not None:
             self._reactions[index, subindex] = then
 
-    def entry(self, index: int, subindex: int) -> Entry:
+    def entry(self, index: int, subindex: int) -> StoredObject:
         """Return an entry.
 
         Raises

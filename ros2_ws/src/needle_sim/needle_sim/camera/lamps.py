@@ -7,7 +7,7 @@ import numpy as np
 
 from needle_sim.camera.optics import FloatImage, Optics
 from needle_sim.camera.scenarios import Glints, Lighting
-from needle_sim.camera.stereo_rig import Camera
+from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 
 _BLOTCH_SIZE = 0.13
@@ -23,14 +23,16 @@ _SHINE = 160.0
 _BEND = 0.25
 
 
-def lamp_light(camera: Camera) -> FloatImage:
+def lamp_light(camera: SimulatedCamera) -> FloatImage:
     """Return the light over the image: a lamp to one side, and the lens's fall-off."""
     u = np.linspace(-1.0, 1.0, camera.image_width, dtype=np.float32)
     v = np.linspace(-1.0, 1.0, camera.image_height, dtype=np.float32)[:, np.newaxis]
     return np.asarray(1.0 + 0.09 * u - 0.06 * v - 0.05 * (u * u + v * v), dtype=np.float32)
 
 
-def uneven_light(lighting: Lighting, camera: Camera, rng: np.random.Generator) -> FloatImage:
+def uneven_light(
+    lighting: Lighting, camera: SimulatedCamera, rng: np.random.Generator
+) -> FloatImage:
     """Return what multiplies the lamp's light: wide blotches, and one side in a soft shade."""
     size = (camera.image_width, camera.image_height)
     small = (-(-size[0] // _COARSE), -(-size[1] // _COARSE))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from needle_sim.camera.projection import project
 from needle_sim.camera.scenarios import Lens
-from needle_sim.camera.stereo_rig import Camera
+from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 
 FloatImage = NDArray[np.float32]
@@ -21,13 +21,13 @@ class Optics:
 
     Parameters
     ----------
-    camera : Camera
+    camera : SimulatedCamera
         One of the rig's.
     lens : Lens or None
         None is in focus everywhere.
     """
 
-    def __init__(self, camera: Camera, lens: Lens | None) -> None:
+    def __init__(self, camera: SimulatedCamera, lens: Lens | None) -> None:
         self.camera = camera
         self.window = camera.window
         self.centre = camera.centre

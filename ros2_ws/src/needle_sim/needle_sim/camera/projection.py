@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from needle_sim.camera.stereo_rig import Camera
-from needle_sim.camera.window import Window
+from needle_sim.camera.stereo_rig import SimulatedCamera
+from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 
 # The slope's equation is concave and increasing: Newton is at the last digit after 3 steps.
 _NEWTON_STEPS = 4
 
 
-def refraction_point(points: ArrayLike, centre: ArrayLike, window: Window) -> FloatArray:
+def refraction_point(points: ArrayLike, centre: ArrayLike, window: SimulatedWindow) -> FloatArray:
     """Return where the ray from a point to a camera crosses the window's outer face.
 
     With a = tan(angle in air), Snell's law makes tan(angle in a medium) a / sqrt(n^2 + (n^2 - 1)
@@ -26,7 +26,7 @@ def refraction_point(points: ArrayLike, centre: ArrayLike, window: Window) -> Fl
         crossing is that of its extension.
     centre : array_like, shape (3,)
         Centre of projection in `rig`, above the face [m].
-    window : Window
+    window : SimulatedWindow
         What the camera looks through.
 
     Returns
@@ -59,14 +59,14 @@ def refraction_point(points: ArrayLike, centre: ArrayLike, window: Window) -> Fl
     return np.asarray(foot + window.outer * window.normal + share[..., np.newaxis] * along)
 
 
-def project(points: ArrayLike, camera: Camera) -> FloatArray:
+def project(points: ArrayLike, camera: SimulatedCamera) -> FloatArray:
     """Return the pixels at which a camera sees points through its window.
 
     Parameters
     ----------
     points : array_like, shape (..., 3)
         Points in `rig` [m].
-    camera : Camera
+    camera : SimulatedCamera
         The calibrated camera.
 
     Returns
@@ -80,7 +80,7 @@ def project(points: ArrayLike, camera: Camera) -> FloatArray:
     return _distorted_pixel(seen[..., 0] / seen[..., 2], seen[..., 1] / seen[..., 2], camera)
 
 
-def _distorted_pixel(x: FloatArray, y: FloatArray, camera: Camera) -> FloatArray:
+def _distorted_pixel(x: FloatArray, y: FloatArray, camera: SimulatedCamera) -> FloatArray:
     """Apply plumb_bob and the camera matrix to normalised image coordinates."""
     k1, k2, p1, p2, k3 = camera.distortion
     square = x * x + y * y

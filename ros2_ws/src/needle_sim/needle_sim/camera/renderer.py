@@ -6,11 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from needle_sim.camera.bubbles import BubbleCloud, place_bubbles
+from needle_sim.camera.metal import place_lamp
 from needle_sim.camera.optics import Optics
+from needle_sim.camera.paper import paper_lines
 from needle_sim.camera.passing import Event, cable_line, event_at, hand_capsules, shadow_line
 from needle_sim.camera.scenarios import CLEAN, Scenario
 from needle_sim.camera.stereo_rig import StereoRig
-from needle_sim.camera.view import GreyImage, Moment, View
+from needle_sim.camera.view import GreyImage, Moment, StillScene, View
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray
 
@@ -28,6 +30,8 @@ _SCENE_STREAM = 5
 _TROUBLE_STREAMS = (6, 7)
 _CABLE_KEY = 1
 _SHADOW_KEY = 2
+_LAMP_KEY = 3
+_PAPER_KEY = 4
 
 
 class StereoRenderer:
@@ -69,11 +73,19 @@ class StereoRenderer:
         self.bubbles: BubbleCloud | None = None
         if scenario.bubbles is not None:
             self.bubbles = place_bubbles(scenario.bubbles, rig, rng)
+        paper = scenario.paper
+        still = StillScene(
+            bubbles=self.bubbles,
+            lamp=place_lamp(self._rng(_LAMP_KEY)),
+            lines=[]
+            if paper is None
+            else paper_lines(paper, rig.half_height, self._rng(_PAPER_KEY)),
+        )
         self._views = tuple(
             View(
                 optics[side],
                 scenario,
-                self.bubbles,
+                still,
                 np.random.default_rng([seed, 0, _MOTTLE_STREAMS[side]]),
                 [seed, 0, _TROUBLE_STREAMS[side]],
             )

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -111,11 +112,58 @@ class FloorShadow:
         Share of the light it takes.
     largest_slant : float
         Largest tangent of the light's angle from the vertical, across and along the needle.
+    penumbra : float
+        Width of its edge for each length of fall: a lamp is no point.
     """
 
     floor_depth: float = 0.035
     darkness: float = 0.5
     largest_slant: float = 0.25
+    penumbra: float = 0.02
+
+
+@dataclasses.dataclass(frozen=True)
+class Metal:
+    """A needle that is not painted: it mirrors a lamp along part of its shaft.
+
+    Attributes
+    ----------
+    rim : float
+        Where it mirrors the room [grey levels].
+    core : float
+        Where it mirrors the lamp [grey levels].
+    core_width : float
+        Of the mirrored lamp, over the needle's.
+    spread : float
+        How far the shaft may turn until the lamp has faded to a third [rad].
+    """
+
+    rim: float = 70.0
+    core: float = 240.0
+    core_width: float = 0.45
+    spread: float = 0.15
+
+
+@dataclasses.dataclass(frozen=True)
+class GraphPaper:
+    """Ruled paper on the phantom's floor.
+
+    Attributes
+    ----------
+    floor_depth : float
+        Of the floor under the surface [m].
+    pitch : float
+        From line to line [m].
+    line_width : float
+        Of each [m].
+    grey : float
+        Of the lines [grey levels].
+    """
+
+    floor_depth: float = 0.035
+    pitch: float = 0.005
+    line_width: float = 0.0004
+    grey: float = 95.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,7 +219,7 @@ class Scenario:
         Standard deviation of the sensor's noise [grey levels].
     needle : bool
         Whether there is a needle to be seen.
-    bubbles, glints, lighting, cable, shadow, occlusion, lens
+    bubbles, glints, lighting, cable, shadow, occlusion, lens, metal, paper
         The troubles; None where there are none.
 
     Raises
@@ -191,10 +239,11 @@ class Scenario:
     shadow: FloorShadow | None = None
     occlusion: Occlusion | None = None
     lens: Lens | None = None
+    metal: Metal | None = None
+    paper: GraphPaper | None = None
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.noise <= 50.0:
-            raise OutOfBoundsError("noise", self.noise, 0.0, 50.0, "grey levels")
+        check_bounds("noise", self.noise, 0.0, 50.0, "grey levels")
 
 
 CLEAN = Scenario("clean", "a clear phantom in good light")
@@ -239,6 +288,25 @@ _ALL = (
         bubbles=Bubbles(45, 0.0002, 0.0015),
         lighting=Lighting(0.04, 0.1, 0.03),
         lens=Lens(focus_height=0.065, aperture=0.011),
+    ),
+    Scenario(
+        "steel",
+        "a bare needle that mirrors a lamp along part of its shaft, dark where it bends away",
+        metal=Metal(),
+        lighting=Lighting(0.04, 0.1, 0.03),
+    ),
+    Scenario(
+        "steel_on_graph_paper",
+        "the same over ruled paper that lies askew",
+        metal=Metal(),
+        lighting=Lighting(0.04, 0.1, 0.03),
+        paper=GraphPaper(),
+    ),
+    Scenario(
+        "hard_shadow",
+        "a small lamp: the needle's shadow is as dark and whole as the needle, close beside it",
+        lighting=Lighting(0.04, 0.1, 0.03),
+        shadow=FloorShadow(0.027, 0.75, 0.3, 0.003),
     ),
 )
 SCENARIOS = {scenario.name: scenario for scenario in _ALL}

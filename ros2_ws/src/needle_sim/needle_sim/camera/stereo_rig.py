@@ -11,7 +11,7 @@ import numpy as np
 import yaml
 
 from needle_common.errors import UserError
-from needle_sim.camera.window import Window
+from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 
 _LARGEST_SIDE_PX = 20_000
@@ -21,7 +21,7 @@ _LEAST_ACROSS = 0.3  # of a window's normal: the part across the needle
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class SimulatedCamera:
     """One calibrated camera.
 
     Parameters
@@ -34,7 +34,7 @@ class Camera:
         plumb_bob: k1, k2, p1, p2, k3.
     T_optical_rig : ndarray, shape (4, 4)
         Rig to optical frame (REP 103) [m].
-    window : Window
+    window : SimulatedWindow
         What it looks through.
     """
 
@@ -43,7 +43,7 @@ class Camera:
     camera_matrix: FloatArray
     distortion: FloatArray
     T_optical_rig: FloatArray
-    window: Window
+    window: SimulatedWindow
 
     @property
     def centre(self) -> FloatArray:
@@ -58,12 +58,12 @@ class StereoRig:
 
     Parameters
     ----------
-    left, right : Camera
+    left, right : SimulatedCamera
         The pair.
     """
 
-    left: Camera
-    right: Camera
+    left: SimulatedCamera
+    right: SimulatedCamera
 
     @property
     def half_height(self) -> float:
@@ -134,7 +134,9 @@ def _stereo_rig(document: object) -> StereoRig:
     return StereoRig(cameras["left"], cameras["right"])
 
 
-def _window_of(top: Mapping[object, object], values: Mapping[object, object], side: str) -> Window:
+def _window_of(
+    top: Mapping[object, object], values: Mapping[object, object], side: str
+) -> SimulatedWindow:
     """Return what a camera looks through: its own window, or the phantom's surface."""
     if ("phantom" in top) == ("window" in values):
         what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
@@ -145,7 +147,7 @@ def _window_of(top: Mapping[object, object], values: Mapping[object, object], si
         phantom = _mapping(top["phantom"], "phantom")
         height = _number(_entry(phantom, "surface_height", "phantom."), "phantom.surface_height")
         index = _refractive_index(phantom, "refractive_index", "phantom.")
-        return Window(np.array([1.0, 0.0, 0.0]), height, (), (index,))
+        return SimulatedWindow(np.array([1.0, 0.0, 0.0]), height, (), (index,))
     prefix = f"{side}.window."
     window = _mapping(values["window"], f"{side}.window")
     point = _numbers(_entry(window, "point", prefix), prefix + "point", 3)
@@ -169,7 +171,7 @@ def _window_of(top: Mapping[object, object], values: Mapping[object, object], si
         thicknesses.append(thickness)
         indices.append(_refractive_index(values, "refractive_index", f"{name}."))
     inside = _refractive_index(window, "inside", prefix)
-    return Window(normal, float(normal @ point), tuple(thicknesses), (*indices, inside))
+    return SimulatedWindow(normal, float(normal @ point), tuple(thicknesses), (*indices, inside))
 
 
 def _refractive_index(values: Mapping[object, object], key: str, prefix: str) -> float:
@@ -179,7 +181,7 @@ def _refractive_index(values: Mapping[object, object], key: str, prefix: str) ->
     return index
 
 
-def _camera(values: Mapping[object, object], side: str, window: Window) -> Camera:
+def _camera(values: Mapping[object, object], side: str, window: SimulatedWindow) -> SimulatedCamera:
     prefix = f"{side}."
     width, height = (
         _number(_entry(values, key, prefix), prefix + key)
@@ -208,7 +210,7 @@ def _camera(values: Mapping[object, object], side: str, window: Window) -> Camer
     pose[:3, 3] = _numbers(_entry(transform, "translation", prefix), prefix + "translation", 3)
     quaternion = _numbers(_entry(transform, "rotation", prefix), prefix + "rotation", 4)
     pose[:3, :3] = _rotation_matrix(quaternion, prefix + "rotation")
-    return Camera(int(width), int(height), matrix, distortion, pose, window)
+    return SimulatedCamera(int(width), int(height), matrix, distortion, pose, window)
 
 
 def _rotation_matrix(quaternion: FloatArray, name: str) -> FloatArray:

@@ -11,8 +11,9 @@ from scipy.special import ndtri
 
 from needle_sim.camera.bubbles import BubbleCloud, BubbleImage, draw_bubbles
 from needle_sim.camera.lamps import drift, flicker, lamp_light, shine, surface_glints, uneven_light
+from needle_sim.camera.metal import mirrored
 from needle_sim.camera.optics import SHARP_PX, FloatImage, Optics
-from needle_sim.camera.scenarios import Scenario
+from needle_sim.camera.scenarios import Metal, Scenario
 from needle_sim.camera.stroke import Stroke, stroke
 from needle_sim.needle.se3 import FloatArray
 
@@ -40,8 +41,6 @@ _SHEATH_LENGTH = 0.04
 _SHEATH_DIAMETER = 0.003
 _RIM_LENGTH = 0.0044
 _RIM_DIAMETER = 0.0012
-# A lamp is no point: its shadow's edge is this wide for each length of fall.
-_PENUMBRA = 0.02
 # Hands are near the lens and drawn this much coarser.
 _HAND_COARSE = 4
 _HAND_EDGE_PX = 7.0
@@ -76,6 +75,25 @@ class Moment:
     hand: list[tuple[FloatArray, FloatArray, float]]
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class StillScene:
+    """What never moves, in `rig`; the same for both cameras.
+
+    Attributes
+    ----------
+    bubbles : BubbleCloud or None
+        In the phantom.
+    lamp : ndarray, shape (3,)
+        What a metal needle mirrors [m].
+    lines : list of ndarray, shape (M, 3)
+        On the paper under the phantom [m].
+    """
+
+    bubbles: BubbleCloud | None
+    lamp: FloatArray
+    lines: list[FloatArray]
+
+
 class View:
     """One camera's light, what never moves in its image, and what is drawn over it.
 
@@ -85,8 +103,8 @@ class View:
         The camera.
     scenario : Scenario
         What troubles it.
-    cloud : BubbleCloud or None
-        The phantom's bubbles.
+    scene : StillScene
+        What it looks at.
     still : numpy.random.Generator
         For the phantom's mottle.
     trouble_key : list of int
@@ -97,7 +115,7 @@ class View:
         self,
         optics: Optics,
         scenario: Scenario,
-        cloud: BubbleCloud | None,
+        scene: StillScene,
         still: np.random.Generator,
         trouble_key: list[int],
     ) -> None:
@@ -111,8 +129,9 @@ class View:
         if scenario.lighting is not None:
             self._light *= uneven_light(scenario.lighting, optics.camera, rng)
         self._bubbles: BubbleImage | None = None
-        if cloud is not None:
-            self._bubbles = draw_bubbles(cloud, optics)
+        self._scene = scene
+        if scene.bubbles is not None:
+            self._bubbles = draw_bubbles(scene.bubbles, optics)
             self._bubbles.added[:] *= self._light
         self._background = self._still_scene(still)
         self._glints: FloatImage | None = None
@@ -197,6 +216,10 @@ class View:
         bench = cv2.fillPoly(np.zeros_like(image), [outline.astype(np.int32)], 1.0)
         softness = float(np.hypot(_BENCH_EDGE_PX, np.max(self._optics.blur_px(edge)) - SHARP_PX))
         image += (_BENCH - _PHANTOM) * cv2.GaussianBlur(bench, (0, 0), softness)
+        paper = self._scenario.paper
+        if paper is not None:
+            for line in self._scene.lines:
+                self._draw_tube(image, line, paper.line_width, paper.grey)
         image *= self._light
         if self._bubbles is not None:
             image *= self._bubbles.gain
@@ -217,11 +240,16 @@ class View:
         grey: float,
         is_needle: bool = False,
     ) -> None:
-        """Draw a metal tube: dark at its edges, a soft reflection of the light along its middle."""
+        """Draw a tube, over what lies behind it and under the bubbles above it."""
         tube = self._stroke(line, diameter, self._optics.blur_px(line))
         pixels = (tube.row, tube.column)
-        metal = grey * (0.8 + 0.6 * np.exp(-((tube.across / 0.5) ** 2)))
-        colour = metal * self._light[pixels]
+        metal = self._scenario.metal
+        if is_needle and metal is not None:
+            colour = self._mirroring(line, diameter, tube, metal) * self._light[pixels]
+        else:
+            # Dark at its edges, a soft reflection of the light along its middle.
+            colour = grey * (0.8 + 0.6 * np.exp(-((tube.across / 0.5) ** 2)))
+            colour *= self._light[pixels]
         if is_needle:
             glints = self._scenario.glints
             if glints is not None:
@@ -233,12 +261,25 @@ class View:
                 colour = np.where(above, seen_through, colour)
         image[pixels] += tube.coverage * (colour - image[pixels])
 
+    def _mirroring(
+        self, line: FloatArray, diameter: float, tube: Stroke, metal: Metal
+    ) -> FloatArray:
+        """Return what a bare needle mirrors at a stroke's pixels [grey levels]."""
+        share, place = mirrored(line, self._optics.centre, self._scene.lamp, metal)
+        # A stroke counts to the left of its way as the image has it, a shaft as the camera does.
+        edge = self._optics.project(line + self._optics.sideways(line, diameter / 2.0))
+        middle = self._optics.project(line)
+        ahead, beside = np.gradient(middle, axis=0), edge - middle
+        side = np.sign(ahead[:, 0] * beside[:, 1] - ahead[:, 1] * beside[:, 0])
+        core = np.exp(-(((tube.across - (side * place)[tube.sample]) / metal.core_width) ** 2))
+        return np.asarray(metal.rim + (metal.core - metal.rim) * share[tube.sample] * core)
+
     def _draw_shadow(self, image: FloatImage, moment: Moment) -> None:
         trouble = self._scenario.shadow
         assert trouble is not None
         line = moment.shadow
         px_per_m = self._optics.radius_px(line, 1e-3) / 1e-3
-        penumbra = _PENUMBRA * moment.shadow_fall * px_per_m
+        penumbra = trouble.penumbra * moment.shadow_fall * px_per_m
         seen = self._stroke(line, moment.diameter, np.hypot(self._optics.blur_px(line), penumbra))
         pixels = (seen.row, seen.column)
         dark = image[pixels] * (1.0 - trouble.darkness * seen.coverage)

@@ -11,7 +11,7 @@ from needle_sim.needle.se3 import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
-class Window:
+class SimulatedWindow:
     """Parallel faces, with a layer between each and the next, and the phantom behind the last.
 
     Parameters

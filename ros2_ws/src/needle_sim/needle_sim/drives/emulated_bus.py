@@ -8,7 +8,7 @@ import enum
 from needle_sim.bus.can_frame import CanFrame
 from needle_sim.bus.canopen_device import SYNC
 from needle_sim.drives.drive_motion import MOTION_STEP
-from needle_sim.drives.emulated_drive import DriveSettings, EmulatedDrive
+from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
 
 
 class MotionClock(enum.Enum):
@@ -41,7 +41,7 @@ class EmulatedBus:
 
     Parameters
     ----------
-    insertion, rotation : DriveSettings
+    insertion, rotation : EmulatedDriveSettings
         The drives.
     clock : MotionClock
         What lets them move on.
@@ -50,7 +50,11 @@ class EmulatedBus:
     """
 
     def __init__(
-        self, insertion: DriveSettings, rotation: DriveSettings, clock: MotionClock, now: float
+        self,
+        insertion: EmulatedDriveSettings,
+        rotation: EmulatedDriveSettings,
+        clock: MotionClock,
+        now: float,
     ) -> None:
         if insertion.node_id == rotation.node_id:
             raise ValueError(f"both drives have node id {insertion.node_id}")

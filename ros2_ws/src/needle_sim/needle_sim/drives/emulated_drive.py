@@ -41,7 +41,7 @@ _THEN_DISABLE = (1, 2)
 
 
 @dataclasses.dataclass(frozen=True)
-class DriveSettings:
+class EmulatedDriveSettings:
     """Settings of an emulated drive.
 
     Attributes
@@ -73,11 +73,11 @@ class EmulatedDrive:
 
     Parameters
     ----------
-    settings : DriveSettings
+    settings : EmulatedDriveSettings
         What it is.
     """
 
-    def __init__(self, settings: DriveSettings) -> None:
+    def __init__(self, settings: EmulatedDriveSettings) -> None:
         self.settings = settings
         self.motor = Motor(settings.motor)
         self._objects = objects = drive_dictionary(

@@ -1,4 +1,4 @@
-"""What a sequence looks like: metal, light, floor and dirt, drawn at random or by name."""
+"""Appearance of a sequence: metal, light, floor and dirt, drawn at random or by name."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ class Appearance:
 
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """What a name fixes of an appearance; the rest is drawn.
+    """Part of an appearance that a name fixes; the rest is drawn.
 
     Attributes
     ----------

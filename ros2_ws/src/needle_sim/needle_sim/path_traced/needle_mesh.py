@@ -21,7 +21,7 @@ _BORE_DEPTH_DIAMETERS = 4.0
 
 @dataclasses.dataclass(frozen=True)
 class NeedleEnd:
-    """How the needle is made and ground.
+    """Make and grind of the needle.
 
     Attributes
     ----------

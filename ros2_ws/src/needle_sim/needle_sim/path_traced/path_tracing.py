@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.refracted_rays import refracted_rays
 from needle_sim.path_traced.scene import Scene
@@ -38,7 +38,7 @@ class PathTracer:
         self,
         scene: Scene,
         pixels: PixelArray,
-        camera: Camera,
+        camera: SimulatedCamera,
         rig: StereoRig,
         *,
         samples: int,
@@ -52,7 +52,7 @@ class PathTracer:
             What is there.
         pixels : ndarray of int, shape (N, 2)
             u, v of the pixels [px].
-        camera : Camera
+        camera : SimulatedCamera
             Who sees it.
         rig : StereoRig
             The phantom that it looks into.
@@ -81,7 +81,7 @@ class PathTracer:
         return light, cover
 
     def covered(
-        self, scene: Scene, pixels: PixelArray, camera: Camera, rig: StereoRig
+        self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
     ) -> NDArray[np.bool_]:
         """Return at which pixels, (N, 2), something stands before the floor, in their middle."""
         mi = self._mi
@@ -136,7 +136,7 @@ class PathTracer:
         self,
         scene: Scene,
         pixels: PixelArray,
-        camera: Camera,
+        camera: SimulatedCamera,
         rig: StereoRig,
         *,
         samples: int,

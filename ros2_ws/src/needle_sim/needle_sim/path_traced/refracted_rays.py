@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import ArrayLike
 
-from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.level_surface import refractive_index
 
@@ -34,7 +34,7 @@ class Rays:
     incoming: FloatArray
 
 
-def refracted_rays(pixels: ArrayLike, camera: Camera, rig: StereoRig) -> Rays:
+def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -> Rays:
     """Return the lines of sight of pixels.
 
     The phantom begins at z = 0, where the needle enters. Before its front face there is air, and
@@ -44,7 +44,7 @@ def refracted_rays(pixels: ArrayLike, camera: Camera, rig: StereoRig) -> Rays:
     ----------
     pixels : array_like, shape (..., 2)
         u, v [px]; whole numbers are pixel centres.
-    camera : Camera
+    camera : SimulatedCamera
         The calibrated camera.
     rig : StereoRig
         The phantom.
@@ -79,7 +79,7 @@ def points_at_height(rays: Rays, height: float) -> FloatArray:
     return np.asarray(rays.origin + length[..., np.newaxis] * rays.direction)
 
 
-def _undistorted(pixels: FloatArray, camera: Camera) -> FloatArray:
+def _undistorted(pixels: FloatArray, camera: SimulatedCamera) -> FloatArray:
     """Return normalised image coordinates: the inverse of plumb_bob by fixed-point iteration."""
     k1, k2, p1, p2, k3 = camera.distortion
     inverse = np.linalg.inv(camera.camera_matrix[:2, :2])

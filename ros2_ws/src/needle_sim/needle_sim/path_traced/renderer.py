@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.camera.optics import FloatImage, Optics
-from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Appearance
@@ -162,7 +162,7 @@ class PathTracedRenderer:
             light[pixels[:, 1], pixels[:, 0]], cover[pixels[:, 1], pixels[:, 0]] = traced
         return np.asarray((1.0 - cover) * floor + light, dtype=np.float32)
 
-    def _view(self, camera: Camera, side: int) -> _View:
+    def _view(self, camera: SimulatedCamera, side: int) -> _View:
         look, rig = self._look, self._rig
         optics = Optics(camera, None)
         size = (camera.image_height, camera.image_width)
@@ -204,11 +204,11 @@ class PathTracedRenderer:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _View:
-    """What never moves in one camera's image.
+    """Still part of one camera's image.
 
     Attributes
     ----------
-    camera : Camera
+    camera : SimulatedCamera
         Who sees it.
     optics : Optics
         Where it sees points.
@@ -220,7 +220,7 @@ class _View:
         Radiance and share of what stands before the floor.
     """
 
-    camera: Camera
+    camera: SimulatedCamera
     optics: Optics
     floor_points: FloatArray
     floor: FloatImage

@@ -1,4 +1,4 @@
-"""What truth.csv says of a path-traced needle beside its tip: the bevel, and what it looks like."""
+"""Columns of truth.csv for a path-traced needle, beside its tip: its bevel and appearance."""
 
 from __future__ import annotations
 

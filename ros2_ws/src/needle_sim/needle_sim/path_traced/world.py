@@ -1,4 +1,4 @@
-"""What stands still in a sequence: lamps, room, floor, bubbles and box, placed by the seed."""
+"""Still parts of a sequence: lamps, room, floor, bubbles and box, placed by the seed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _SKY = (64, 32)
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class World:
-    """All that stands still in a sequence.
+    """Still parts of a sequence.
 
     Attributes
     ----------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_sim.camera.stereo_rig import Camera
+from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 
 RIG_FRAME = "rig"
@@ -72,7 +72,7 @@ def to_image(image: NDArray[np.uint8], frame: str, stamp: Time) -> Image:
     return message
 
 
-def to_camera_info(camera: Camera, frame: str, stamp: Time) -> CameraInfo:
+def to_camera_info(camera: SimulatedCamera, frame: str, stamp: Time) -> CameraInfo:
     """Return a camera's calibration as a message; the images are not rectified."""
     message = CameraInfo(
         height=camera.image_height,

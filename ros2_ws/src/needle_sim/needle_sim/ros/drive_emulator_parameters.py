@@ -10,7 +10,7 @@ from needle_common.settings.parameter_fields import check_fields, fixed_paramete
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import MotionClock
-from needle_sim.drives.emulated_drive import DriveSettings
+from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
 # Encoder of the rotation axis: 16 bits a turn, no gear.
@@ -92,10 +92,10 @@ class DriveEmulatorParameters:
             )
 
     @property
-    def insertion(self) -> DriveSettings:
+    def insertion(self) -> EmulatedDriveSettings:
         """The insertion axis: a stepper on a screw, with a limit switch at either end."""
         scale = self.insertion_counts_per_unit
-        return DriveSettings(
+        return EmulatedDriveSettings(
             "insertion",
             self.insertion_node_id,
             STEPPER,
@@ -111,10 +111,10 @@ class DriveEmulatorParameters:
         )
 
     @property
-    def rotation(self) -> DriveSettings:
+    def rotation(self) -> EmulatedDriveSettings:
         """The rotation axis: a servo that turns without end."""
         scale = self.rotation_counts_per_unit
-        return DriveSettings(
+        return EmulatedDriveSettings(
             "rotation",
             self.rotation_node_id,
             SERVO,

@@ -1,4 +1,4 @@
-"""Disturbances of a study: of the measured tips, and of the tissue's curvature.
+"""Disturbances of a study: of the measured tips, of the tissue, and of the needle in it.
 
 The controller is told of none of it.
 """
@@ -7,16 +7,19 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+from typing import Any, TypeVar
 
 import numpy as np
+import scipy.special
 from numpy.typing import NDArray
 
 from needle_common.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 
-OUTLIER_SIZE = (0.005, 0.010)
-"""Distance by which an outlier is off [m]."""
+Insertion = TypeVar("Insertion", float, FloatArray)
+"""Of all needles, or of each."""
+NOISE_SHAPES = ("uniform", "normal")
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature stays the same [m]."""
 
@@ -28,15 +31,20 @@ class Disturbances:
     Attributes
     ----------
     noise : float
-        Largest error of a measured coordinate, uniform [m].
+        Largest error of a measured coordinate where the noise is uniform, its standard deviation
+        where it is normal [m].
+    noise_shape : str
+        One of `NOISE_SHAPES`.
     outliers : float
-        Share of measurements that are off by 5-10 mm in a random direction instead.
+        Share of measurements that are off in a random direction instead.
+    outlier_size : tuple of float
+        Least and largest distance by which an outlier is off, uniform in between [m].
     dropped : float
         Share of measurements that are missing.
     delay : int
-        How many steps late a measurement arrives.
-    pitch_noise : float
-        Largest error of a measured pitch, uniform, for controllers that measure it [rad].
+        How many steps late a measurement arrives; the controller is told its age.
+    untold_delay : int
+        The same, but it comes as if it were new.
     curvature_scale : float
         The plant's curvature as a multiple of what the controller assumes.
     curvature_patches : float
@@ -45,17 +53,26 @@ class Disturbances:
         Dead band of the shaft's torsion, +- [rad].
     lag_length : float
         Lag of the shaft's torsion [m].
+    slip : float
+        Share by which the stage moves farther than the needle goes in, > -1.
+    bump : float
+        Distance by which the phantom, and the needle in it, is moved at half the depth, in a random
+        direction [m].
     """
 
     noise: float = 0.0
+    noise_shape: str = "uniform"
     outliers: float = 0.0
+    outlier_size: tuple[float, float] = (0.005, 0.010)
     dropped: float = 0.0
     delay: int = 0
-    pitch_noise: float = 0.0
+    untold_delay: int = 0
     curvature_scale: float = 1.0
     curvature_patches: float = 0.0
     play: float = 0.0
     lag_length: float = 0.0
+    slip: float = 0.0
+    bump: float = 0.0
 
 
 def measured(
@@ -83,12 +100,17 @@ def measured(
     count = len(tips)
     share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
     seen = np.empty((count, 3))
-    _add_noise(tips, share, disturbances.noise, seen)
+    if disturbances.noise_shape == "normal":
+        # The middle of each of the 2^24 steps that a share has: 0 would be infinitely far off.
+        off = scipy.special.ndtri(share[:, :3].astype(np.float64) + 0.5**25)
+        seen[:] = tips + disturbances.noise * off
+    else:
+        _add_noise(tips, share, disturbances.noise, seen)
     if exposure == 0:
         return seen
     if disturbances.outliers > 0.0:
         chance = study_noise.uniform(seed, study_noise.OUTLIER, exposure, first, count)[:, 0]
-        off = tips + _outliers(seed, exposure, first, count)
+        off = tips + _outliers(disturbances.outlier_size, seed, exposure, first, count)
         seen = np.where((chance < disturbances.outliers)[:, np.newaxis], off, seen)
     if disturbances.dropped > 0.0:
         chance = study_noise.uniform(seed, study_noise.MISSED, exposure, first, count)[:, 0]
@@ -96,19 +118,16 @@ def measured(
     return seen
 
 
-def measured_pitch(
-    pitch: FloatArray, disturbances: Disturbances, seed: int, exposure: int, first: int
-) -> FloatArray:
-    """Return what is measured of some needles' pitch, (N,) [rad]; see `measured`."""
-    share = study_noise.uniform(seed, study_noise.PITCH, exposure, first, len(pitch))[:, 0]
-    off = 2.0 * share.astype(np.float64) - 1.0
-    return np.asarray(pitch + disturbances.pitch_noise * off)
-
-
 def patch_factors(patches: float, seed: int, patch: int, first: int, count: int) -> FloatArray:
     """Return what multiplies each needle's curvature in one patch, (count,), in 1 +- patches."""
     share = study_noise.uniform(seed, study_noise.CURVATURE, patch, first, count)[:, 0]
     return np.asarray(1.0 + patches * (2.0 * share.astype(np.float64) - 1.0))
+
+
+def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
+    """Return by what the phantom of each needle is moved, (count, 3) [m]."""
+    share = study_noise.uniform(seed, study_noise.BUMP, 0, first, count)
+    return np.asarray(distance * _directions(share))
 
 
 class DelayLine:
@@ -124,30 +143,31 @@ class DelayLine:
 
     def __init__(self, steps: int) -> None:
         self._steps = steps
-        self._under_way: collections.deque[tuple[FloatArray, float]] = collections.deque()
+        self._under_way: collections.deque[tuple[FloatArray, Any]] = collections.deque()
 
-    def pass_on(self, tips: FloatArray, insertion: float) -> tuple[FloatArray, float]:
+    def pass_on(self, tips: FloatArray, insertion: Insertion) -> tuple[FloatArray, Insertion]:
         """Take what was exposed now; return what arrives now.
 
         Parameters
         ----------
         tips : ndarray, shape (N, 3)
             Measured at this insertion [m]; further columns come along.
-        insertion : float
+        insertion : float, or ndarray, shape (N,)
             Where the needles are now [m].
 
         Returns
         -------
         tips : ndarray, shape (N, 3)
             Measured earlier [m]; NaN if nothing arrives.
-        age : float
+        age : float, or ndarray, shape (N,)
             Insertion since [m].
         """
+        none = insertion - insertion
         if self._steps == 0:
-            return tips, 0.0
+            return tips, none
         self._under_way.append((tips, insertion))
         if len(self._under_way) <= self._steps:
-            return np.full_like(tips, np.nan), 0.0
+            return np.full_like(tips, np.nan), none
         late, then = self._under_way.popleft()
         return late, insertion - then
 
@@ -161,12 +181,18 @@ def _add_noise(
             seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
 
 
-def _outliers(seed: int, exposure: int, first: int, count: int) -> FloatArray:
-    numbers = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+def _outliers(
+    size: tuple[float, float], seed: int, exposure: int, first: int, count: int
+) -> FloatArray:
+    share = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
+    low, high = size
+    return np.asarray(_directions(share) * (low + (high - low) * share[:, 2:3].astype(np.float64)))
+
+
+def _directions(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return unit vectors, uniform on the sphere, from the first two of some uniform numbers."""
     share = numbers.astype(np.float64)
     up = 2.0 * share[:, 0] - 1.0
     across = np.sqrt(1.0 - up * up)
     around = 2.0 * np.pi * share[:, 1]
-    direction = np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)
-    low, high = OUTLIER_SIZE
-    return np.asarray(direction * (low + (high - low) * share[:, 2, np.newaxis]))
+    return np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)

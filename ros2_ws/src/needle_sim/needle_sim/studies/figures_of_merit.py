@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.beliefs import Belief, BeliefTally
 
 BAND = 1e-3
 """Half width of what counts as in the plane [m]: the paper's +-1 mm."""
@@ -16,6 +18,7 @@ LAST_STEPS = 20
 """Steps at the end over which a run is judged."""
 
 BoolArray = NDArray[np.bool_]
+_Rows = TypeVar("_Rows")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,12 +36,20 @@ class Outcomes:
         outside.
     rotation : ndarray, shape (N,)
         Sum of all the base turned, either way [rad].
+    inside_2_sigma, inside_3_sigma : ndarray, shape (N,)
+        Share of x and pitch after the last steps that lay within so many of the controller's own
+        standard deviations from where it took them to be; NaN where it does not say.
+    doubtful : ndarray, shape (N,)
+        Whether the controller called the end doubtful, 0 or 1; NaN where it does not say.
     """
 
     x_start: FloatArray
     x_last: FloatArray
     settled: FloatArray
     rotation: FloatArray
+    inside_2_sigma: FloatArray
+    inside_3_sigma: FloatArray
+    doubtful: FloatArray
 
     @property
     def x_end(self) -> FloatArray:
@@ -63,10 +74,12 @@ class Outcomes:
         return np.asarray(~self.converged_at_end & away)
 
 
-def joined(parts: Sequence[Outcomes]) -> Outcomes:
-    """Return the outcomes of all parts as one."""
-    names = [field.name for field in dataclasses.fields(Outcomes)]
-    return Outcomes(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in names})
+def joined(parts: Sequence[_Rows]) -> _Rows:
+    """Return the outcomes of all parts as one; a dataclass of arrays, one row for each run."""
+    kind: Any = type(parts[0])
+    names = [field.name for field in dataclasses.fields(kind)]
+    whole = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    return cast(_Rows, kind(**whole))
 
 
 class Tally:
@@ -87,6 +100,12 @@ class Tally:
         self._step = 0
         self._settled: FloatArray = np.where(np.abs(x) <= BAND, 0.0, np.inf)
         self._rotation: FloatArray = np.zeros(len(x))
+        self._beliefs = BeliefTally(len(x))
+
+    @property
+    def in_last_steps(self) -> bool:
+        """Whether the last step added is one of those over which a run is judged."""
+        return self._step > self._skip
 
     def add(self, x: FloatArray, insertion: float, turned: FloatArray) -> None:
         """Take one step.
@@ -109,16 +128,29 @@ class Tally:
             self._last[self._step - self._skip] = x
         self._step += 1
 
+    def add_belief(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
+        """Take what the controller says after one of the last steps; see `BeliefTally.add`."""
+        self._beliefs.add(belief, x, pitch)
+
     def outcomes(self) -> Outcomes:
         """Return what became of the needles."""
-        return Outcomes(self._start, self._last.T.copy(), self._settled, self._rotation)
+        inside_2_sigma, inside_3_sigma = self._beliefs.inside
+        return Outcomes(
+            x_start=self._start,
+            x_last=self._last.T.copy(),
+            settled=self._settled,
+            rotation=self._rotation,
+            inside_2_sigma=inside_2_sigma,
+            inside_3_sigma=inside_3_sigma,
+            doubtful=self._beliefs.doubtful,
+        )
 
 
 def figures(outcomes: Outcomes) -> dict[str, float | None]:
     """Return the figures of a study, by the names of `monte_carlo --json`.
 
     Settling figures are over the runs that ended inside the band, for the others never settled;
-    null if there is none.
+    null if there is none. What the controller says of itself is null where it says nothing.
     """
     at_end = outcomes.converged_at_end
     last = np.abs(outcomes.x_last) * 1e3
@@ -137,4 +169,13 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "final_max_mm": float(np.max(end)),
         "missed_runs": float(np.sum(~at_end)),
         "diverged": float(np.mean(outcomes.diverged)),
+        "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
+        "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
+        "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
     }
+
+
+def mean_of_what_is_said(values: FloatArray) -> float | None:
+    """Return the mean; None where nothing is said, which is NaN."""
+    mean = float(np.mean(values))
+    return None if np.isnan(mean) else mean

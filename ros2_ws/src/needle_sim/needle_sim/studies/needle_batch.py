@@ -71,12 +71,16 @@ class NeedleBatch:
         poses[:, 3, 3] = 1.0
         return poses
 
-    def advance(self, d_insertion: float, d_rotation: ArrayLike, curvature: ArrayLike) -> None:
-        """Insert all needles by one length, and turn each base over it.
+    def shift(self, offsets: FloatArray) -> None:
+        """Move all needles as they are by some offsets, shape (N, 3) [m]."""
+        self._position += offsets.T
+
+    def advance(self, d_insertion: ArrayLike, d_rotation: ArrayLike, curvature: ArrayLike) -> None:
+        """Insert each needle, and turn its base over that length.
 
         Parameters
         ----------
-        d_insertion : float
+        d_insertion : array_like, shape (N,) or ()
             Insertion, >= 0 [m].
         d_rotation : array_like, shape (N,)
             Rotation of each base [rad].
@@ -86,21 +90,22 @@ class NeedleBatch:
         turned = np.asarray(d_rotation, dtype=np.float64)
         if self._torsion is not None:
             turned = self._torsion.advance(d_insertion, turned)
-        shape = self._position.shape[1:]
-        _cut(
-            self._position,
-            self._rotation,
-            float(d_insertion),
-            np.ascontiguousarray(np.broadcast_to(turned, shape)),
-            np.ascontiguousarray(np.broadcast_to(np.asarray(curvature, dtype=np.float64), shape)),
+        length, turned, kappa = (
+            np.ascontiguousarray(np.broadcast_to(values, self._position.shape[1:]))
+            for values in (
+                np.asarray(d_insertion, dtype=np.float64),
+                turned,
+                np.asarray(curvature, dtype=np.float64),
+            )
         )
+        _cut(self._position, self._rotation, length, turned, kappa)
 
 
 @compiled
 def _cut(
     position: FloatArray,
     rotation: FloatArray,
-    length: float,
+    length: FloatArray,
     turned: FloatArray,
     curvature: FloatArray,
 ) -> None:
@@ -119,12 +124,12 @@ def _cut(
 
 @compiled
 def _fill_coefficients(
-    length: float, turned: FloatArray, curvature: FloatArray, coefficients: FloatArray
+    length: FloatArray, turned: FloatArray, curvature: FloatArray, coefficients: FloatArray
 ) -> None:
     """Set sin(a)/a, (1 - cos a)/a^2 and (a - sin a)/a^3 for each angle a."""
     far = 0
     for i in range(turned.shape[0]):
-        bend = curvature[i] * length
+        bend = curvature[i] * length[i]
         square = bend * bend + turned[i] * turned[i]
         first = second = third = 0.0
         for k in range(_TERMS):
@@ -138,7 +143,7 @@ def _fill_coefficients(
     if far == 0:
         return
     for i in range(turned.shape[0]):
-        bend = curvature[i] * length
+        bend = curvature[i] * length[i]
         square = bend * bend + turned[i] * turned[i]
         if square > _SERIES_UP_TO:
             angle = np.sqrt(square)
@@ -152,14 +157,14 @@ def _fill_coefficients(
 def _move_row(
     along_axis: FloatArray,
     row: FloatArray,
-    motion: tuple[float, FloatArray, FloatArray],
+    motion: tuple[FloatArray, FloatArray, FloatArray],
     coefficients: FloatArray,
 ) -> None:
     """Move one coordinate of the tips, and turn one row of their rotation matrices."""
-    length, turned, curvature = motion
+    lengths, turned, curvature = motion
     for i in range(turned.shape[0]):
+        length, turn = lengths[i], turned[i]
         bend = curvature[i] * length
-        turn = turned[i]
         first, second, third = coefficients[0, i], coefficients[1, i], coefficients[2, i]
         r0, r1, r2 = row[0, i], row[1, i], row[2, i]
         forward = third * bend * turn * r0 - second * bend * r1 + (1.0 - third * bend * bend) * r2

@@ -15,7 +15,7 @@ POINTS = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class Bounds:
+class StartBounds:
     """Largest |x| [m], |pitch| and |roll| [rad] of a start."""
 
     x: float
@@ -28,24 +28,24 @@ class Bounds:
         return np.array([self.x, self.pitch, self.roll])
 
 
-def endpoint_grid(bounds: Bounds, draws: int, seed: int) -> FloatArray:
+def endpoint_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
     """Return the 10 x 10 x 10 grid whose outermost points are the bounds."""
     return _grid(np.linspace(-1.0, 1.0, POINTS), bounds, draws)
 
 
-def cell_grid(bounds: Bounds, draws: int, seed: int) -> FloatArray:
+def cell_grid(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
     """Return the middles of the 10 x 10 x 10 cells that the bounds enclose."""
     return _grid((2.0 * np.arange(POINTS) + 1.0) / POINTS - 1.0, bounds, draws)
 
 
-def random_starts(bounds: Bounds, draws: int, seed: int) -> FloatArray:
+def random_starts(bounds: StartBounds, draws: int, seed: int) -> FloatArray:
     """Return as many starts as the grids have runs, uniform within the bounds, no two alike."""
     numbers = study_noise.uniform(seed, study_noise.START, 0, 0, POINTS**3 * draws)
     share = numbers[:, :3].astype(np.float64)
     return np.asarray((2.0 * share - 1.0) * bounds.half_widths)
 
 
-GRIDS: Mapping[str, Callable[[Bounds, int, int], FloatArray]] = {
+GRIDS: Mapping[str, Callable[[StartBounds, int, int], FloatArray]] = {
     "endpoint": endpoint_grid,
     "cell": cell_grid,
     "random": random_starts,
@@ -53,6 +53,6 @@ GRIDS: Mapping[str, Callable[[Bounds, int, int], FloatArray]] = {
 """Each takes bounds, draws and seed, and returns x [m], pitch, roll [rad], (1000 draws, 3)."""
 
 
-def _grid(unit: FloatArray, bounds: Bounds, draws: int) -> FloatArray:
+def _grid(unit: FloatArray, bounds: StartBounds, draws: int) -> FloatArray:
     points = np.stack(np.meshgrid(unit, unit, unit, indexing="ij"), axis=-1).reshape(-1, 3)
     return np.repeat(points * bounds.half_widths, draws, axis=0)

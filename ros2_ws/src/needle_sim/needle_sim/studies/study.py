@@ -7,35 +7,22 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-import numpy as np
-
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.needle.tissue import Torsion
-from needle_sim.studies.disturbances import (
-    PATCH_LENGTH,
-    DelayLine,
-    Disturbances,
-    measured,
-    measured_pitch,
-    patch_factors,
-)
+from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.disturbances import Disturbances
+from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import Outcomes, Tally, joined
-from needle_sim.studies.needle_batch import NeedleBatch
 
-CHUNK = 10_000
-"""Needles steered at a time: their arrays fit into a processor's cache."""
+CHUNK = 500
+"""Needles steered at a time: what is known of them fits into a processor's cache."""
 
 
 class Controller(Protocol):
     """Controller of some needles; everything has their number as its leading axis.
 
-    Attributes
-    ----------
-    measures_pitch : bool
-        Whether the tips after the first have a fourth column, the measured pitch [rad].
-    """
+    A last tip is measured after the last step, as the node does before it is done.
 
-    measures_pitch: bool
+    """
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips, (N, 3) [m]; return the rotation rates, (N,) [rad/m]."""
@@ -51,7 +38,7 @@ class Controller(Protocol):
             Insertion of the step [m].
         d_rotation : ndarray, shape (N,)
             What the bases turned [rad].
-        tips : ndarray, shape (N, 3), or (N, 4) where the pitch is measured
+        tips : ndarray, shape (N, 3)
             The measured tips [m]; NaN where missing.
         age : float
             Insertion since they were measured [m].
@@ -61,6 +48,9 @@ class Controller(Protocol):
         ndarray, shape (N,)
             Rotation of the base per inserted length over the next step [rad/m].
         """
+
+    def belief(self) -> Belief | None:
+        """Return what is known after the last step; None from a controller that does not say."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,31 +125,29 @@ def _steer(
     settings: StudySettings,
     on_progress: Callable[[int], None],
 ) -> Outcomes:
-    wrong, seed, steps = settings.disturbances, settings.seed, settings.steps
-    torsion = Torsion(wrong.play, wrong.lag_length) if wrong.play or wrong.lag_length else None
-    needles = NeedleBatch(starts, torsion)
-    tally = Tally(needles.x, steps)
-    delay = DelayLine(wrong.delay)
-    rate = controller.start(measured(needles.tips, wrong, seed, 0, first))
+    steps = settings.steps
+    needles = DisturbedNeedles(
+        starts,
+        settings.disturbances,
+        curvature=settings.curvature,
+        bump_at=0.5 * settings.depth,
+        seed=settings.seed,
+        first=first,
+    )
+    true = needles.true
+    tally = Tally(true.x, steps)
+    rate = controller.start(needles.first_seen())
     insertion = 0.0
-    patch = -1
-    curvature = np.asarray(settings.curvature * wrong.curvature_scale)
     for step in range(1, steps + 1):
         reached = min(step * settings.step_length, settings.depth)
-        length, here = reached - insertion, int((insertion + 1e-9) / PATCH_LENGTH)
-        if wrong.curvature_patches and here != patch:
-            patch = here
-            factors = patch_factors(wrong.curvature_patches, seed, patch, first, len(starts))
-            curvature = np.asarray(settings.curvature * wrong.curvature_scale * factors)
+        length = reached - insertion
         turned = rate * length
-        needles.advance(length, turned, curvature)
+        needles.insert(insertion, reached, length, turned)
         insertion = reached
-        tally.add(needles.x, insertion, turned)
+        tally.add(true.x, insertion, turned)
         on_progress(len(starts))
-        if step < steps:
-            seen = measured(needles.tips, wrong, seed, step, first)
-            if controller.measures_pitch:
-                pitch = measured_pitch(needles.pitch, wrong, seed, step, first)
-                seen = np.column_stack([seen, pitch])
-            rate = controller.step(length, turned, *delay.pass_on(seen, insertion))
+        tips, age = needles.seen(insertion)
+        rate = controller.step(length, turned, tips, age)
+        if tally.in_last_steps:
+            tally.add_belief(controller.belief(), true.x, true.pitch)
     return tally.outcomes()

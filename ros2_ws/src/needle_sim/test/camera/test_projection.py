@@ -11,8 +11,8 @@ import pytest
 from scipy.optimize import minimize
 
 from needle_sim.camera.projection import project, refraction_point
-from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
-from needle_sim.camera.window import Window
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
+from needle_sim.camera.window import SimulatedWindow
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"
 HEIGHT = 0.0175
@@ -23,11 +23,11 @@ def rig() -> StereoRig:
     return load_stereo_rig(CALIBRATION)
 
 
-def surface(index: float) -> Window:
-    return Window(np.array([1.0, 0.0, 0.0]), HEIGHT, (), (index,))
+def surface(index: float) -> SimulatedWindow:
+    return SimulatedWindow(np.array([1.0, 0.0, 0.0]), HEIGHT, (), (index,))
 
 
-def through(camera: Camera, index: float) -> Camera:
+def through(camera: SimulatedCamera, index: float) -> SimulatedCamera:
     return dataclasses.replace(camera, window=surface(index))
 
 
@@ -36,7 +36,7 @@ def points_inside(count: int, seed: int = 1) -> np.ndarray:
     return np.random.default_rng(seed).uniform(low, high, (count, 3))
 
 
-def opencv_pixels(points: np.ndarray, camera: Camera) -> np.ndarray:
+def opencv_pixels(points: np.ndarray, camera: SimulatedCamera) -> np.ndarray:
     pose = camera.T_optical_rig
     pixels, _ = cv2.projectPoints(
         points,
@@ -130,7 +130,7 @@ def refracted(direction: np.ndarray, normal: np.ndarray, ratio: float) -> np.nda
 def test_a_ray_traced_from_face_to_face_meets_the_point(layers: tuple[float, ...]) -> None:
     normal = np.array([0.1, 0.97, -0.2]) / np.linalg.norm([0.1, 0.97, -0.2])
     indices = (1.49, 1.1, 1.6)[: len(layers)]
-    window = Window(normal, 0.03, layers, (*indices, 1.34))
+    window = SimulatedWindow(normal, 0.03, layers, (*indices, 1.34))
     centre = np.array([0.02, 0.5, 0.1])
     points = np.random.default_rng(4).uniform([-0.2, -0.15, -0.1], [0.2, -0.08, 0.3], (100, 3))
     for point, crossing in zip(points, refraction_point(points, centre, window), strict=True):

@@ -29,8 +29,8 @@ from needle_sim.camera.scenarios import (
     Scenario,
     find_scenario,
 )
-from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
-from needle_sim.camera.window import Window
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
+from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
@@ -63,7 +63,7 @@ def taken(with_it: Pair, without: Pair) -> np.ndarray:
     return np.asarray(np.stack(without).astype(float) - np.stack(with_it))
 
 
-def cameras(rig: StereoRig) -> tuple[Camera, Camera]:
+def cameras(rig: StereoRig) -> tuple[SimulatedCamera, SimulatedCamera]:
     return rig.left, rig.right
 
 
@@ -121,7 +121,7 @@ def test_bubbles_are_seen_where_refraction_puts_them(rig: StereoRig) -> None:
     checked = 0
     for image, camera in zip(dark, cameras(rig), strict=True):
         centres = project(renderer.bubbles.centre, camera)
-        dry = Window(camera.window.normal, camera.window.outer, (), (1.0,))
+        dry = SimulatedWindow(camera.window.normal, camera.window.outer, (), (1.0,))
         straight = project(renderer.bubbles.centre, dataclasses.replace(camera, window=dry))
         for i, (u, v) in enumerate(centres):
             apart = np.linalg.norm(np.delete(centres, i, axis=0) - [u, v], axis=1)

@@ -11,7 +11,7 @@ from needle_sim.bus.can_frame import CanFrame
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.drives.emulated_drive import DriveSettings
+from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
 INSERTION, ROTATION, MASTER = 1, 2, 127
@@ -24,9 +24,9 @@ def settings(name: str, limit_action: LimitAction, *, start: float = 0.0, lag: f
     if name == "insertion":
         scale = COUNTS_PER_METRE
         motor = MotorSettings(scale, 0.01 * scale, lag, start, 0.25 * scale)
-        return DriveSettings(name, INSERTION, STEPPER, motor, limit_action, 0.3)
+        return EmulatedDriveSettings(name, INSERTION, STEPPER, motor, limit_action, 0.3)
     motor = MotorSettings(COUNTS_PER_RADIAN, 20.0 * COUNTS_PER_RADIAN, lag)
-    return DriveSettings(name, ROTATION, SERVO, motor, limit_action, 0.3)
+    return EmulatedDriveSettings(name, ROTATION, SERVO, motor, limit_action, 0.3)
 
 
 class Master:

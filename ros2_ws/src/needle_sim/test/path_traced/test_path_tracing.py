@@ -12,7 +12,7 @@ import pytest
 
 from needle_common.errors import UserError
 from needle_sim.camera.projection import project
-from needle_sim.camera.stereo_rig import Camera, StereoRig, load_stereo_rig
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance
 from needle_sim.path_traced.floors import FloorPicture
 from needle_sim.path_traced.insertion import trace_insertion
@@ -45,7 +45,7 @@ def mitsuba() -> Mitsuba:
 def quarter_size(rig: StereoRig) -> StereoRig:
     """Return the rig with images of a quarter of the sides."""
 
-    def smaller(camera: Camera) -> Camera:
+    def smaller(camera: SimulatedCamera) -> SimulatedCamera:
         matrix = camera.camera_matrix.copy()
         matrix[:2] /= 4.0
         return dataclasses.replace(camera, image_width=256, image_height=192, camera_matrix=matrix)

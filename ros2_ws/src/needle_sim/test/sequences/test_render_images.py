@@ -169,7 +169,7 @@ def test_truth_s_angles_give_the_directions_back() -> None:
         (["--frames", "0"], "--frames = 0 is outside [1, 999999]"),
         (["--frames", "many"], "--frames 'many' is not a whole number"),
         (["--seed", "-1"], "--seed"),
-        (["--depth-mm", "nan"], "--depth-mm 'nan' is not finite"),
+        (["--depth-mm", "nan"], "--depth-mm = nan mm is not finite"),
         (["--step-mm", "0"], "--step-mm = 0 mm is outside"),
         (["--noise", "60"], "--noise = 60 grey levels is outside [0, 50]"),
         (["--calibration", "/nowhere.yaml"], "cannot read calibration /nowhere.yaml"),

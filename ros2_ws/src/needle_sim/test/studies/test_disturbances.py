@@ -3,10 +3,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from numpy.random import default_rng
+from scipy import stats
 
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
-from needle_sim.studies.disturbances import DelayLine, Disturbances, measured, patch_factors
+from needle_sim.studies.disturbances import (
+    DelayLine,
+    Disturbances,
+    bumps,
+    measured,
+    patch_factors,
+)
 
 COUNT = 20_000
 TIPS = default_rng(1).uniform(-0.1, 0.1, (COUNT, 3))
@@ -23,6 +30,15 @@ def test_noise_is_uniform_independent_and_bounded() -> None:
     np.testing.assert_allclose(np.std(share, axis=0), 1.0 / np.sqrt(3.0), rtol=0.02)
     assert np.all(np.abs(np.mean(share, axis=0)) < 0.02)
     assert np.all(np.abs(np.corrcoef(share.T) - np.eye(3)) < 0.03)
+
+
+def test_normal_noise_is_normal_with_its_amplitude_as_standard_deviation() -> None:
+    off = error(Disturbances(noise=0.001, noise_shape="normal"))
+    assert np.all(np.isfinite(off))
+    # of a sample of a normal distribution the test's p is uniform: 1e-4 is one seed in 10,000
+    assert stats.kstest(off.ravel(), "norm", args=(0.0, 0.001)).pvalue > 1e-4
+    assert 0.004 < np.max(np.abs(off)) < 0.0055
+    assert np.all(np.abs(np.corrcoef(off.T) - np.eye(3)) < 0.03)
 
 
 def test_noise_differs_between_exposures_and_seeds_and_is_none_at_0() -> None:
@@ -47,6 +63,24 @@ def test_outliers_are_off_by_5_to_10_mm_in_any_direction(share: float) -> None:
     assert np.all(np.abs(np.mean(direction, axis=0)) < 5.0 / np.sqrt(3.0 * count))
     # on the sphere each coordinate is uniform
     np.testing.assert_allclose(np.mean(direction**2, axis=0), 1.0 / 3.0, atol=2.0 / np.sqrt(count))
+
+
+def test_outliers_are_as_far_off_as_asked() -> None:
+    size = np.linalg.norm(error(Disturbances(outliers=1.0, outlier_size=(0.002, 0.0035))), axis=1)
+    assert 0.002 - 1e-9 <= size.min() < 0.00201
+    assert 0.00349 < size.max() <= 0.0035
+    assert abs(np.mean(size) - 0.00275) < 5.0 * 0.0015 / np.sqrt(12.0 * COUNT)
+
+
+def test_bumps_are_of_one_size_in_any_direction_and_one_for_each_needle() -> None:
+    moved = bumps(0.002, 1, 0, COUNT)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 0.002, rtol=1e-9)
+    assert np.all(np.abs(np.mean(moved, axis=0)) < 5.0 * 0.002 / np.sqrt(3.0 * COUNT))
+    np.testing.assert_allclose(np.std(moved, axis=0), 0.002 / np.sqrt(3.0), rtol=0.02)
+    np.testing.assert_array_equal(bumps(0.002, 1, 40, 5), moved[40:45])
+    # independent of which way outliers are off
+    outliers = error(Disturbances(outliers=1.0))
+    assert abs(np.corrcoef(moved[:, 0], outliers[:, 0])[0, 1]) < 0.03
 
 
 def test_dropped_tips_are_missing_whole_and_the_others_untouched() -> None:

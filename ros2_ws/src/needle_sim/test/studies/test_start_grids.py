@@ -3,9 +3,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_sim.studies.start_grids import GRIDS, Bounds
+from needle_sim.studies.start_grids import GRIDS, StartBounds
 
-BOUNDS = Bounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0))
+BOUNDS = StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0))
 LARGEST = np.array([0.003, np.deg2rad(10.0), np.deg2rad(30.0)])
 
 

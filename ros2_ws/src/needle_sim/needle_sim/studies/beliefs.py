@@ -1,0 +1,79 @@
+"""What a controller says of its needles, and how often that is true."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_sim.needle.se3 import FloatArray
+
+
+@dataclasses.dataclass(frozen=True)
+class Belief:
+    """Where a controller takes its needles to be, and how sure it is.
+
+    Attributes
+    ----------
+    x, x_std : ndarray, shape (N,)
+        Distance from the plane, and its standard deviation [m].
+    sin_pitch, sin_pitch_std : ndarray, shape (N,)
+        Sine of the pitch out of the plane, and its standard deviation.
+    doubtful : ndarray of bool, shape (N,), optional
+        Whether it says that it cannot be relied on; None if it never says so.
+    """
+
+    x: FloatArray
+    x_std: FloatArray
+    sin_pitch: FloatArray
+    sin_pitch_std: FloatArray
+    doubtful: NDArray[np.bool_] | None = None
+
+
+class BeliefTally:
+    """Compares what a controller says of some needles with the truth, step after step.
+
+    Parameters
+    ----------
+    needles : int
+        How many.
+    """
+
+    def __init__(self, needles: int) -> None:
+        self._within: FloatArray = np.zeros((2, needles))
+        self._compared = 0
+        self._doubtful: FloatArray = np.full(needles, np.nan)
+
+    def add(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
+        """Take one step.
+
+        Parameters
+        ----------
+        belief : Belief, optional
+            What the controller says after it; None if it says nothing.
+        x, pitch : ndarray, shape (N,)
+            The truth [m, rad].
+        """
+        if belief is None:
+            return
+        for off, std in (
+            (np.abs(belief.x - x), belief.x_std),
+            (np.abs(belief.sin_pitch - np.sin(pitch)), belief.sin_pitch_std),
+        ):
+            self._within += off <= np.array([[2.0], [3.0]]) * std
+            self._compared += 1
+        if belief.doubtful is not None:
+            self._doubtful = belief.doubtful.astype(np.float64)
+
+    @property
+    def inside(self) -> FloatArray:
+        """Share of x and pitch within 2 (first row) and 3 sigma, (2, N); NaN if nothing is said."""
+        if not self._compared:
+            return np.full_like(self._within, np.nan)
+        return self._within / self._compared
+
+    @property
+    def doubtful(self) -> FloatArray:
+        """Whether the last step was called doubtful, shape (N,), 0 or 1; NaN if nothing is said."""
+        return self._doubtful

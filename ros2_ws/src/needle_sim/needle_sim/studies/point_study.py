@@ -1,0 +1,164 @@
+"""A study of points: many simulated needles, each steered to a point of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.beliefs import BeliefTally
+from needle_sim.studies.disturbed_needles import DisturbedNeedles
+from needle_sim.studies.figures_of_merit import BAND, BoolArray, joined, mean_of_what_is_said
+from needle_sim.studies.point_targets import NEAREST
+from needle_sim.studies.study import CHUNK, Controller, StudySettings
+
+ARRIVED = 1e-4
+"""Insertion left at which a needle stays where it is [m]."""
+
+
+class PointController(Controller, Protocol):
+    """Controller of some needles that knows where each one's way ends."""
+
+    def step(
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
+    ) -> FloatArray:
+        """Take a step as `Controller.step`; insertion and age are each needle's own, (N,) [m]."""
+
+    def insertion_left(self) -> FloatArray:
+        """Return how far each needle has to go on after the last step, (N,) [m]."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PointOutcomes:
+    """Outcome of each run, from the true tips.
+
+    Attributes
+    ----------
+    error : ndarray, shape (N,)
+        Distance of the tip from its point at the end [m].
+    rotation : ndarray, shape (N,)
+        Sum of all the base turned, either way [rad].
+    inside_2_sigma, inside_3_sigma, doubtful : ndarray, shape (N,)
+        As of `figures_of_merit.Outcomes`, of the end alone.
+    """
+
+    error: FloatArray
+    rotation: FloatArray
+    inside_2_sigma: FloatArray
+    inside_3_sigma: FloatArray
+    doubtful: FloatArray
+
+    @property
+    def reached(self) -> BoolArray:
+        """Tell whether the tip ended within 1 mm of its point."""
+        return np.asarray(self.error <= BAND)
+
+
+def run_point_study(
+    starts: FloatArray,
+    targets: FloatArray,
+    new_controller: Callable[[FloatArray], PointController],
+    settings: StudySettings,
+    *,
+    on_progress: Callable[[int], None] = lambda _: None,
+    chunk: int = CHUNK,
+) -> PointOutcomes:
+    """Steer each needle from its start to its point.
+
+    Parameters
+    ----------
+    starts : ndarray, shape (N, 3)
+        x [m], pitch, roll [rad] of each needle.
+    targets : ndarray, shape (N, 3)
+        Its point [m].
+    new_controller : callable
+        Returns a controller for needles that have these points.
+    settings : StudySettings
+        What the needles have in common; a needle that is not there at the depth stays there.
+    on_progress : callable
+        Told after each step how many needles were on their way.
+    chunk : int
+        Needles steered at a time; changes the time it takes, not the outcomes.
+
+    Returns
+    -------
+    PointOutcomes
+        In the order of the starts.
+    """
+    parts = []
+    for first in range(0, len(starts), chunk):
+        part = slice(first, first + chunk)
+        needles = DisturbedNeedles(
+            starts[part],
+            settings.disturbances,
+            curvature=settings.curvature,
+            bump_at=0.5 * NEAREST,
+            seed=settings.seed,
+            first=first,
+        )
+        controller = new_controller(targets[part])
+        parts.append(_steer(needles, targets[part], controller, settings, on_progress))
+    return joined(parts)
+
+
+def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
+    """Return the figures of a study of points, by the names of `monte_carlo --json`."""
+    error = outcomes.error * 1e3
+    return {
+        "within_1_mm_point": float(np.mean(outcomes.reached)),
+        "rms_point_mm": float(np.sqrt(np.mean(error**2))),
+        "p95_point_mm": float(np.percentile(error, 95.0)),
+        "max_point_mm": float(np.max(error)),
+        "rotation_mean_deg": float(np.rad2deg(np.mean(outcomes.rotation))),
+        "rotation_p95_deg": float(np.rad2deg(np.percentile(outcomes.rotation, 95.0))),
+        "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
+        "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
+        "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
+    }
+
+
+def _steer(
+    needles: DisturbedNeedles,
+    targets: FloatArray,
+    controller: PointController,
+    settings: StudySettings,
+    on_progress: Callable[[int], None],
+) -> PointOutcomes:
+    count, true = len(targets), needles.true
+    rate = controller.start(needles.first_seen())
+    inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
+    inside, doubtful = np.full((2, count), np.nan), np.full(count, np.nan)
+    on_the_way = np.ones(count, dtype=bool)
+    begin = 0.0
+    while True:
+        left = np.minimum(controller.insertion_left(), settings.depth - inserted)
+        # Not "left <= ARRIVED": who does not know how far it has to go stays where it is.
+        arrived = on_the_way & ~(left > ARRIVED)
+        if np.any(arrived):
+            said = BeliefTally(count)
+            said.add(controller.belief(), true.x, true.pitch)
+            off = np.linalg.norm(true.tips - targets, axis=1)
+            error[arrived], doubtful[arrived] = off[arrived], said.doubtful[arrived]
+            inside[:, arrived] = said.inside[:, arrived]
+            on_the_way &= ~arrived
+            if not np.any(on_the_way):
+                break
+        # What has arrived goes on unheeded: so all needles make one step at a time.
+        length = np.where(on_the_way, np.minimum(left, settings.step_length), settings.step_length)
+        turned = rate * length
+        inserted = inserted + length
+        rotation += np.where(on_the_way, np.abs(turned), 0.0)
+        end = begin + settings.step_length
+        needles.insert(begin, end, length, turned)
+        begin = end
+        on_progress(int(np.sum(on_the_way)))
+        tips, age = needles.seen(inserted)
+        rate = controller.step(length, turned, tips, age)
+    return PointOutcomes(error, rotation, inside[0], inside[1], doubtful)
