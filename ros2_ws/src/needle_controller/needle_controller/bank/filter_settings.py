@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated, NamedTuple
+
+import numpy as np
 
 from needle_common.errors import UserError
+from needle_common.settings.bounds import Bounds, check_bounded_fields
+from needle_controller.bank.estimate_tiles import NOISES
 from needle_controller.bank.hypotheses import (
+    NoiseHypothesis,
     RollHypothesis,
     TorsionHypothesis,
-    bounded,
-    check_bounded_fields,
 )
-from needle_controller.bank.hypothesis_bank import Limits
+from needle_controller.model.arrays import Array
 
 TORSION_HYPOTHESES = (
     TorsionHypothesis(0.0, 0.0, 0.0, 0.52),
@@ -22,16 +26,52 @@ TORSION_HYPOTHESES = (
 )
 """None, a small and a large play, lag. Each one's size is estimated."""
 ROLL_HYPOTHESES = tuple(
-    RollHypothesis(math.radians(roll), math.radians(16.0), weight)
-    for roll, weight in (
-        (0.0, 0.24),
-        (30.0, 0.21),
-        (-30.0, 0.21),
-        *((float(roll), 0.038) for roll in (60, -60, 90, -90, 120, -120, 150, -150, 180)),
+    RollHypothesis(math.radians(roll), math.radians(std), weight)
+    for roll, std, weight in (
+        (0.0, 16.0, 0.24),
+        *((roll, 16.0, 0.21) for roll in (30.0, -30.0)),
+        *((roll, 19.0, 0.057) for roll in (65.0, -65.0)),
+        *((roll, 21.0, 0.057) for roll in (107.0, -107.0)),
+        *((roll, 22.0, 0.057) for roll in (153.0, -153.0)),
     )
 )
 """Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
 linear in the roll knows less than it thinks when its roll is wide."""
+NORMAL_NOISE = (NoiseHypothesis(False, (1.0, 2.0, 4.0, 8.0), (0.7, 0.15, 0.1, 0.05), 1.0),)
+"""Where a covariance is claimed: normal, as claimed or larger."""
+BOUNDED_NOISE = (
+    NoiseHypothesis(True, (1.0, 1.3, 1.7, 2.2), (0.85, 0.05, 0.05, 0.05), 0.8),
+    NoiseHypothesis(False, (1.0, 1.6, 2.6), (0.6, 0.2, 0.2), 0.2),
+)
+"""Where a bound is claimed: most likely it holds; else a larger one, or none."""
+
+
+class Drift(NamedTuple):
+    """Variance that each gains per inserted length; see `FilterSettings`."""
+
+    orientation: float
+    curvature: float
+    scale: float
+    play: float
+    lag: float
+
+
+class Limits(NamedTuple):
+    """What the estimates are kept to, and when they end; see `FilterSettings`."""
+
+    smallest_curvature: float
+    largest_curvature: float
+    largest_play: float
+    smallest_lag: float
+    largest_lag: float
+    smallest_weight: float
+    softness: float
+    mistrust: float
+    outlier_share: float
+    outlier_density: float
+    jump_share: float
+    jump_variance: float
+    jump_turn_variance: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -48,17 +88,31 @@ class FilterSettings:
         Least and most that is believed, as shares of it.
     curvature_drift : float
         Growth of its standard deviation over a metre, as a share of it [1/sqrt(m)].
+    scale_spread : float
+        Standard deviation of the insertion scale at the start: how far the needle goes in for each
+        unit that the stage moves, about 1.
+    scale_drift : float
+        Growth of it over a metre [1/sqrt(m)].
     tip_noise_bound : float
-        Largest error of a measured coordinate where a tip comes without covariance [m].
-    tip_noise_softness : float
-        Standard deviation by which that bound is blurred [m].
+        Largest error claimed of a measured coordinate where a tip comes without covariance [m].
+    outlier_share : float
+        Share of tips that have nothing to do with the needle.
+    outlier_reach : float
+        Size of where these are found, as a multiple of the claimed bound (of sqrt(3) standard
+        deviations).
     model_error : float
         What the model leaves out of a tip's position [m]. A better sensor is not believed beyond
         it: a filter that is linear in the roll would hold a wrong one for certain. Its square is
         added to a tip's covariance, and a bound is taken as at least twice as large.
-    surprise : float
-        Probability of a measured coordinate that a hypothesis does not explain: a single tip is no
-        proof against it, for its distribution is not as Gaussian as it is taken to be.
+    softness : float
+        Standard deviation by which a coordinate is blurred [m].
+    mistrust : float
+        Share by which the variance of an expected coordinate is taken as larger than it is: a
+        filter that is linear in the roll knows less than it thinks.
+    jump_share : float
+        How likely a tip that looks like an outlier shows such a jump, against that it is one.
+    jump_std, jump_turn_std : float
+        How far a phantom or a tracker may be displaced [m], and turned [rad], at once.
     initial_angle_std : float
         How well pitch and yaw at the entry are known [rad].
     orientation_drift : float
@@ -66,13 +120,6 @@ class FilterSettings:
     play_drift, lag_drift : float
         Growth of the standard deviations of play [rad/sqrt(m)] and lag length [sqrt(m)] over a
         metre, where they are estimated: what keeps them open for what the model does not know.
-    gate : float
-        A tip is refused whose squared Mahalanobis distance is above this for every hypothesis.
-    tips_until_reacceptance : int
-        After so many refused tips in a row the next one is taken all the same.
-    lost_below : float
-        When the running mean of the tips' log likelihood falls below this, no hypothesis is right
-        and all of them start over.
     prune_ratio : float
         A hypothesis ends when it is less likely than the likeliest one by this factor.
     merge_angle : float
@@ -83,32 +130,37 @@ class FilterSettings:
         Most that play is believed to be [rad].
     lag_range : tuple of float
         Least and most that a lag length is believed to be [m].
-    torsion_hypotheses, roll_hypotheses : tuple
-        Every torsion is tried with every roll.
+    torsion_hypotheses, roll_hypotheses, noise_hypotheses : tuple
+        Every torsion is tried with every roll and every noise, of each shape at most one.
     """
 
-    curvature: float = bounded(1.0 / 0.122, 0.1, 100.0, "1/m")
-    curvature_spread: float = bounded(0.22, 0.0, 1.0, "-")
+    curvature: Annotated[float, Bounds(0.1, 100.0, "1/m")] = 1.0 / 0.122
+    curvature_spread: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.22
     curvature_range: tuple[float, float] = (0.5, 1.6)
-    curvature_drift: float = bounded(0.02 * math.sqrt(1000.0), 0.0, 100.0, "1/sqrt(m)")
-    tip_noise_bound: float = bounded(0.001, 1e-6, 0.1, "m")
-    tip_noise_softness: float = bounded(0.00003, 0.0, 0.1, "m")
-    model_error: float = bounded(0.0001, 0.0, 0.1, "m")
-    surprise: float = bounded(0.02, 1e-9, 1.0, "-")
-    initial_angle_std: float = bounded(math.radians(8.0), 1e-6, math.pi, "rad")
-    orientation_drift: float = bounded(math.sqrt(0.001), 0.0, 100.0, "rad/sqrt(m)")
-    play_drift: float = bounded(0.2, 0.0, 100.0, "rad/sqrt(m)")
-    lag_drift: float = bounded(0.003, 0.0, 1.0, "sqrt(m)")
-    gate: float = bounded(30.0, 1.0, 1e9, "-")
-    tips_until_reacceptance: int = bounded(4, 1, 1000, "-")
-    lost_below: float = bounded(-2.2, -1e9, -0.1, "-")
-    prune_ratio: float = bounded(math.exp(6.0), 1.0, 1e30, "-")
-    merge_angle: float = bounded(0.35, 0.0, math.pi, "rad")
-    longest_step: float = bounded(0.002, 1e-5, 1.0, "m")
-    play_limit: float = bounded(1.0, 0.0, math.pi, "rad")
+    curvature_drift: Annotated[float, Bounds(0.0, 100.0, "1/sqrt(m)")] = 0.02 * math.sqrt(1000.0)
+    scale_spread: Annotated[float, Bounds(0.0, 0.3, "-")] = 0.04
+    scale_drift: Annotated[float, Bounds(0.0, 10.0, "1/sqrt(m)")] = 0.01
+    tip_noise_bound: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.001
+    outlier_share: Annotated[float, Bounds(1e-6, 0.5, "-")] = 0.1
+    outlier_reach: Annotated[float, Bounds(1.0, 1000.0, "-")] = 4.0
+    model_error: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.0001
+    softness: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.00004
+    mistrust: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.25
+    jump_share: Annotated[float, Bounds(1e-6, 1.0, "-")] = 0.1
+    jump_std: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.003
+    jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(3.0)
+    initial_angle_std: Annotated[float, Bounds(1e-6, math.pi, "rad")] = math.radians(8.0)
+    orientation_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = math.sqrt(0.001)
+    play_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.2
+    lag_drift: Annotated[float, Bounds(0.0, 1.0, "sqrt(m)")] = 0.003
+    prune_ratio: Annotated[float, Bounds(1.0, 1e30, "-")] = 250.0
+    merge_angle: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.35
+    longest_step: Annotated[float, Bounds(1e-5, 1.0, "m")] = 0.002
+    play_limit: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
     lag_range: tuple[float, float] = (0.001, 0.016)
     torsion_hypotheses: tuple[TorsionHypothesis, ...] = TORSION_HYPOTHESES
     roll_hypotheses: tuple[RollHypothesis, ...] = ROLL_HYPOTHESES
+    noise_hypotheses: tuple[NoiseHypothesis, ...] = BOUNDED_NOISE
 
     def __post_init__(self) -> None:
         """Check every field.
@@ -125,30 +177,47 @@ class FilterSettings:
         ):
             if not (0.0 < least <= most < math.inf):
                 raise UserError(f"{name} = ({least:g}, {most:g}), wants 0 < least <= most")
-        if not (self.torsion_hypotheses and self.roll_hypotheses):
-            raise UserError("torsion_hypotheses and roll_hypotheses want at least one each")
+        for name in ("torsion_hypotheses", "roll_hypotheses", "noise_hypotheses"):
+            if not getattr(self, name):
+                raise UserError(f"{name} = (), wants at least one")
 
     @property
     def believed_bound(self) -> float:
         """Largest error of a measured coordinate that is reckoned with [m]."""
         return max(self.tip_noise_bound, 2.0 * self.model_error)
 
+    def drift(self) -> Drift:
+        """Return what the compiled code needs of this for an advance."""
+        return Drift(
+            orientation=self.orientation_drift**2,
+            curvature=(self.curvature_drift * self.curvature) ** 2,
+            scale=self.scale_drift**2,
+            play=self.play_drift**2,
+            lag=self.lag_drift**2,
+        )
+
     def limits(self) -> Limits:
-        """Return what the compiled code needs of this."""
+        """Return what the compiled code needs of this for a tip."""
         return Limits(
-            orientation_noise=self.orientation_drift**2,
-            curvature_noise=(self.curvature_drift * self.curvature) ** 2,
-            play_noise=self.play_drift**2,
-            lag_noise=self.lag_drift**2,
             smallest_curvature=self.curvature_range[0] * self.curvature,
             largest_curvature=self.curvature_range[1] * self.curvature,
             largest_play=self.play_limit,
             smallest_lag=self.lag_range[0],
             largest_lag=self.lag_range[1],
             smallest_weight=1.0 / self.prune_ratio,
-            merge_angle=self.merge_angle,
-            gate=self.gate,
-            tips_until_reacceptance=self.tips_until_reacceptance,
-            surprise=self.surprise,
-            longest_step=self.longest_step,
+            softness=self.softness**2,
+            mistrust=self.mistrust,
+            outlier_share=self.outlier_share,
+            outlier_density=self.outlier_reach**-3,
+            jump_share=self.jump_share,
+            jump_variance=self.jump_std**2,
+            jump_turn_variance=self.jump_turn_std**2,
         )
+
+    def noises(self) -> Array:
+        """Return multiples and shares of normal and uniform noises, shape (2, 2, NOISES)."""
+        numbers = np.zeros((2, 2, NOISES))
+        for noise in self.noise_hypotheses:
+            count = len(noise.shares)
+            numbers[int(noise.is_uniform), :, :count] = noise.multiples, noise.shares
+        return numbers

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Any
+from typing import Annotated
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import Bounds, check_bounded_fields
+from needle_controller.bank.estimate_tiles import NOISES
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,17 +27,14 @@ class TorsionHypothesis:
         Prior weight, relative to the others'.
     """
 
-    play: float
-    lag_length: float
-    size_std: float
-    weight: float
+    play: Annotated[float, Bounds(0.0, math.pi, "rad")]
+    lag_length: Annotated[float, Bounds(0.0, 0.1, "m")]
+    size_std: Annotated[float, Bounds(0.0, math.pi, "m or rad")]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError."""
-        check_bounds("play", self.play, 0.0, math.pi, "rad")
-        check_bounds("lag_length", self.lag_length, 0.0, 0.1, "m")
-        check_bounds("size_std", self.size_std, 0.0, math.pi, "m or rad")
-        check_bounds("weight", self.weight, 1e-9, 1e9, "-")
+        check_bounded_fields(self)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,40 +51,42 @@ class RollHypothesis:
         Prior weight, relative to the others'.
     """
 
-    roll: float
-    std: float
-    weight: float
+    roll: Annotated[float, Bounds(-math.pi, math.pi, "rad")]
+    std: Annotated[float, Bounds(1e-6, math.pi, "rad")]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError."""
-        check_bounds("roll", self.roll, -math.pi, math.pi, "rad")
-        check_bounds("std", self.std, 1e-6, math.pi, "rad")
-        check_bounds("weight", self.weight, 1e-9, 1e9, "-")
+        check_bounded_fields(self)
 
 
-def check_bounds(name: str, value: float, lower: float, upper: float, unit: str) -> None:
-    """Raise what names the value and the bound unless lower <= value <= upper.
+@dataclasses.dataclass(frozen=True)
+class NoiseHypothesis:
+    """What the noise of a measured coordinate may be, against what is claimed of it.
 
-    Raises
-    ------
-    UserError
-        A value that is not finite.
-    OutOfBoundsError
-        A value out of bounds.
+    Attributes
+    ----------
+    is_uniform : bool
+        Whether it is uniform within a bound; else it is normal.
+    multiples : tuple of float
+        Its bound as multiples of the claimed bound, or its standard deviation as multiples of the
+        claimed one (of a bound: bound / sqrt(3)); at most 4.
+    shares : tuple of float
+        How likely each is; the sum is 1.
+    weight : float
+        Prior weight, relative to the others'.
     """
-    if not math.isfinite(value):
-        raise UserError(f"{name} = {value} {unit} is not finite")
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)
 
+    is_uniform: bool
+    multiples: tuple[float, ...]
+    shares: tuple[float, ...]
+    weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
 
-def bounded(default: Any, lower: float, upper: float, unit: str) -> Any:
-    """Declare a number of a settings dataclass with its bounds, for `check_bounded_fields`."""
-    return dataclasses.field(default=default, metadata={"bounds": (lower, upper, unit)})
-
-
-def check_bounded_fields(settings: Any) -> None:
-    """Check every field declared with `bounded`; raises as `check_bounds` does."""
-    for field in dataclasses.fields(settings):
-        if "bounds" in field.metadata:
-            check_bounds(field.name, getattr(settings, field.name), *field.metadata["bounds"])
+    def __post_init__(self) -> None:
+        """Check every field; raises UserError."""
+        check_bounded_fields(self)
+        said = f"multiples = {self.multiples}, shares = {self.shares}"
+        if not 0 < len(self.multiples) == len(self.shares) <= NOISES:
+            raise UserError(f"{said}: want 1 to {NOISES} of each")
+        if min(self.multiples + self.shares) <= 0.0 or abs(sum(self.shares) - 1.0) > 1e-9:
+            raise UserError(f"{said}: want multiples > 0, and shares > 0 whose sum is 1")

@@ -1,40 +1,34 @@
 """Many needles, several Gaussian estimates of each: what is done to all of them; compiled.
 
-A needle's hypotheses that are still alive come first; `alive` says how many they are. What lies
-behind them in their last block is calculated along and has no weight. Angles of base and tip count
-from the start.
+Beside its estimates a needle has how likely each noise model is, and what became of its last tips.
+Angles of base and tip count from the start.
 """
 
-# Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from needle_common.compiled import compiled
-from needle_controller.bank.hypothesis_lanes import (
-    BEHIND_PLAY,
-    KAPPA,
-    LAG,
+from needle_controller.bank.estimate_tiles import (
+    E_TURN,
+    EVIDENCE,
     LANES,
-    PER_SIZE,
-    PLAY,
-    SIZE_CHANGE,
-    SURPRISE,
-    TIP_ANGLE,
+    OUTLIER,
+    PLACE,
+    ROWS,
     WEIGHT,
+    Tiles,
 )
-from needle_controller.bank.hypothesis_pruning import merge, prune
-from needle_controller.bank.tip_motion import LARGEST_TURN, move
-from needle_controller.bank.tip_update import squared_distance, take_bounded, take_gaussian
+from needle_controller.bank.filter_settings import Drift, Limits
+from needle_controller.bank.tip_motion import LARGEST_TURN, MOTION_ROWS, move
+from needle_controller.bank.tip_update import FOUND, READING_ROWS, UPDATE_ROWS, take_tip
 from needle_controller.model.arrays import Array
 
-EVIDENCE_SHARE = 0.15
-"""Of the newest tip in the running mean of the evidence."""
+_SUSPECTED = 0.5
+_NEWEST_SHARE = 0.1
 
 
 class Bank(NamedTuple):
@@ -42,41 +36,24 @@ class Bank(NamedTuple):
 
     Attributes
     ----------
-    alive : ndarray of int, shape (N,)
-        Hypotheses alive of each needle.
-    state : ndarray, shape (N, blocks, BLOCK)
-        The estimates, see `hypothesis_lanes`. The heaviest of a needle has weight 1.
+    tiles : Tiles
+        The estimates. The heaviest of a needle has weight 1.
     base : ndarray, shape (N,)
         Rotation of the base since the start [rad].
+    refused : ndarray, shape (N,)
+        How likely the last tip was an outlier.
+    unexplained : ndarray, shape (N,)
+        The same in the running mean of the last tips.
     """
 
-    alive: npt.NDArray[np.int64]
-    state: Array
+    tiles: Tiles
     base: Array
-
-
-class Limits(NamedTuple):
-    """What the estimates are kept to, and when they end; see `FilterSettings`."""
-
-    orientation_noise: float
-    curvature_noise: float
-    play_noise: float
-    lag_noise: float
-    smallest_curvature: float
-    largest_curvature: float
-    largest_play: float
-    smallest_lag: float
-    largest_lag: float
-    smallest_weight: float
-    merge_angle: float
-    gate: float
-    tips_until_reacceptance: int
-    surprise: float
-    longest_step: float
+    refused: Array
+    unexplained: Array
 
 
 @compiled
-def advance_bank(bank: Bank, length: Array, turn: Array, limits: Limits) -> None:
+def advance_bank(bank: Bank, length: Array, turn: Array, longest_step: float, drift: Drift) -> None:
     """Move every estimate by what the base did.
 
     Parameters
@@ -85,40 +62,39 @@ def advance_bank(bank: Bank, length: Array, turn: Array, limits: Limits) -> None
         The estimates.
     length, turn : ndarray, shape (N,)
         Inserted length [m] and rotation of the base over it [rad].
-    limits : Limits
-        Process noise, and the longest step that is taken at once.
+    longest_step : float
+        That is taken at once [m].
+    drift : Drift
+        What grows uncertain on the way.
     """
-    for n in range(bank.alive.size):
-        parts = math.ceil(
-            max(length[n] / limits.longest_step, abs(turn[n]) / LARGEST_TURN, 1.0) - 1e-9
-        )
-        step, part = length[n] / parts, turn[n] / parts
-        for _ in range(parts):
-            for b in range((bank.alive[n] + LANES - 1) // LANES):
-                move(
-                    bank.state[n, b],
-                    bank.base[n],
-                    part,
-                    step,
-                    limits.orientation_noise * step,
-                    limits.curvature_noise * step,
-                    limits.play_noise * step,
-                    limits.lag_noise * step,
-                )
-            bank.base[n] += part
+    parts = np.empty(length.size)
+    for n in range(length.size):
+        parts[n] = math.ceil(max(length[n] / longest_step, abs(turn[n]) / LARGEST_TURN, 1.0) - 1e-9)
+    work = np.empty((MOTION_ROWS, LANES))
+    base, step, share = np.empty(LANES), np.empty(LANES), np.empty(LANES)
+    state, owner = bank.tiles.state, bank.tiles.owner
+    for t in range(state.shape[0]):
+        most = 1.0
+        for h in range(LANES):
+            most = max(most, parts[owner[t * LANES + h]])
+        for part in range(int(most)):
+            for h in range(LANES):
+                n = owner[t * LANES + h]
+                goes_on = part < parts[n]
+                share[h] = turn[n] / parts[n] if goes_on else 0.0
+                step[h] = length[n] / parts[n] if goes_on else 0.0
+                base[h] = bank.base[n] + part * share[h]
+            move(state[t], base, share, step, drift, work)
+    for n in range(length.size):
+        bank.base[n] += turn[n]
 
 
 @compiled
 def correct_bank(
     bank: Bank,
-    tip: Array,
-    noise: Array,
-    bound: float,
-    softness: float,
+    reading: Array,
+    noises: Array,
     limits: Limits,
-    merging: bool,
-    refused_in_row: npt.NDArray[np.int64],
-    evidence: Array,
 ) -> None:
     """Take one measured tip of every needle.
 
@@ -126,95 +102,69 @@ def correct_bank(
     ----------
     bank : Bank, changed
         The estimates.
-    tip : ndarray, shape (N, 3)
-        The tips [m]; NaN where there is none.
-    noise : ndarray, shape (N or 1, 3, 3)
-        Their covariance [m^2], also for the gate.
-    bound, softness : float
-        The noise's bound [m] and its edges' variance [m^2]; bound 0: Gaussian noise instead.
+    reading : ndarray, shape (N, READING_ROWS)
+        The tips, as `take_tip` wants them.
+    noises :
+        As in `take_tip`.
     limits : Limits
-        Gate, bounds of the estimates, pruning and merging.
-    merging : bool
-        Whether to look for hypotheses that have become the same.
-    refused_in_row : ndarray of int, shape (N,), changed
-        Tips refused since the last one taken.
-    evidence : ndarray, shape (N,), changed
-        Running mean of how well all hypotheses together explain the tips, as a log likelihood; a
-        tip as good as its noise is 0.
+        Of the estimates; what errors are reckoned with.
     """
-    for n in range(bank.alive.size):
-        if not np.isfinite(tip[n, 0] + tip[n, 1] + tip[n, 2]):
-            continue
-        state = bank.state[n]
-        spread = noise[min(n, noise.shape[0] - 1)]
-        if refused_in_row[n] < limits.tips_until_reacceptance and not _believed(
-            state, bank.alive[n], tip[n], spread, limits.gate
-        ):
-            refused_in_row[n] += 1
-            continue
-        refused_in_row[n] = 0
-        before = _whole_weight(state, bank.alive[n])
-        for b in range((bank.alive[n] + LANES - 1) // LANES):
-            if bound > 0.0:
-                take_bounded(state[b], tip[n], bound, softness, limits.surprise)
-            else:
-                take_gaussian(state[b], tip[n], spread)
-            _keep_in_limits(state[b], limits)
-        gained = 0.0
-        if bound <= 0.0:
-            gained = 1.5 - 0.5 * _weigh_by_distance(state, bank.alive[n])
-        after = _whole_weight(state, bank.alive[n])
-        evidence[n] += EVIDENCE_SHARE * (math.log(after / before) + gained - evidence[n])
-        bank.alive[n] = prune(state, bank.alive[n], limits.smallest_weight)
-        if bank.alive[n] > LANES and merging:
-            bank.alive[n] = merge(state, bank.alive[n], limits.merge_angle)
+    state, owner = bank.tiles.state, bank.tiles.owner
+    work, seen = np.empty((UPDATE_ROWS, LANES)), np.empty((READING_ROWS, LANES))
+    for t in range(state.shape[0]):
+        for h in range(LANES):
+            n = owner[t * LANES + h]
+            for row in range(READING_ROWS):
+                seen[row, h] = reading[n, row]
+        take_tip(state[t], seen, noises, limits, work)
+    for n in range(bank.base.size):
+        if reading[n, FOUND] > 0.0:
+            _judge(bank, n, limits)
 
 
 @compiled
-def _believed(state: Array, alive: int, tip: Array, spread: Array, gate: float) -> bool:
-    """Return whether a tip is within the gate of any hypothesis."""
-    for h in range(alive):
-        if squared_distance(state[h // LANES], h % LANES, tip, spread) <= gate:
-            return True
-    return False
+def _judge(bank: Bank, n: int, limits: Limits) -> None:
+    """Weigh a needle's hypotheses by its tip; end what is unlikely."""
+    state, first, end = bank.tiles.state, bank.tiles.first[n], bank.tiles.first[n + 1]
+    whole = largest = refused = 0.0
+    for e in range(first, end):
+        tile, h = state[e // LANES], e % LANES
+        weight = tile[WEIGHT, h] * tile[EVIDENCE, h]
+        tile[WEIGHT, h] = weight
+        whole += weight
+        largest = max(largest, weight)
+        refused += weight * tile[OUTLIER, h]
+    refused /= whole
+    for e in range(first, end):
+        tile, h = state[e // LANES], e % LANES
+        weight = tile[WEIGHT, h] / largest
+        tile[WEIGHT, h] = weight if weight > limits.smallest_weight else 0.0
+    bank.refused[n] = refused
+    bank.unexplained[n] += _NEWEST_SHARE * (refused - bank.unexplained[n])
+    if refused > _SUSPECTED:
+        _suspect_jump(state, first, end, limits)
 
 
 @compiled
-def _whole_weight(state: Array, alive: int) -> float:
-    total = 0.0
-    for h in range(alive):
-        total += state[h // LANES, WEIGHT + h % LANES]
-    return total
+def _suspect_jump(state: Array, first: int, end: int, limits: Limits) -> None:
+    """Let an estimate that has ended be the likeliest one again, but displaced nobody knows where.
 
-
-@compiled
-def _weigh_by_distance(state: Array, alive: int) -> float:
-    """Multiply the weights by exp(-(d - d of the nearest)/2), and return that d."""
-    nearest = np.inf
-    for h in range(alive):
-        nearest = min(nearest, state[h // LANES, SURPRISE + h % LANES])
-    for h in range(alive):
-        distance = state[h // LANES, SURPRISE + h % LANES]
-        state[h // LANES, WEIGHT + h % LANES] *= math.exp(0.5 * (nearest - distance))
-    return nearest
-
-
-@compiled
-def _keep_in_limits(block: Array, limits: Limits) -> None:
-    """Bound the curvature; change the torsion's size, with which the tip has turned all along."""
-    for h in range(LANES):
-        block[KAPPA + h] = min(
-            max(block[KAPPA + h], limits.smallest_curvature), limits.largest_curvature
-        )
-        change, tip = block[SIZE_CHANGE + h], block[TIP_ANGLE + h]
-        lag, play, per_size = block[LAG + h], block[PLAY + h], block[PER_SIZE + h]
-        has_lag = lag > 0.0
-        new_lag = min(max(lag + change, limits.smallest_lag), limits.largest_lag)
-        new_play = min(max(play + change, 0.0), limits.largest_play)
-        tip += per_size * (new_lag - lag if has_lag else new_play - play)
-        changed = change != 0.0
-        block[TIP_ANGLE + h] = tip if changed else block[TIP_ANGLE + h]
-        block[LAG + h] = new_lag if changed and has_lag else lag
-        block[PLAY + h] = new_play if changed and not has_lag else play
-        behind = block[BEHIND_PLAY + h]
-        block[BEHIND_PLAY + h] = tip if changed and not has_lag else behind
+    If the tip was an outlier it will end soon; if the needle was displaced the next tips will be
+    where it expects them, and the others will end.
+    """
+    likeliest = free = -1
+    for e in range(first, end):
+        weight = state[e // LANES, WEIGHT, e % LANES]
+        if weight == 1.0:
+            likeliest = e
+        if weight == 0.0:
+            free = e
+    if free < 0:
+        return
+    tile, h = state[free // LANES], free % LANES
+    for row in range(ROWS):
+        tile[row, h] = state[likeliest // LANES, row, likeliest % LANES]
+    tile[WEIGHT, h] = limits.jump_share
+    for axis in range(3):
+        tile[PLACE[axis, axis], h] += limits.jump_variance
+        tile[PLACE[E_TURN + axis, E_TURN + axis], h] += limits.jump_turn_variance

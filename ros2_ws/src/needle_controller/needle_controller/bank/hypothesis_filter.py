@@ -11,33 +11,42 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.bank.filter_settings import FilterSettings
-from needle_controller.bank.hypothesis_bank import Bank, advance_bank, correct_bank
-from needle_controller.bank.hypothesis_lanes import (
+from needle_controller.bank.doubts import doubts_of
+from needle_controller.bank.estimate_tiles import (
     ERROR,
-    R00,
+    P,
+    R,
     X,
     covariances,
+    lower_half,
     rows,
-    set_covariances,
     set_rows,
+    tidied,
 )
+from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_bank import Bank, advance_bank, correct_bank
 from needle_controller.bank.hypothesis_mixture import (
     COLUMNS,
+    L_CURVATURE,
+    LEARNED,
     Hypotheses,
     MixtureEstimate,
     mixture,
     mixture_covariance,
 )
-from needle_controller.bank.hypothesis_start import start_bank, start_over
+from needle_controller.bank.hypothesis_pruning import merge
+from needle_controller.bank.hypothesis_start import start_bank
+from needle_controller.bank.tip_update import ALONG, BOUND, FOUND, READ, READING_ROWS
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 
 AMBIGUOUS_WEIGHT = 0.1
 AGE_TOLERANCE = 1e-9
 _LONGEST_QUEUE = 64
-MERGE_EVERY = 5
-"""Tips from one look for hypotheses that have become the same to the next."""
+SMALLEST_VARIANCE = 1e-18
+"""Of a measured coordinate [m^2]: an exact one would leave nothing to divide by."""
+TIDY_EVERY = 8
+"""Tips from one look for hypotheses that have ended or become the same to the next."""
 
 
 class HypothesisFilter:
@@ -76,10 +85,7 @@ class HypothesisFilter:
         self._bank = start_bank(self.settings, start, rotation)
         self._start_turn = turned[:, 2].copy()
         self._queue: list[tuple[Array, Array]] = []
-        self._refused_in_row = np.zeros(needles, dtype=np.int64)
         self._too_late = np.zeros(needles, dtype=bool)
-        self._evidence = np.zeros(needles)
-        self._started_over = np.zeros(needles, dtype=bool)
         self._version = self._corrections = 0
 
     def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
@@ -93,7 +99,7 @@ class HypothesisFilter:
         self._version += 1
         self._queue.append((length, turn))
         if len(self._queue) > _LONGEST_QUEUE:
-            self._move(*self._queue.pop(0))
+            self._move(self._bank, *self._queue.pop(0))
 
     def correct(
         self, tip: npt.ArrayLike, covariance: npt.ArrayLike | None = None, age: npt.ArrayLike = 0.0
@@ -113,30 +119,18 @@ class HypothesisFilter:
             position = np.where(self._too_late[:, None], np.nan, position)
         settings = self.settings
         if covariance is None:
-            bound = settings.believed_bound
-            noise = np.eye(3)[None] * (bound**2 / 3.0)
+            noise = np.eye(3)[None] * (settings.believed_bound**2 / 3.0)
         else:
-            noise, bound = self._covariances(covariance), 0.0
-            finite = np.all(np.isfinite(noise), axis=(1, 2))
-            if not np.all(finite):
-                position = np.where(finite[:, None], position, np.nan)
-            noise = noise + np.eye(3) * settings.model_error**2
+            noise = self._covariances(covariance) + np.eye(3) * settings.model_error**2
         correct_bank(
             self._bank,
-            position,
-            noise,
-            bound,
-            settings.tip_noise_softness**2,
+            readings(position, noise),
+            settings.noises(),
             settings.limits(),
-            self._corrections % MERGE_EVERY == 0,
-            self._refused_in_row,
-            self._evidence,
         )
-        lost = np.nonzero(self._evidence < settings.lost_below)[0]
-        if lost.size:
-            self._bank = start_over(self._bank, lost, settings)
-            self._evidence[lost] = 0.0
-            self._started_over[lost] = True
+        if self._corrections % TIDY_EVERY == 0:
+            merge(self._bank.tiles, settings.merge_angle)
+            self._bank = self._bank._replace(tiles=tidied(self._bank.tiles))
 
     def estimate(self) -> MixtureEstimate:
         """Return what is known now; see `Estimator.estimate`.
@@ -144,27 +138,31 @@ class HypothesisFilter:
         Its covariance is to be read before the next `advance`, `correct` or `reset`.
         """
         bank = self._looked_ahead()
-        needles, kinds = bank.alive.size, len(self.settings.torsion_hypotheses)
+        needles, kinds = bank.base.size, len(self.settings.torsion_hypotheses)
         coordinates, linearized = np.empty((needles, 6)), np.empty((needles, 3))
-        curvature, ambiguous = np.empty(needles), np.empty(needles)
+        learned, ambiguous = np.empty((needles, LEARNED)), np.empty(needles)
         table = np.empty((needles, kinds, COLUMNS))
         uncertainty = np.empty((needles, 3))
-        mixture(bank, coordinates, linearized, curvature, ambiguous, table, uncertainty)
+        noises = self.settings.noises()
+        mixture(bank.tiles, noises, coordinates, linearized, learned, ambiguous, table, uncertainty)
+        doubts = doubts_of(learned, uncertainty[:, 0], bank.unexplained, self.settings)
         version = self._version
 
         def covariance() -> Array:
             if self._version != version:
                 raise RuntimeError("the estimator has moved on since this estimate")
-            of_all = mixture_covariance(self._looked_ahead(), coordinates)
+            of_all = mixture_covariance(self._looked_ahead().tiles, coordinates)
             return of_all.reshape(*self._shape, 6, 6)
 
         shape = self._shape
         return MixtureEstimate(
             coordinates=coordinates.reshape(*shape, 6),
             linearized=linearized.reshape(*shape, 3),
-            curvature=curvature.reshape(shape),
-            warnings=self._warnings(ambiguous, curvature),
+            curvature=learned[:, L_CURVATURE].reshape(shape),
+            warnings=self._warnings(ambiguous),
             covariance_of=covariance,
+            doubtful=np.any(list(doubts.values()), axis=0).reshape(shape),
+            doubts=tuple(why for why, there in doubts.items() if np.any(there)),
             hypotheses=Hypotheses(
                 table=table.reshape(*shape, kinds, COLUMNS),
                 base=bank.base.reshape(shape).copy(),
@@ -177,22 +175,19 @@ class HypothesisFilter:
         """Express everything in another target plane; see `Estimator.change_frame`."""
         transform = np.asarray(T_new_old, dtype=float)
         turn = transform[:3, :3]
-        bank = self._bank
+        tiles = self._bank.tiles
         self._version += 1
         self.initial_rotation = turn @ self.initial_rotation
-        state = bank.state.copy()
-        set_rows(state, X, rows(state, X, 3) @ turn.T + transform[:3, 3])
-        rotation = rows(state, R00, 9)
-        turned = turn @ rotation.reshape(*rotation.shape[:2], 3, 3)
-        set_rows(state, R00, turned.reshape(rotation.shape))
+        set_rows(tiles, X, rows(tiles, X, 3) @ turn.T + transform[:3, 3])
+        rotation = turn @ rows(tiles, R, 9).reshape(-1, 3, 3)
+        set_rows(tiles, R, rotation.reshape(-1, 9))
         turns = np.eye(ERROR)
         turns[:3, :3] = turns[3:6, 3:6] = turn
-        set_covariances(state, turns @ covariances(state) @ turns.T)
-        self._bank = bank._replace(state=state)
+        set_rows(tiles, P, lower_half(turns @ covariances(tiles) @ turns.T))
 
-    def _move(self, length: Array, turn: Array) -> None:
-        """Carry the bank over an advance."""
-        advance_bank(self._bank, length, turn, self.settings.limits())
+    def _move(self, bank: Bank, length: Array, turn: Array) -> None:
+        """Carry a bank over an advance."""
+        advance_bank(bank, length, turn, self.settings.longest_step, self.settings.drift())
 
     def _catch_up(self, age: Array) -> npt.NDArray[np.bool_]:
         """Carry the bank to where the tip was exposed; return where it was past that already."""
@@ -201,7 +196,7 @@ class HypothesisFilter:
         too_late = ahead < -AGE_TOLERANCE
         if np.all(np.abs(age) <= AGE_TOLERANCE):
             for length, turn in self._queue:
-                self._move(length, turn)
+                self._move(self._bank, length, turn)
             self._queue = []
             return cast(npt.NDArray[np.bool_], too_late)
         while self._queue and np.any(ahead > AGE_TOLERANCE):
@@ -210,7 +205,7 @@ class HypothesisFilter:
             # What only turned belongs to the place it turned at.
             share = np.where(length > 0.0, take / np.where(length > 0.0, length, 1.0), ahead > 0.0)
             share = np.where(share > 1.0 - 1e-9, 1.0, share)
-            self._move(share * length, share * turn)
+            self._move(self._bank, share * length, share * turn)
             ahead = ahead - take
             if np.any(share < 1.0):
                 rest = 1.0 - share
@@ -223,28 +218,23 @@ class HypothesisFilter:
         """Return the bank as it will be at the end of the queue; itself where that is empty."""
         if not self._queue:
             return self._bank
-        bank = Bank(self._bank.alive, self._bank.state.copy(), self._bank.base.copy())
+        bank = self._bank._replace(
+            tiles=self._bank.tiles._replace(state=self._bank.tiles.state.copy()),
+            base=self._bank.base.copy(),
+        )
         for length, turn in self._queue:
-            advance_bank(bank, length, turn, self.settings.limits())
+            self._move(bank, length, turn)
         return bank
 
-    def _warnings(self, ambiguous: Array, curvature: Array) -> tuple[str, ...]:
-        settings = self.settings
-        least, most = (share * settings.curvature for share in settings.curvature_range)
+    def _warnings(self, ambiguous: Array) -> tuple[str, ...]:
         warnings = []
         if np.any(ambiguous > AMBIGUOUS_WEIGHT):
             worst = float(np.max(ambiguous))
             warnings.append(f"the roll is not known yet: {100.0 * worst:.0f} % says otherwise")
-        if np.any(self._refused_in_row > 0):
-            warnings.append(
-                f"tip refused as an outlier, {int(np.max(self._refused_in_row))} in a row"
-            )
-        if np.any(self._started_over):
-            warnings.append("nothing explained the tips any more: the roll was looked for anew")
+        if np.any(self._bank.refused > 0.5):
+            warnings.append("tip refused as an outlier")
         if np.any(self._too_late):
             warnings.append("tip dropped: it is older than the last one used")
-        if np.any((curvature <= least) | (curvature >= most)):
-            warnings.append(f"the curvature is at its limit, [{least:.3g}, {most:.3g}] 1/m")
         return tuple(warnings)
 
     def _covariances(self, covariance: npt.ArrayLike) -> Array:
@@ -257,3 +247,39 @@ class HypothesisFilter:
         shaped = np.broadcast_to(np.asarray(values, dtype=float), self._shape)
         # A copy: what cannot be written to is another type to compiled code, compiled once more.
         return np.array(shaped.reshape(-1))
+
+
+def readings(position: Array, noise: Array) -> Array:
+    """Return tips as `take_tip` wants them.
+
+    Parameters
+    ----------
+    position : ndarray, shape (N, 3)
+        The tips [m]; not finite where there is none.
+    noise : ndarray, shape (N or 1, 3, 3)
+        Their covariance [m^2]; not finite where there is no tip.
+
+    Returns
+    -------
+    ndarray, shape (N, READING_ROWS)
+        Read along the rows of L^-1, noise = L D L^T, where the errors are independent.
+    """
+    found = np.all(np.isfinite(position), axis=1) & np.all(np.isfinite(noise), axis=(1, 2))
+    tip = np.where(found[:, None], position, 0.0)
+    n = np.where(found[:, None, None], noise, np.eye(3))
+    # numpy's own elementary operations, whose bits do not depend on how many needles there are.
+    d0 = np.maximum(n[:, 0, 0], SMALLEST_VARIANCE)
+    l10, l20 = n[:, 1, 0] / d0, n[:, 2, 0] / d0
+    d1 = np.maximum(n[:, 1, 1] - l10 * l10 * d0, SMALLEST_VARIANCE)
+    l21 = (n[:, 2, 1] - l20 * l10 * d0) / d1
+    d2 = np.maximum(n[:, 2, 2] - l20 * l20 * d0 - l21 * l21 * d1, SMALLEST_VARIANCE)
+    rows_of = np.zeros((len(tip), READING_ROWS))
+    rows_of[:, FOUND] = found
+    along = rows_of[:, ALONG:BOUND].reshape(-1, 3, 3)
+    along[:, [0, 1, 2], [0, 1, 2]] = 1.0
+    along[:, 1, 0], along[:, 2, 0], along[:, 2, 1] = -l10, l21 * l10 - l20, -l21
+    y = tip[:, 1] - l10 * tip[:, 0]
+    rows_of[:, READ], rows_of[:, READ + 1] = tip[:, 0], y
+    rows_of[:, READ + 2] = tip[:, 2] - l21 * y - l20 * tip[:, 0]
+    rows_of[:, BOUND:] = np.sqrt(3.0 * np.stack([d0, d1, d2], axis=1))
+    return rows_of

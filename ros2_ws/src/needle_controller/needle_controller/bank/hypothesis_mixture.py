@@ -10,32 +10,24 @@ import math
 import numpy as np
 
 from needle_common.compiled import compiled
-from needle_controller.bank.hypothesis_bank import Bank
-from needle_controller.bank.hypothesis_lanes import (
+from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
+    E_TURN,
+    IS_UNIFORM,
     KAPPA,
     KIND,
     LAG,
     LANES,
-    P00,
-    P40,
-    P44,
-    P50,
-    P54,
-    P55,
+    NOISE,
+    NOISES,
+    PLACE,
     PLAY,
-    R00,
-    R01,
-    R02,
-    R10,
-    R12,
-    R20,
-    R22,
+    SCALE,
     TIP_ANGLE,
     WEIGHT,
+    R,
+    Tiles,
     X,
-    Y,
-    Z,
     covariances,
     rows,
 )
@@ -57,26 +49,16 @@ from needle_controller.observers.estimator import Estimate
 curvature [1/m], angles of the tip and of the shaft behind the play since the start [rad], play
 [rad], lag length [m], weight."""
 COLUMNS = 8
-(
-    S_WEIGHT,
-    S_X,
-    S_Y,
-    S_Z,
-    S_HEADING_X,
-    S_HEADING_Y,
-    S_HEADING_Z,
-    S_SIDE_X,
-    S_SIDE_Y,
-    S_SIDE_Z,
-    S_BEND,
-    S_CURVATURE,
-    S_X_X,
-    S_X_PITCH,
-    S_PITCH_PITCH,
-) = range(0, 15 * LANES, LANES)
-"""Rows of a needle's sums over its hypotheses: weight; by weight: the tip, its heading and its x
-axis, s3, curvature, and products of x and sin(pitch)."""
+S_POSITION, S_HEADING, S_SIDE, S_BEND, S_CURVATURE, S_SCALE, S_X_X, S_X_PITCH, S_PITCH_PITCH = (
+    0, 3, 6, 9, 10, 11, 12, 13, 14,
+)  # fmt: skip
+"""A needle's means over its hypotheses: tip, heading, the tip's x axis, s3, curvature, insertion
+scale, products of x and sin(pitch)."""
 SUMS = 15
+L_CURVATURE, L_SCALE, L_NOISE = range(3)
+"""What was learned of a needle: curvature [1/m], insertion scale, and the noise as a multiple of
+what is claimed, as its likeliest hypothesis has it."""
+LEARNED = 3
 _AMBIGUOUS_COSINE = math.cos(math.radians(60.0))
 _NO_MEAN_ROLL = 0.1
 
@@ -119,10 +101,11 @@ class MixtureEstimate(Estimate):
 
 @compiled
 def mixture(
-    bank: Bank,
+    tiles: Tiles,
+    noises: Array,
     coordinates: Array,
     linearized: Array,
-    curvature: Array,
+    learned: Array,
     ambiguous: Array,
     table: Array,
     uncertainty: Array,
@@ -131,128 +114,127 @@ def mixture(
 
     Parameters
     ----------
-    bank : Bank
+    tiles : Tiles
         The estimates.
+    noises : ndarray, shape (2, 2, NOISES)
+        As in `take_tip`.
     coordinates : ndarray, shape (N, 6), written
         x, y, z [m] are the weighted mean; the heading is the mean heading, the roll the mean
         direction of the tip's x axis about it, the likeliest one's where those cancel.
     linearized : ndarray, shape (N, 3), written
         Mean of the linearized states (6).
-    curvature : ndarray, shape (N,), written
-        Mean curvature [1/m].
+    learned : ndarray, shape (N, LEARNED), written
+        What was learned, see `L_CURVATURE`.
     ambiguous : ndarray, shape (N,), written
         Weight of the hypotheses whose roll is more than 60 deg from the likeliest one's.
     table : ndarray, shape (N, K, 8), written
         See `Hypotheses`; likewise `uncertainty`, shape (N, 3).
     """
-    sums, axis, side = np.empty(SUMS * LANES), np.empty(3), np.empty(3)
-    for n in range(bank.alive.size):
-        state, alive = bank.state[n], bank.alive[n]
+    sums = np.empty(SUMS)
+    for n in range(tiles.first.size - 1):
+        first, end = tiles.first[n], tiles.first[n + 1]
         sums[:] = 0.0
-        for b in range((alive + LANES - 1) // LANES):
-            _add_block(state[b], sums)
-        best = _fill_table(state, alive, table[n])
-        one = 1.0 / _total(sums, S_WEIGHT)
-        for k in range(3):
-            coordinates[n, k] = one * _total(sums, S_X + k * LANES)
-            axis[k] = one * _total(sums, S_HEADING_X + k * LANES)
-            side[k] = one * _total(sums, S_SIDE_X + k * LANES)
-        x, sin_pitch = coordinates[n, 0], axis[0]
-        linearized[n, 0], linearized[n, 1] = x, sin_pitch
-        linearized[n, 2] = one * _total(sums, S_BEND)
-        curvature[n] = one * _total(sums, S_CURVATURE)
-        uncertainty[n, 0] = one * _total(sums, S_X_X) - x * x
-        uncertainty[n, 1] = one * _total(sums, S_X_PITCH) - x * sin_pitch
-        uncertainty[n, 2] = one * _total(sums, S_PITCH_PITCH) - sin_pitch * sin_pitch
-        ambiguous[n] = one * _elsewhere(state, alive, best)
+        whole = heaviest = 0.0
+        best = first
+        for e in range(first, end):
+            tile, h = tiles.state[e // LANES], e % LANES
+            whole += tile[WEIGHT, h]
+            if tile[WEIGHT, h] > heaviest:
+                heaviest, best = tile[WEIGHT, h], e
+        for e in range(first, end):
+            tile, h = tiles.state[e // LANES], e % LANES
+            if tile[WEIGHT, h] > 0.0:
+                _add_estimate(tile, h, tile[WEIGHT, h] / whole, sums)
+        _fill_table(tiles.state, first, end, whole, table[n])
+        x, sin_pitch = sums[S_POSITION], sums[S_HEADING]
+        linearized[n, 0], linearized[n, 1], linearized[n, 2] = x, sin_pitch, sums[S_BEND]
+        learned[n, L_CURVATURE], learned[n, L_SCALE] = sums[S_CURVATURE], sums[S_SCALE]
+        learned[n, L_NOISE] = _noise_size(tiles.state[best // LANES], best % LANES, noises)
+        uncertainty[n, 0] = sums[S_X_X] - x * x
+        uncertainty[n, 1] = sums[S_X_PITCH] - x * sin_pitch
+        uncertainty[n, 2] = sums[S_PITCH_PITCH] - sin_pitch * sin_pitch
+        ambiguous[n] = _elsewhere(tiles.state, first, end, best) / whole
+        side = sums[S_SIDE : S_SIDE + 3]
         if side[0] * side[0] + side[1] * side[1] + side[2] * side[2] < _NO_MEAN_ROLL**2:
-            top, i = state[best // LANES], best % LANES
-            side[0], side[1], side[2] = top[R00 + i], top[R10 + i], top[R20 + i]
-        _mean_angles(axis, side, coordinates[n])
+            for k in range(3):
+                side[k] = tiles.state[best // LANES, R + 3 * k, best % LANES]
+        for k in range(3):
+            coordinates[n, k] = sums[S_POSITION + k]
+        _mean_angles(sums[S_HEADING : S_HEADING + 3], side, coordinates[n])
 
 
 @compiled
-def _add_block(p: Array, sums: Array) -> None:
-    """Add what eight hypotheses have, by weight, lane by lane; what has no weight adds nothing."""
-    for h in range(LANES):
-        weight, x, bend = p[WEIGHT + h], p[X + h], p[KAPPA + h] * p[R01 + h]
-        rx, ry, rz = p[R02 + h], p[R12 + h], p[R22 + h]
-        sums[S_WEIGHT + h] += weight
-        sums[S_X + h] += weight * x
-        sums[S_Y + h] += weight * p[Y + h]
-        sums[S_Z + h] += weight * p[Z + h]
-        sums[S_HEADING_X + h] += weight * rx
-        sums[S_HEADING_Y + h] += weight * ry
-        sums[S_HEADING_Z + h] += weight * rz
-        sums[S_SIDE_X + h] += weight * p[R00 + h]
-        sums[S_SIDE_Y + h] += weight * p[R10 + h]
-        sums[S_SIDE_Z + h] += weight * p[R20 + h]
-        sums[S_BEND + h] -= weight * bend
-        sums[S_CURVATURE + h] += weight * p[KAPPA + h]
-        # A turn w changes the heading's x by w_y heading_z - w_z heading_y.
-        of_pitch = p[P44 + h] * rz * rz - 2.0 * p[P54 + h] * ry * rz + p[P55 + h] * ry * ry
-        sums[S_X_X + h] += weight * (p[P00 + h] + x * x)
-        sums[S_X_PITCH + h] += weight * (p[P40 + h] * rz - p[P50 + h] * ry + x * rx)
-        sums[S_PITCH_PITCH + h] += weight * (of_pitch + rx * rx)
+def _add_estimate(tile: Array, h: int, weight: float, sums: Array) -> None:
+    """Add what an estimate has, by weight."""
+    x, rx, ry, rz = tile[X, h], tile[R + 2, h], tile[R + 5, h], tile[R + 8, h]
+    for k in range(3):
+        sums[S_POSITION + k] += weight * tile[X + k, h]
+        sums[S_HEADING + k] += weight * tile[R + 3 * k + 2, h]
+        sums[S_SIDE + k] += weight * tile[R + 3 * k, h]
+    sums[S_BEND] -= weight * tile[KAPPA, h] * tile[R + 1, h]
+    sums[S_CURVATURE] += weight * tile[KAPPA, h]
+    sums[S_SCALE] += weight * tile[SCALE, h]
+    # A turn w changes the heading's x by w_y heading_z - w_z heading_y.
+    y_y, z_y = tile[PLACE[E_TURN + 1, E_TURN + 1], h], tile[PLACE[E_TURN + 2, E_TURN + 1], h]
+    z_z = tile[PLACE[E_TURN + 2, E_TURN + 2], h]
+    x_pitch = tile[PLACE[E_TURN + 1, 0], h] * rz - tile[PLACE[E_TURN + 2, 0], h] * ry
+    pitch_pitch = y_y * rz * rz - 2.0 * z_y * ry * rz + z_z * ry * ry
+    sums[S_X_X] += weight * (tile[PLACE[0, 0], h] + x * x)
+    sums[S_X_PITCH] += weight * (x_pitch + x * rx)
+    sums[S_PITCH_PITCH] += weight * (pitch_pitch + rx * rx)
 
 
 @compiled
-def _total(sums: Array, row: int) -> float:
-    total = 0.0
-    for h in range(LANES):
-        total += sums[row + h]
-    return total
+def _noise_size(tile: Array, h: int, noises: Array) -> float:
+    size = 0.0
+    for m in range(NOISES):
+        size += tile[NOISE + m, h] * noises[int(tile[IS_UNIFORM, h]), 0, m]
+    return size
 
 
 @compiled
-def _fill_table(state: Array, alive: int, table: Array) -> int:
-    """Write the means of every torsion hypothesis; return which hypothesis is the heaviest."""
+def _fill_table(state: Array, first: int, end: int, whole: float, table: Array) -> None:
+    """Write the means of every torsion hypothesis."""
     table[:] = 0.0
-    whole = heaviest = 0.0
-    best = 0
-    for h in range(alive):
-        p, i = state[h // LANES], h % LANES
-        weight = p[WEIGHT + i]
-        whole += weight
-        if weight > heaviest:
-            heaviest, best = weight, h
-        row = table[int(p[KIND + i])]
-        across = weight / math.sqrt(p[R00 + i] * p[R00 + i] + p[R01 + i] * p[R01 + i])
+    for e in range(first, end):
+        tile, h = state[e // LANES], e % LANES
+        weight = tile[WEIGHT, h]
+        if weight == 0.0:
+            continue
+        row = table[int(tile[KIND, h])]
+        r00, r01 = tile[R, h], tile[R + 1, h]
+        across = weight / math.sqrt(r00 * r00 + r01 * r01)
         row[T_WEIGHT] += weight
-        row[T_ROLL] -= across * p[R01 + i]
-        row[T_AGREEMENT] += across * p[R00 + i]
-        row[T_CURVATURE] += weight * p[KAPPA + i]
-        row[T_TIP_ANGLE] += weight * p[TIP_ANGLE + i]
-        row[T_BEHIND_PLAY] += weight * p[BEHIND_PLAY + i]
-        row[T_PLAY] += weight * p[PLAY + i]
-        row[T_LAG] += weight * p[LAG + i]
+        row[T_ROLL] -= across * r01
+        row[T_AGREEMENT] += across * r00
+        row[T_CURVATURE] += weight * tile[KAPPA, h]
+        row[T_TIP_ANGLE] += weight * tile[TIP_ANGLE, h]
+        row[T_BEHIND_PLAY] += weight * tile[BEHIND_PLAY, h]
+        row[T_PLAY] += weight * tile[PLAY, h]
+        row[T_LAG] += weight * tile[LAG, h]
     for k in range(table.shape[0]):
         row = table[k]
         if row[T_WEIGHT] == 0.0:
             continue
-        per_weight = 1.0 / row[T_WEIGHT]
+        row[:T_WEIGHT] /= row[T_WEIGHT]
         across, along = row[T_ROLL], row[T_AGREEMENT]
         row[T_ROLL] = math.atan2(across, along)
-        row[T_AGREEMENT] = math.sqrt(along * along + across * across) * per_weight
-        row[T_CURVATURE] *= per_weight
-        row[T_TIP_ANGLE] *= per_weight
-        row[T_BEHIND_PLAY] *= per_weight
-        row[T_PLAY] *= per_weight
-        row[T_LAG] *= per_weight
+        row[T_AGREEMENT] = math.sqrt(along * along + across * across)
         row[T_WEIGHT] /= whole
-    return best
 
 
 @compiled
-def _elsewhere(state: Array, alive: int, best: int) -> float:
+def _elsewhere(state: Array, first: int, end: int, best: int) -> float:
     """Return the weight of hypotheses whose roll is more than 60 deg from one's."""
     top, i = state[best // LANES], best % LANES
     weight = 0.0
-    for h in range(alive):
-        p, j = state[h // LANES], h % LANES
-        along = top[R00 + i] * p[R00 + j] + top[R10 + i] * p[R10 + j] + top[R20 + i] * p[R20 + j]
+    for e in range(first, end):
+        tile, h = state[e // LANES], e % LANES
+        along = 0.0
+        for k in range(3):
+            along += top[R + 3 * k, i] * tile[R + 3 * k, h]
         if along < _AMBIGUOUS_COSINE:
-            weight += p[WEIGHT + j]
+            weight += tile[WEIGHT, h]
     return weight
 
 
@@ -269,12 +251,12 @@ def _mean_angles(axis: Array, side: Array, coordinates: Array) -> None:
     coordinates[5] = math.atan2(-(y * side_z - z * side_y), side_x)
 
 
-def mixture_covariance(bank: Bank, coordinates: Array) -> Array:
+def mixture_covariance(tiles: Tiles, coordinates: Array) -> Array:
     """Return the covariance of the mixture about its mean.
 
     Parameters
     ----------
-    bank : Bank
+    tiles : Tiles
         The estimates.
     coordinates : ndarray, shape (N, 6)
         Their mean, as `mixture` gives it.
@@ -284,23 +266,22 @@ def mixture_covariance(bank: Bank, coordinates: Array) -> Array:
     ndarray, shape (N, 6, 6)
         Of x, y, z, yaw, pitch, roll; singular coordinates at pitch +-pi/2.
     """
-    weights = rows(bank.state, WEIGHT, 1)
-    weights = weights * (np.arange(weights.shape[1]) < bank.alive[:, None])[..., None]
-    weights /= np.sum(weights, axis=1, keepdims=True)
-    rotation = rotation_from_angles(coordinates[:, None, 3:])
-    turned = rows(bank.state, R00, 9).reshape(*weights.shape[:2], 3, 3)
+    owner, firsts = tiles.owner[: tiles.first[-1]], tiles.first[:-1]
+    weights = rows(tiles, WEIGHT, 1)[:, 0]
+    weights = weights / np.add.reduceat(weights, firsts)[owner]
+    rotation = rotation_from_angles(coordinates[owner, 3:])
     # The rotation that takes the mean to each one, as a vector.
-    difference = turned @ np.swapaxes(rotation, -1, -2)
+    difference = rows(tiles, R, 9).reshape(-1, 3, 3) @ np.swapaxes(rotation, -1, -2)
     cosine = 0.5 * (np.trace(difference, axis1=-2, axis2=-1) - 1.0)
     angle = np.arccos(np.clip(cosine, -1.0, 1.0))
     scale = 0.5 / np.maximum(np.sinc(angle / np.pi), 1e-6)
-    error = np.empty((*weights.shape[:2], 6))
-    error[..., :3] = rows(bank.state, X, 3) - coordinates[:, None, :3]
-    error[..., 3] = scale * (difference[..., 2, 1] - difference[..., 1, 2])
-    error[..., 4] = scale * (difference[..., 0, 2] - difference[..., 2, 0])
-    error[..., 5] = scale * (difference[..., 1, 0] - difference[..., 0, 1])
-    of_each = covariances(bank.state)[..., :6, :6] + error[..., :, None] * error[..., None, :]
-    covariance = np.sum(weights[..., None] * of_each, axis=1)
+    error = np.empty((len(weights), 6))
+    error[:, :3] = rows(tiles, X, 3) - coordinates[owner, :3]
+    error[:, 3] = scale * (difference[:, 2, 1] - difference[:, 1, 2])
+    error[:, 4] = scale * (difference[:, 0, 2] - difference[:, 2, 0])
+    error[:, 5] = scale * (difference[:, 1, 0] - difference[:, 0, 1])
+    of_each = covariances(tiles)[:, :6, :6] + error[:, :, None] * error[:, None, :]
+    covariance = np.add.reduceat(weights[:, None, None] * of_each, firsts)
     to_angles = np.zeros_like(covariance)
     to_angles[:, :3, :3] = np.eye(3)
     to_angles[:, 3:, 3:] = np.linalg.inv(angle_axes(coordinates[:, 3:]))

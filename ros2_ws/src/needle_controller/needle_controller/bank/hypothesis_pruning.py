@@ -1,4 +1,4 @@
-"""Which of a needle's hypotheses go: the unlikely ones, and those that have become the same."""
+"""Hypotheses of a needle that have become the same become one; compiled."""
 
 # Compiled code takes keywords slowly or not at all.
 # ruff: noqa: PLR0917
@@ -9,131 +9,97 @@ import math
 import numpy as np
 
 from needle_common.compiled import compiled
-from needle_controller.bank.hypothesis_lanes import (
-    BLOCK,
+from needle_controller.bank.estimate_tiles import (
+    E_KAPPA,
+    E_SCALE,
+    E_SIZE,
+    E_TURN,
     ERROR,
+    IS_UNIFORM,
     KAPPA,
     KIND,
     LAG,
     LANES,
-    P00,
+    NOISE,
+    NOISES,
+    PLACE,
     PLAY,
-    R00,
-    R01,
-    R02,
-    R10,
-    R20,
+    SCALE,
     WEIGHT,
+    R,
+    Tiles,
     X,
-    Y,
-    Z,
 )
 from needle_controller.bank.tip_update import rotate
 from needle_controller.model.arrays import Array
 
 _SAME_LAG = 0.001
+_X_X = PLACE[0, 0]
 
 
 @compiled
-def prune(state: Array, alive: int, smallest_weight: float) -> int:
-    """End hypotheses that became unlikely; make the largest weight 1; return how many are left."""
-    largest = 0.0
-    for h in range(alive):
-        largest = max(largest, state[h // LANES, WEIGHT + h % LANES])
-    h = 0
-    while h < alive:
-        weight = state[h // LANES, WEIGHT + h % LANES] / largest
-        state[h // LANES, WEIGHT + h % LANES] = weight
-        if weight < smallest_weight:
-            alive = _remove(state, alive, h)
-        else:
-            h += 1
-    return alive
+def merge(tiles: Tiles, angle: float) -> None:
+    """Join hypotheses of the same torsion that have become the same; one of them gets weight 0.
 
-
-@compiled
-def merge(state: Array, alive: int, angle: float) -> int:
-    """Join hypotheses of the same torsion that have become the same; return how many are left."""
+    Parameters
+    ----------
+    tiles : Tiles, changed
+        The estimates of all needles.
+    angle : float
+        Between rolls that count as the same [rad].
+    """
     cosine, difference = math.cos(angle), np.empty(ERROR)
-    first = 0
-    while first < alive:
-        a, i = state[first // LANES], first % LANES
-        second = first + 1
-        while second < alive:
-            b, j = state[second // LANES], second % LANES
-            if a[KIND + i] == b[KIND + j] and _same(a, i, b, j, cosine, angle):
-                _join(a, i, b, j, difference)
-                alive = _remove(state, alive, second)
-            else:
-                second += 1
-        first += 1
-    return alive
+    for n in range(tiles.first.size - 1):
+        for first in range(tiles.first[n], tiles.first[n + 1]):
+            a, i = tiles.state[first // LANES], first % LANES
+            if a[WEIGHT, i] == 0.0:
+                continue
+            for second in range(first + 1, tiles.first[n + 1]):
+                b, j = tiles.state[second // LANES], second % LANES
+                if b[WEIGHT, j] > 0.0 and _same(a, i, b, j, cosine, angle):
+                    _join(a, i, b, j, difference)
 
 
 @compiled
 def _same(a: Array, i: int, b: Array, j: int, cosine: float, angle: float) -> bool:
     """Return whether two hypotheses are one: rolls, pitches and sizes of the torsion are near."""
-    along = a[R00 + i] * b[R00 + j] + a[R01 + i] * b[R01 + j] + a[R02 + i] * b[R02 + j]
+    if a[KIND, i] != b[KIND, j] or a[IS_UNIFORM, i] != b[IS_UNIFORM, j]:
+        return False
+    along = a[R, i] * b[R, j] + a[R + 1, i] * b[R + 1, j] + a[R + 2, i] * b[R + 2, j]
     return bool(
         along > cosine
-        and abs(a[R02 + i] - b[R02 + j]) < 0.25 * angle
-        and abs(a[PLAY + i] - b[PLAY + j]) < 0.5 * angle
-        and abs(a[LAG + i] - b[LAG + j]) < _SAME_LAG
+        and abs(a[R + 2, i] - b[R + 2, j]) < 0.25 * angle
+        and abs(a[PLAY, i] - b[PLAY, j]) < 0.5 * angle
+        and abs(a[LAG, i] - b[LAG, j]) < _SAME_LAG
+        # Else one of them has jumped.
+        and (a[X, i] - b[X, j]) ** 2 < max(a[_X_X, i], b[_X_X, j])
     )
 
 
 @compiled
 def _join(a: Array, i: int, b: Array, j: int, difference: Array) -> None:
     """Put one estimate in the place of the first of two, with their common mean and covariance."""
-    weight = a[WEIGHT + i] + b[WEIGHT + j]
-    share = b[WEIGHT + j] / weight
-    difference[0], difference[1] = b[X + j] - a[X + i], b[Y + j] - a[Y + i]
-    difference[2] = b[Z + j] - a[Z + i]
-    # R_b R_a^T, a small turn, as a vector.
-    difference[3] = 0.5 * (_row_product(b, j, R20, a, i, R10) - _row_product(b, j, R10, a, i, R20))
-    difference[4] = 0.5 * (_row_product(b, j, R00, a, i, R20) - _row_product(b, j, R20, a, i, R00))
-    difference[5] = 0.5 * (_row_product(b, j, R10, a, i, R00) - _row_product(b, j, R00, a, i, R10))
-    difference[6] = b[KAPPA + j] - a[KAPPA + i]
-    difference[7] = b[PLAY + j] - a[PLAY + i] + b[LAG + j] - a[LAG + i]
+    weight = a[WEIGHT, i] + b[WEIGHT, j]
+    share = b[WEIGHT, j] / weight
+    for k in range(3):
+        difference[k] = b[X + k, j] - a[X + k, i]
+        # R_b R_a^T, a small turn, as a vector.
+        left, right = R + 3 * ((k + 1) % 3), R + 3 * ((k + 2) % 3)
+        turn = 0.0
+        for m in range(3):
+            turn += b[right + m, j] * a[left + m, i] - b[left + m, j] * a[right + m, i]
+        difference[E_TURN + k] = 0.5 * turn
+    difference[E_KAPPA] = b[KAPPA, j] - a[KAPPA, i]
+    difference[E_SIZE] = b[PLAY, j] - a[PLAY, i] + b[LAG, j] - a[LAG, i]
+    difference[E_SCALE] = b[SCALE, j] - a[SCALE, i]
     between = share * (1.0 - share)
-    row = P00
     for k in range(ERROR):
         for m in range(k + 1):
-            a[row + i] += (
-                share * (b[row + j] - a[row + i]) + between * difference[k] * difference[m]
-            )
-            row += LANES
+            row = PLACE[k, m]
+            a[row, i] += share * (b[row, j] - a[row, i]) + between * difference[k] * difference[m]
     rotate(a, i, share * difference[3], share * difference[4], share * difference[5])
     for k in range(3):
-        a[X + k * LANES + i] += share * difference[k]
-    for row in range(KAPPA, KIND, LANES):
-        a[row + i] += share * (b[row + j] - a[row + i])
-    a[WEIGHT + i] = weight
-
-
-@compiled
-def _row_product(b: Array, j: int, row: int, a: Array, i: int, other: int) -> float:
-    """Return one element of R_b R_a^T: the product of two rows of the matrices."""
-    return float(
-        b[row + j] * a[other + i]
-        + b[row + LANES + j] * a[other + LANES + i]
-        + b[row + 2 * LANES + j] * a[other + 2 * LANES + i]
-    )
-
-
-@compiled
-def _remove(state: Array, alive: int, h: int) -> int:
-    """End a hypothesis: the last one takes its place, with the weight as it is there."""
-    last = alive - 1
-    if h != last:
-        _copy(state, last, h)
-    state[last // LANES, WEIGHT + last % LANES] = 0.0
-    return last
-
-
-@compiled
-def _copy(state: Array, source: int, target: int) -> None:
-    a, b = state[source // LANES], state[target // LANES]
-    i, j = source % LANES, target % LANES
-    for row in range(0, BLOCK, LANES):
-        b[row + j] = a[row + i]
+        a[X + k, i] += share * difference[k]
+    for row in range(KAPPA, NOISE + NOISES):
+        a[row, i] += share * (b[row, j] - a[row, i])
+    a[WEIGHT, i], b[WEIGHT, j] = weight, 0.0

@@ -1,325 +1,289 @@
-"""One measured tip into estimates: Gaussian noise, or noise within a bound; compiled.
+"""One measured tip into estimates, whatever its noise may be; compiled.
 
-Noise within a bound says only that the tip lies in a box around the measured one. The exact
-posterior of a Gaussian prior is then that Gaussian cut off outside the box; it is replaced, one
-coordinate after the other, by the Gaussian of the same mean and variance (assumed-density
-filtering; the moments of a truncated normal are closed form). A prior that lies well inside the box
-learns nothing, one at its edge much: with uniform noise that halves the error of a Kalman filter
-with the noise's variance.
-
-Gaussian noise is taken one coordinate after the other too, along directions in which it is not
-correlated. Blocks and the order of the error are those of `hypothesis_lanes`.
+Several noise models are thought possible, each uniform within a bound or normal, and besides them
+that the tip is an outlier, which says nothing. Uniform noise says that the tip lies in a box around
+the measured one: the posterior of a Gaussian prior is that Gaussian cut off outside the box.
+Coordinate after coordinate the mixture of what the models say is replaced by the Gaussian of the
+same mean and variance (assumed-density filtering; truncated normals have these in closed form). In
+the end the estimate is the mixture of that and of what it was before, by how likely the tip was an
+outlier. A correlated tip is taken along directions in which its errors are independent.
 """
 
-# Compiled code takes keywords slowly or not at all.
-# ruff: noqa: PLR0917
-# A symmetric 8 x 8 matrix is 36 lines.
-# ruff: noqa: PLR0915
 from __future__ import annotations
 
 import math
 
 from needle_common.compiled import compiled, inlined
-from needle_controller.bank.hypothesis_lanes import (
-    BLOCK,
+from needle_controller.bank.estimate_tiles import (
+    BEHIND_PLAY,
+    E_KAPPA,
+    E_SCALE,
+    E_SIZE,
+    E_TURN,
+    ERROR,
+    EVIDENCE,
+    IS_UNIFORM,
     KAPPA,
-    LANES,
-    P00,
-    P10,
-    P11,
-    P20,
-    P21,
-    P22,
-    P30,
-    P31,
-    P32,
-    P33,
-    P40,
-    P41,
-    P42,
-    P43,
-    P44,
-    P50,
-    P51,
-    P52,
-    P53,
-    P54,
-    P55,
-    P60,
-    P61,
-    P62,
-    P63,
-    P64,
-    P65,
-    P66,
-    P70,
-    P71,
-    P72,
-    P73,
-    P74,
-    P75,
-    P76,
-    P77,
-    R00,
-    R01,
-    R02,
-    R10,
-    R11,
-    R12,
-    R20,
-    R21,
-    R22,
-    SIZE_CHANGE,
-    SURPRISE,
-    TURN_X,
-    TURN_Y,
-    TURN_Z,
+    LAG,
+    NOISE,
+    NOISES,
+    OUTLIER,
+    PER_SIZE,
+    PLACE,
+    PLAY,
+    SCALE,
+    TIP_ANGLE,
     WEIGHT,
+    R,
     X,
-    Y,
-    Z,
 )
-from needle_controller.bank.normal_moments import truncated_moments
+from needle_controller.bank.filter_settings import Limits
+from needle_controller.bank.normal_moments import falling_exponential, truncated_moments
 from needle_controller.bank.tip_motion import rotation_factors
 from needle_controller.model.arrays import Array
 
-SMALLEST_MASS = 1e-7
-"""A prior with less than this in the box is taken to its edge."""
-SMALLEST_VARIANCE = 1e-18
-"""Of a measured coordinate [m^2]: an exact one would leave nothing to divide by."""
+FOUND, READ, ALONG, BOUND = 0, 1, 4, 13
+READING_ROWS = 16
+"""Rows of a tip: 1 if there is one; its three readings [m], the directions in which they were read,
+and the noise bound claimed for each [m]."""
+CHANGE, COVARIED, NARROWING, INNOVATION, VARIANCE, DEVIATION, MASS, MEAN, SQUARE, OUTSIDE, SHARE = (
+    0, 9, 36, 39, 40, 41, 42, 43, 44, 45, 46,
+)  # fmt: skip
+SPREAD = INNOVATION
+UPDATE_ROWS = SHARE + NOISES
+"""Rows of working memory: what the tip changes; each coordinate's covariances with the error, and
+by how much they narrow it; of one coordinate innovation, variance and standard deviation, and sums
+over the noise models; the density of outliers; each noise model's share.
+From `SPREAD` on, once the coordinates are done with: what multiplies a row of the covariances."""
 _SMALLEST_SHARE = 0.02
-_EDGE_SHARE = 0.5
+_NO_MASS = 1e-30
+_GIVEN_UP = 1e-3
+_REOPENED = 0.2
 _LARGEST_TURN = 1.5
+_DENSITY = 2.0 / math.sqrt(2.0 * math.pi)
 
 
 @compiled
-def take_bounded(block: Array, tip: Array, bound: float, softness: float, surprise: float) -> None:
-    """Take a tip whose coordinates are each within a bound of the truth.
-
-    The weights are multiplied by the probability of the box.
+def take_tip(tile: Array, reading: Array, noises: Array, limits: Limits, work: Array) -> None:
+    """Take a tip of each estimate's needle.
 
     Parameters
     ----------
-    block : ndarray, shape (BLOCK,), changed
-        Eight estimates.
-    tip : ndarray, shape (3,)
-        The measured tip [m].
-    bound : float
-        Half the box's edge [m].
-    softness : float
-        Variance by which the box's edges are blurred [m^2].
-    surprise : float
-        Probability, for each coordinate, of a tip that the estimate does not explain: no single tip
-        is taken as proof against it.
+    tile : ndarray, shape (ROWS, LANES), changed
+        The estimates. `EVIDENCE` becomes the tip's likelihood, relative to noise within the claimed
+        bounds, `OUTLIER` the share of it that outliers have.
+    reading : ndarray, shape (READING_ROWS, LANES)
+        The tips; where there is none nothing changes.
+    noises : ndarray, shape (2, 2, NOISES)
+        For normal and for uniform noise: sqrt(3) standard deviations of each model, or its bound,
+        as a multiple of the claimed bound; and how likely it is beforehand.
+    limits : Limits
+        What the estimates are kept to, and how many tips are outliers.
+    work : ndarray, shape (UPDATE_ROWS, LANES)
+        Working memory.
     """
-    _begin(block)
-    _take_within(block, 1.0, 0.0, 0.0, tip[0], bound, softness, surprise)
-    _take_within(block, 0.0, 1.0, 0.0, tip[1], bound, softness, surprise)
-    _take_within(block, 0.0, 0.0, 1.0, tip[2], bound, softness, surprise)
-    _end(block)
-
-
-@compiled
-def take_gaussian(block: Array, tip: Array, noise: Array) -> None:
-    """Take a tip with Gaussian noise of a given covariance: an extended Kalman filter's update.
-
-    The weights are multiplied by all of the likelihood's density but exp(-d/2), relative to a tip's
-    at the middle of its noise; d, the squared Mahalanobis distance, is written into `SURPRISE`.
-
-    Parameters
-    ----------
-    block, tip :
-        As in `take_bounded`.
-    noise : ndarray, shape (3, 3)
-        Covariance of the measured tip [m^2].
-    """
-    _begin(block)
-    # noise = L D L^T; the rows of L^-1 are the directions.
-    d0 = max(noise[0, 0], SMALLEST_VARIANCE)
-    l10, l20 = noise[1, 0] / d0, noise[2, 0] / d0
-    d1 = max(noise[1, 1] - l10 * l10 * d0, SMALLEST_VARIANCE)
-    l21 = (noise[2, 1] - l20 * l10 * d0) / d1
-    d2 = max(noise[2, 2] - l20 * l20 * d0 - l21 * l21 * d1, SMALLEST_VARIANCE)
-    x, y = tip[0], tip[1] - l10 * tip[0]
-    z = tip[2] - l21 * y - l20 * x
-    _take_with_variance(block, 1.0, 0.0, 0.0, x, d0)
-    _take_with_variance(block, -l10, 1.0, 0.0, y, d1)
-    _take_with_variance(block, l21 * l10 - l20, -l21, 1.0, z, d2)
-    _end(block)
-
-
-@compiled
-def squared_distance(block: Array, h: int, tip: Array, noise: Array) -> float:
-    """Return a tip's squared Mahalanobis distance from one estimate, coordinates one by one.
-
-    Parameters
-    ----------
-    block, tip, noise :
-        As in `take_gaussian`; only the noise's diagonal counts.
-    h : int
-        Which of the eight.
-    """
-    x, y, z = tip[0] - block[X + h], tip[1] - block[Y + h], tip[2] - block[Z + h]
-    return float(
-        x * x / (block[P00 + h] + noise[0, 0])
-        + y * y / (block[P11 + h] + noise[1, 1])
-        + z * z / (block[P22 + h] + noise[2, 2])
-    )
+    work[CHANGE : CHANGE + ERROR], work[OUTSIDE] = 0.0, 1.0
+    work[SHARE : SHARE + NOISES] = tile[NOISE : NOISE + NOISES]
+    for coordinate in range(3):
+        _look(tile, reading, coordinate, limits, work)
+        for m in range(NOISES):
+            bound = reading[BOUND + coordinate]
+            if _is_thought(tile, m, 1.0):
+                _weigh_uniform(tile, m, bound, noises[1, 0, m], work)
+            if _is_thought(tile, m, 0.0):
+                _weigh_normal(tile, m, bound, noises[0, 0, m], work)
+        _decide(coordinate, work)
+    _judge(tile, reading, noises, limits, work)
+    _narrow(tile, work)
+    _apply(tile, limits, work)
 
 
 @inlined
-def _begin(block: Array) -> None:
-    for h in range(LANES):
-        block[TURN_X + h] = block[TURN_Y + h] = block[TURN_Z + h] = 0.0
-        block[SIZE_CHANGE + h] = block[SURPRISE + h] = 0.0
-
-
-@inlined
-def _take_within(
-    block: Array,
-    ux: float,
-    uy: float,
-    uz: float,
-    measured: float,
-    bound: float,
-    softness: float,
-    surprise: float,
-) -> None:
-    """Take one coordinate, along (ux, uy, uz), within a bound."""
-    p = block
-    for h in range(LANES):
-        variance = _variance(p, h, ux, uy, uz) + softness
-        per_deviation = 1.0 / math.sqrt(variance)
-        innovation = measured - ux * p[X + h] - uy * p[Y + h] - uz * p[Z + h]
-        lower, upper = (innovation - bound) * per_deviation, (innovation + bound) * per_deviation
-        mass, mean, share = truncated_moments(lower, upper)
-        outside = mass < SMALLEST_MASS
-        share = min(max(share, _SMALLEST_SHARE), 1.0)
-        share = _EDGE_SHARE if outside else share
-        edge = lower if innovation > 0.0 else upper
-        mean = edge if outside else mean
-        mass = 0.0 if outside else mass
-        p[WEIGHT + h] *= mass + surprise * (1.0 - mass)
-        _narrow(
-            p, h, ux, uy, uz, mean * per_deviation, (1.0 - share) * (per_deviation * per_deviation)
+def _look(tile: Array, reading: Array, coordinate: int, limits: Limits, work: Array) -> None:
+    """Write innovation, variance and covariances of one coordinate; begin the sums."""
+    lanes, along, own = tile.shape[1], ALONG + 3 * coordinate, COVARIED + ERROR * coordinate
+    for k in range(ERROR):
+        x, y, z = PLACE[0, k], PLACE[1, k], PLACE[2, k]
+        for h in range(lanes):
+            work[own + k, h] = (
+                reading[along, h] * tile[x, h]
+                + reading[along + 1, h] * tile[y, h]
+                + reading[along + 2, h] * tile[z, h]
+            )
+    # What the coordinates before have narrowed.
+    for before in range(coordinate):
+        others = COVARIED + ERROR * before
+        for h in range(lanes):
+            work[MEAN, h] = work[NARROWING + before, h] * (
+                reading[along, h] * work[others, h]
+                + reading[along + 1, h] * work[others + 1, h]
+                + reading[along + 2, h] * work[others + 2, h]
+            )
+        for k in range(ERROR):
+            for h in range(lanes):
+                work[own + k, h] -= work[MEAN, h] * work[others + k, h]
+    for h in range(lanes):
+        ux, uy, uz = reading[along, h], reading[along + 1, h], reading[along + 2, h]
+        work[INNOVATION, h] = reading[READ + coordinate, h] - (
+            ux * (tile[X, h] + work[CHANGE, h])
+            + uy * (tile[X + 1, h] + work[CHANGE + 1, h])
+            + uz * (tile[X + 2, h] + work[CHANGE + 2, h])
         )
+        variance = ux * work[own, h] + uy * work[own + 1, h] + uz * work[own + 2, h]
+        bound = reading[BOUND + coordinate, h]
+        # Where nearly nothing is known there is nothing to mistrust.
+        known = bound * bound / (bound * bound + 3.0 * variance)
+        variance += limits.softness + limits.mistrust * known * variance
+        # Outliers are spread over a multiple of where the tip is expected.
+        work[OUTSIDE, h] *= math.sqrt(known)
+        work[VARIANCE, h], work[DEVIATION, h] = variance, math.sqrt(variance)
+        work[MASS, h] = work[MEAN, h] = work[SQUARE, h] = 0.0
 
 
 @inlined
-def _take_with_variance(
-    block: Array, ux: float, uy: float, uz: float, measured: float, noise: float
-) -> None:
-    """Take one coordinate, along (ux, uy, uz), with Gaussian noise of a variance."""
-    p = block
-    for h in range(LANES):
-        narrowing = 1.0 / (_variance(p, h, ux, uy, uz) + noise)
-        innovation = measured - ux * p[X + h] - uy * p[Y + h] - uz * p[Z + h]
-        p[SURPRISE + h] += innovation * innovation * narrowing
-        p[WEIGHT + h] *= math.sqrt(noise * narrowing)
-        _narrow(p, h, ux, uy, uz, innovation * narrowing, narrowing)
+def _is_thought(tile: Array, m: int, is_uniform: float) -> bool:
+    """Return whether any estimate that has not ended thinks a noise model possible."""
+    for h in range(tile.shape[1]):
+        if tile[NOISE + m, h] * tile[WEIGHT, h] > 0.0 and tile[IS_UNIFORM, h] == is_uniform:
+            return True
+    return False
 
 
 @inlined
-def _variance(p: Array, h: int, ux: float, uy: float, uz: float) -> float:
-    along_x = ux * p[P00 + h] + 2.0 * (uy * p[P10 + h] + uz * p[P20 + h])
-    along_y = uy * p[P11 + h] + 2.0 * uz * p[P21 + h]
-    return float(ux * along_x + uy * along_y + uz * uz * p[P22 + h])
+def _weigh_uniform(tile: Array, m: int, bound: Array, multiple: float, work: Array) -> None:
+    """Add what a uniform noise model says of a coordinate, by how likely it is."""
+    for h in range(tile.shape[1]):
+        per_deviation = 1.0 / work[DEVIATION, h]
+        innovation, limit = work[INNOVATION, h], multiple * bound[h]
+        mass, mean, variance = truncated_moments(
+            (innovation - limit) * per_deviation, (innovation + limit) * per_deviation
+        )
+        weight = tile[IS_UNIFORM, h] * work[SHARE + m, h] * mass / multiple
+        work[SHARE + m, h] = weight if tile[IS_UNIFORM, h] > 0.0 else work[SHARE + m, h]
+        work[MASS, h] += weight
+        work[MEAN, h] += weight * mean
+        work[SQUARE, h] += weight * (variance + mean * mean)
 
 
 @inlined
-def _narrow(
-    p: Array, h: int, ux: float, uy: float, uz: float, shift: float, narrowing: float
-) -> None:
-    """Shift an estimate by its covariance with a coordinate, and take that's square off."""
-    c0 = ux * p[P00 + h] + uy * p[P10 + h] + uz * p[P20 + h]
-    c1 = ux * p[P10 + h] + uy * p[P11 + h] + uz * p[P21 + h]
-    c2 = ux * p[P20 + h] + uy * p[P21 + h] + uz * p[P22 + h]
-    c3 = ux * p[P30 + h] + uy * p[P31 + h] + uz * p[P32 + h]
-    c4 = ux * p[P40 + h] + uy * p[P41 + h] + uz * p[P42 + h]
-    c5 = ux * p[P50 + h] + uy * p[P51 + h] + uz * p[P52 + h]
-    c6 = ux * p[P60 + h] + uy * p[P61 + h] + uz * p[P62 + h]
-    c7 = ux * p[P70 + h] + uy * p[P71 + h] + uz * p[P72 + h]
-    p[X + h] += c0 * shift
-    p[Y + h] += c1 * shift
-    p[Z + h] += c2 * shift
-    p[TURN_X + h] += c3 * shift
-    p[TURN_Y + h] += c4 * shift
-    p[TURN_Z + h] += c5 * shift
-    p[KAPPA + h] += c6 * shift
-    p[SIZE_CHANGE + h] += c7 * shift
-    scaled = c0 * narrowing
-    p[P00 + h] -= scaled * c0
-    scaled = c1 * narrowing
-    p[P10 + h] -= scaled * c0
-    p[P11 + h] -= scaled * c1
-    scaled = c2 * narrowing
-    p[P20 + h] -= scaled * c0
-    p[P21 + h] -= scaled * c1
-    p[P22 + h] -= scaled * c2
-    scaled = c3 * narrowing
-    p[P30 + h] -= scaled * c0
-    p[P31 + h] -= scaled * c1
-    p[P32 + h] -= scaled * c2
-    p[P33 + h] -= scaled * c3
-    scaled = c4 * narrowing
-    p[P40 + h] -= scaled * c0
-    p[P41 + h] -= scaled * c1
-    p[P42 + h] -= scaled * c2
-    p[P43 + h] -= scaled * c3
-    p[P44 + h] -= scaled * c4
-    scaled = c5 * narrowing
-    p[P50 + h] -= scaled * c0
-    p[P51 + h] -= scaled * c1
-    p[P52 + h] -= scaled * c2
-    p[P53 + h] -= scaled * c3
-    p[P54 + h] -= scaled * c4
-    p[P55 + h] -= scaled * c5
-    scaled = c6 * narrowing
-    p[P60 + h] -= scaled * c0
-    p[P61 + h] -= scaled * c1
-    p[P62 + h] -= scaled * c2
-    p[P63 + h] -= scaled * c3
-    p[P64 + h] -= scaled * c4
-    p[P65 + h] -= scaled * c5
-    p[P66 + h] -= scaled * c6
-    scaled = c7 * narrowing
-    p[P70 + h] -= scaled * c0
-    p[P71 + h] -= scaled * c1
-    p[P72 + h] -= scaled * c2
-    p[P73 + h] -= scaled * c3
-    p[P74 + h] -= scaled * c4
-    p[P75 + h] -= scaled * c5
-    p[P76 + h] -= scaled * c6
-    p[P77 + h] -= scaled * c7
+def _weigh_normal(tile: Array, m: int, bound: Array, multiple: float, work: Array) -> None:
+    """Add what a normal noise model says of a coordinate, by how likely it is."""
+    for h in range(tile.shape[1]):
+        variance, innovation = work[VARIANCE, h], work[INNOVATION, h]
+        noise = multiple * bound[h]
+        per_variance = 1.0 / (variance + noise * noise / 3.0)
+        bell = falling_exponential(-0.5 * innovation * innovation * per_variance)
+        density = _DENSITY * bound[h] * math.sqrt(per_variance) * bell
+        weight = (1.0 - tile[IS_UNIFORM, h]) * work[SHARE + m, h] * density
+        mean = work[DEVIATION, h] * innovation * per_variance
+        work[SHARE + m, h] = work[SHARE + m, h] if tile[IS_UNIFORM, h] > 0.0 else weight
+        work[MASS, h] += weight
+        work[MEAN, h] += weight * mean
+        work[SQUARE, h] += weight * (1.0 - variance * per_variance + mean * mean)
 
 
 @inlined
-def _end(block: Array) -> None:
-    """Turn the orientations by what was collected; a single tip turns none by more than 1.5 rad."""
-    # Were the number of lanes known, the compiler would unroll the loop and do one after the other.
-    for h in range(block.size // (BLOCK // LANES)):
-        rotate(block, h, block[TURN_X + h], block[TURN_Y + h], block[TURN_Z + h])
+def _decide(coordinate: int, work: Array) -> None:
+    """Take one coordinate's mean and variance over the noise models."""
+    lanes, own = work.shape[1], COVARIED + ERROR * coordinate
+    for h in range(lanes):
+        per_mass = 1.0 / max(work[MASS, h], _NO_MASS)
+        mean = work[MEAN, h] * per_mass
+        share = work[SQUARE, h] * per_mass - mean * mean
+        share = min(max(share, _SMALLEST_SHARE), 1.0)
+        work[MEAN, h] = mean / work[DEVIATION, h]
+        work[NARROWING + coordinate, h] = (1.0 - share) / work[VARIANCE, h]
+    for k in range(ERROR):
+        for h in range(lanes):
+            work[CHANGE + k, h] += work[own + k, h] * work[MEAN, h]
 
 
 @inlined
-def rotate(p: Array, h: int, x: float, y: float, z: float) -> None:
+def _judge(tile: Array, reading: Array, noises: Array, limits: Limits, work: Array) -> None:
+    """Say how likely the tip was, how likely an outlier, and what it shows of the noise."""
+    for h in range(tile.shape[1]):
+        outlier = limits.outlier_share * limits.outlier_density * work[OUTSIDE, h]
+        evidence = outlier
+        for m in range(NOISES):
+            work[SHARE + m, h] *= 1.0 - limits.outlier_share
+            evidence += work[SHARE + m, h]
+        share = outlier / evidence
+        family, kept = int(tile[IS_UNIFORM, h]), 0.0
+        for m in range(NOISES):
+            likely = work[SHARE + m, h] / evidence + share * tile[NOISE + m, h]
+            # A surprise opens the question of the noise again.
+            likely += _REOPENED * share * (noises[family, 1, m] - likely)
+            likely = likely if likely > _GIVEN_UP else 0.0
+            work[SHARE + m, h] = likely
+            kept += likely
+        is_found = reading[FOUND, h] > 0.0
+        for m in range(NOISES):
+            likely = work[SHARE + m, h] / kept
+            tile[NOISE + m, h] = likely if is_found else tile[NOISE + m, h]
+        tile[EVIDENCE, h] = evidence
+        tile[OUTLIER, h] = share if is_found else 1.0
+
+
+@inlined
+def _narrow(tile: Array, work: Array) -> None:
+    """Narrow the covariance; mix with what was before, by how likely the tip was an outlier."""
+    lanes = tile.shape[1]
+    for a in range(ERROR):
+        for h in range(lanes):
+            inside = 1.0 - tile[OUTLIER, h]
+            for i in range(3):
+                by = inside * work[NARROWING + i, h]
+                work[SPREAD + i, h] = by * work[COVARIED + ERROR * i + a, h]
+            work[SPREAD + 3, h] = inside * tile[OUTLIER, h] * work[CHANGE + a, h]
+        for b in range(a + 1):
+            row = PLACE[a, b]
+            for h in range(lanes):
+                tile[row, h] += work[SPREAD + 3, h] * work[CHANGE + b, h] - (
+                    work[SPREAD, h] * work[COVARIED + b, h]
+                    + work[SPREAD + 1, h] * work[COVARIED + ERROR + b, h]
+                    + work[SPREAD + 2, h] * work[COVARIED + 2 * ERROR + b, h]
+                )
+    for k in range(ERROR):
+        for h in range(lanes):
+            work[CHANGE + k, h] *= 1.0 - tile[OUTLIER, h]
+
+
+@inlined
+def _apply(tile: Array, limits: Limits, work: Array) -> None:
+    """Change the estimates; a torsion's size has turned the tip all along."""
+    for h in range(tile.shape[1]):
+        for k in range(3):
+            tile[X + k, h] += work[CHANGE + k, h]
+        kappa = tile[KAPPA, h] + work[CHANGE + E_KAPPA, h]
+        tile[KAPPA, h] = min(max(kappa, limits.smallest_curvature), limits.largest_curvature)
+        tile[SCALE, h] += work[CHANGE + E_SCALE, h]
+        change, lag, play = work[CHANGE + E_SIZE, h], tile[LAG, h], tile[PLAY, h]
+        has_lag, has_changed = lag > 0.0, change != 0.0
+        new_lag = min(max(lag + change, limits.smallest_lag), limits.largest_lag)
+        new_play = min(max(play + change, 0.0), limits.largest_play)
+        turn = tile[PER_SIZE, h] * (new_lag - lag if has_lag else new_play - play)
+        tip = tile[TIP_ANGLE, h] + turn
+        tile[TIP_ANGLE, h] = tip if has_changed else tile[TIP_ANGLE, h]
+        tile[LAG, h] = new_lag if has_changed and has_lag else lag
+        tile[PLAY, h] = new_play if has_changed and not has_lag else play
+        behind = tile[BEHIND_PLAY, h]
+        tile[BEHIND_PLAY, h] = tip if has_changed and not has_lag else behind
+    for h in range(tile.shape[1]):
+        rotate(tile, h, work[E_TURN, h], work[E_TURN + 1, h], work[E_TURN + 2, h])
+
+
+@inlined
+def rotate(tile: Array, h: int, x: float, y: float, z: float) -> None:
     """Turn an orientation by a vector in `target_plane`, 1.5 rad at most: R <- exp(v^) R."""
     squared = x * x + y * y + z * z
     scale = _LARGEST_TURN / math.sqrt(max(squared, _LARGEST_TURN * _LARGEST_TURN))
     x, y, z = scale * x, scale * y, scale * z
     a, b, _ = rotation_factors(scale * scale * squared)
-    e00, e01, e02 = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
-    e10, e11, e12 = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
-    e20, e21, e22 = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
-    r0, r1, r2 = p[R00 + h], p[R10 + h], p[R20 + h]
-    p[R00 + h] = e00 * r0 + e01 * r1 + e02 * r2
-    p[R10 + h] = e10 * r0 + e11 * r1 + e12 * r2
-    p[R20 + h] = e20 * r0 + e21 * r1 + e22 * r2
-    r0, r1, r2 = p[R01 + h], p[R11 + h], p[R21 + h]
-    p[R01 + h] = e00 * r0 + e01 * r1 + e02 * r2
-    p[R11 + h] = e10 * r0 + e11 * r1 + e12 * r2
-    p[R21 + h] = e20 * r0 + e21 * r1 + e22 * r2
-    r0, r1, r2 = p[R02 + h], p[R12 + h], p[R22 + h]
-    p[R02 + h] = e00 * r0 + e01 * r1 + e02 * r2
-    p[R12 + h] = e10 * r0 + e11 * r1 + e12 * r2
-    p[R22 + h] = e20 * r0 + e21 * r1 + e22 * r2
+    for column in range(3):
+        r0, r1, r2 = tile[R + column, h], tile[R + 3 + column, h], tile[R + 6 + column, h]
+        across = x * r0 + y * r1 + z * r2
+        # v x (v x r) = v (v r) - r v^2.
+        square = scale * scale * squared
+        tile[R + column, h] = r0 + a * (y * r2 - z * r1) + b * (x * across - square * r0)
+        tile[R + 3 + column, h] = r1 + a * (z * r0 - x * r2) + b * (y * across - square * r1)
+        tile[R + 6 + column, h] = r2 + a * (x * r1 - y * r0) + b * (z * across - square * r2)

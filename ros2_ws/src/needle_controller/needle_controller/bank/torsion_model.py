@@ -67,7 +67,8 @@ def turn_tip(
     part = 0.5 * ramp if short else 1.0 - (1.0 - ramp_decay) / long_ramp
     slope = -0.5 * ramp if short else (ramp_decay * (1.0 + ramp) - 1.0) / long_ramp
     by_lag = (per_size + distance * length / (lag * lag)) * decay + change * slope / lag
-    lagged = behind_play + distance * decay + change * part
+    # Without insertion nothing follows, to the last bit.
+    lagged = behind_play + distance * decay + change * part if length > 0.0 else tip
     has_lag = lag_length > 0.0
     return (
         lagged if has_lag else behind,

@@ -18,11 +18,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated
 
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 from needle_controller.curvature.insertion_arc import (
     BEND,
     ENTRY,
@@ -46,6 +48,7 @@ _ARBITRARY_START = 1e-3
 _MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
 # Units in which the unknowns are of one size.
 _SCALE: Array = np.array([1.0, 1.0, 1.0, 20.0, 20.0, 1e3, 1e3])
+_HEADING_STD = math.radians(5.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,28 +77,16 @@ class CurvatureFitSettings:
     """
 
     heading: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    heading_std: float = math.radians(5.0)
+    heading_std: Annotated[float, Bounds(ABOVE_0, math.inf, "rad", unlimited=True)] = _HEADING_STD
     entry: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    entry_std: float = 0.0005
-    measurement_std: float | None = None
-    outlier_limit: float = 4.0
-    repeating_error: float = 0.0
+    entry_std: Annotated[float, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = 0.0005
+    measurement_std: Annotated[float | None, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = None
+    outlier_limit: Annotated[float, Bounds(ABOVE_0, math.inf, "-", unlimited=True)] = 4.0
+    repeating_error: Annotated[float, Bounds(0.0, math.inf, "m")] = 0.0
 
     def __post_init__(self) -> None:
         """Check every field; raises OutOfBoundsError or UserError with the value."""
-        tiny = float(np.nextafter(0.0, 1.0))
-        checked = [
-            ("heading_std", self.heading_std, "rad"),
-            ("entry_std", self.entry_std, "m"),
-            ("outlier_limit", self.outlier_limit, "-"),
-        ]
-        if self.measurement_std is not None:
-            checked.append(("measurement_std", self.measurement_std, "m"))
-        for name, value, unit in checked:
-            if not value >= tiny:
-                raise OutOfBoundsError(name, value, tiny, math.inf, unit)
-        if not 0.0 <= self.repeating_error < math.inf:
-            raise OutOfBoundsError("repeating_error", self.repeating_error, 0.0, math.inf, "m")
+        check_bounded_fields(self)
         if not abs(float(np.linalg.norm(self.heading)) - 1.0) < 1e-6:
             raise UserError(f"heading = {self.heading} is not of unit length")
         if not np.all(np.isfinite(self.entry)):

@@ -84,32 +84,5 @@ class FlipPlan:
         done = np.searchsorted(np.asarray(self.depths, dtype=float), reached, side="right")
         return np.asarray(np.where(done % 2 == 0, self.first_sign, -self.first_sign))
 
-    def next_flip(self, insertion: float) -> float:
-        """Return the depth of the next flip [m], infinite if there is none."""
-        ahead = [depth for depth in self.depths if depth > insertion + DEPTH_TOLERANCE]
-        return ahead[0] if ahead else math.inf
-
 
 DEPTH_TOLERANCE = 1e-6
-
-
-def evenly_spaced_flips(count: int, depth: float) -> FlipPlan:
-    """Return a plan of flips that divide a depth into `count` + 1 equal parts.
-
-    Parameters
-    ----------
-    count : int
-        Number of flips, >= 0.
-    depth : float
-        Insertion at which steering ends [m].
-
-    Raises
-    ------
-    OutOfBoundsError
-        A negative count, or a depth that is not above 0.
-    """
-    if count < 0:
-        raise OutOfBoundsError("flips", count, 0, math.inf, "-")
-    if not 0.0 < depth < math.inf:
-        raise OutOfBoundsError("depth", depth, float(np.nextafter(0.0, 1.0)), math.inf, "m")
-    return FlipPlan(tuple(depth * (i + 1) / (count + 1) for i in range(count)))

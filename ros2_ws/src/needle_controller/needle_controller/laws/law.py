@@ -16,7 +16,7 @@ from needle_controller.observers.luenberger_steps import demand_states
 
 
 @dataclasses.dataclass(frozen=True)
-class Command:
+class SteeringCommand:
     """What the law wants over the next step.
 
     Attributes
@@ -25,20 +25,24 @@ class Command:
         v [1/m^2], as wanted by (10), before what limits the rotation.
     rotation_rate : ndarray, shape (...)
         u, rotation of the base per inserted length, after all limits [rad/m].
+    insertion_left : ndarray, shape (...), optional
+        Insertion after which the needle is there, < 0 beyond it [m]; None from a law that does not
+        say: then the depth does.
     """
 
     virtual_input: Array
     rotation_rate: Array
+    insertion_left: Array | None = None
 
 
-StepLaw = Callable[[Estimate, float], Command]
+StepLaw = Callable[[Estimate, float], SteeringCommand]
 """Takes the estimate and the insertion it is of [m]."""
 
 
 class Law(Protocol):
     """A control law: called once per step."""
 
-    def __call__(self, estimate: Estimate) -> Command:
+    def __call__(self, estimate: Estimate) -> SteeringCommand:
         """Return the rotation rate to hold over the next step."""
 
 
@@ -69,7 +73,7 @@ class LinearizingLaw:
     demand_margin: float
     max_rotation_per_length: float
 
-    def __call__(self, estimate: Estimate) -> Command:
+    def __call__(self, estimate: Estimate) -> SteeringCommand:
         """Return the rotation rate to hold over the next step."""
         s, length, curvature = estimate.linearized, self.step_length, estimate.curvature
         v = np.asarray(-(s @ self.feedback))
@@ -86,13 +90,13 @@ class LinearizingLaw:
         drift = -curvature * cosines * s[..., 1] / (1.0 - squared)
         limit = self.max_rotation_per_length
         rate = np.clip((wanted_roll - roll) / length - drift, -limit, limit)
-        return Command(v, np.asarray(rate))
+        return SteeringCommand(v, np.asarray(rate))
 
 
 class OpenLoopLaw:
     """u = 0: the needle bends as it will; v says what that does to s3."""
 
-    def __call__(self, estimate: Estimate) -> Command:
+    def __call__(self, estimate: Estimate) -> SteeringCommand:
         """Return no rotation."""
         rate = np.zeros(estimate.coordinates.shape[:-1])
-        return Command(virtual_input(estimate.reduced, rate, estimate.curvature), rate)
+        return SteeringCommand(virtual_input(estimate.reduced, rate, estimate.curvature), rate)

@@ -5,11 +5,12 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 
 from needle_common.compiled import compiled
+from needle_common.settings.bounds import Bounds
 from needle_controller.bank.hypothesis_mixture import (
     T_AGREEMENT,
     T_BEHIND_PLAY,
@@ -27,27 +28,68 @@ _USUAL_LAG = 0.008
 _USUAL_PLAY = math.radians(40.0)
 
 
-class RollLawNumbers(NamedTuple):
-    """`RollLawSettings` for the compiled code."""
+class RollLawSettings(NamedTuple):
+    """What the roll law is made of.
 
-    step_length: float
-    max_rotation_per_length: float
-    max_winding: float
-    plane_gain: float
-    pitch_gain: float
-    braking_share: float
-    braking_share_added: float
-    braking_from: float
-    braking_over: float
-    lag_caution: float
-    braking_caution: float
-    doubt: float
-    scatter_dead_band: float
-    near: float
-    near_dead_band: float
-    far_dead_band: float
-    largest_turn: float
-    smallest_weight: float
+    Attributes
+    ----------
+    step_length : float
+        Inserted length over which a command is held [m].
+    max_rotation_per_length : float
+        Most the base turns per inserted length [rad/m].
+    max_winding : float
+        The base's angle is kept within +- this: the turn then goes the other way round [rad].
+    plane_gain : float
+        Wanted sin(pitch) per distance from the plane, near it [1/m].
+    pitch_gain : float
+        Wanted s3 per error of sin(pitch) [1/m].
+    braking_share : float
+        Share of the curvature that the approach counts on for levelling out.
+    braking_share_added : float
+        What is added to it far from the plane.
+    braking_from, braking_over : float
+        Distance at which that begins, and over which it grows to the whole [m].
+    lag_caution : float
+        Share by which both gains are lowered at a lag of 8 mm.
+    braking_caution : float
+        Share by which the braking share is lowered at a lag of 8 mm or a play of 40 deg.
+    doubt : float
+        How much the demand on s3 shrinks with the uncertainty of what it is made of: by 1 /
+        sqrt(1 + (doubt std(s3 demand) / curvature)^2). Without it, a needle whose pitch is hardly
+        known is spun to and fro, which hides its roll.
+    scatter_dead_band : float
+        What is added to the dead band where the hypotheses' rolls point everywhere, in proportion
+        to how little they agree: a needle that is left alone shows its roll soonest [rad].
+    near : float
+        Distance from the plane within which `near_dead_band` holds [m].
+    near_dead_band, far_dead_band : float
+        Errors of the roll that are left alone, which saves rotation [rad].
+    largest_turn : float
+        Most that a single hypothesis asks of a step, before the mean [rad].
+    smallest_weight : float
+        Hypotheses that weigh less than this share of the heaviest have no say in the turn.
+    """
+
+    step_length: Annotated[float, Bounds(1e-5, 0.1, "m")] = 0.001
+    max_rotation_per_length: Annotated[float, Bounds(0.0, 1e5, "rad/m")] = (
+        math.radians(30.0) / 0.001
+    )
+    max_winding: Annotated[float, Bounds(2.0 * math.pi, 1e6, "rad")] = 6.0 * math.pi
+    plane_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 120.0
+    pitch_gain: Annotated[float, Bounds(0.0, 1e5, "1/m")] = 200.0
+    braking_share: Annotated[float, Bounds(0.01, 2.0, "-")] = 0.5
+    braking_share_added: Annotated[float, Bounds(0.0, 2.0, "-")] = 0.5
+    braking_from: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0025
+    braking_over: Annotated[float, Bounds(1e-6, 1.0, "m")] = 0.003
+    lag_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.45
+    braking_caution: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.5
+    doubt: Annotated[float, Bounds(0.0, 10.0, "-")] = 1.0
+    scatter_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 1.0
+    near: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.0005
+    near_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.25
+    far_dead_band: Annotated[float, Bounds(0.0, math.pi, "rad")] = 0.15
+    largest_turn: Annotated[float, Bounds(0.01, 100.0, "rad")] = 2.0
+    smallest_weight: Annotated[float, Bounds(0.0, 1.0, "-")] = 0.02
 
 
 @compiled
@@ -58,7 +100,7 @@ def roll_turns(
     wound: Array,
     bend_sign: Array,
     uncertainty: Array,
-    numbers: RollLawNumbers,
+    settings: RollLawSettings,
     turn: Array,
     wanted: Array,
 ) -> None:
@@ -74,31 +116,31 @@ def roll_turns(
         Wanted sign of cos(roll); 0 is either.
     uncertainty : ndarray, shape (N, 3)
         See `Hypotheses`.
-    numbers : RollLawNumbers
+    settings : RollLawSettings
         The settings.
     turn, wanted : ndarray, shape (N,), written
         The results.
     """
-    limit = numbers.max_rotation_per_length * numbers.step_length
+    limit = settings.max_rotation_per_length * settings.step_length
     for n in range(table.shape[0]):
         x, pitch = state[n, 0], state[n, 1]
         heaviest = np.max(table[n, :, T_WEIGHT])
         turns = weights = s3_mean = 0.0
         for k in range(table.shape[1]):
             row = table[n, k]
-            if row[T_WEIGHT] < numbers.smallest_weight * heaviest or row[T_WEIGHT] == 0.0:
+            if row[T_WEIGHT] < settings.smallest_weight * heaviest or row[T_WEIGHT] == 0.0:
                 continue
             weight = row[T_WEIGHT]
-            s3, sine = wanted_bend(x, pitch, uncertainty[n], row, numbers)
-            tip_turn = nearest_turn(row[T_ROLL], sine, bend_sign[n], wound[n], numbers.max_winding)
-            dead_band = numbers.near_dead_band
-            if abs(x) > numbers.near:
-                dead_band = numbers.far_dead_band
-            dead_band += numbers.scatter_dead_band * (1.0 - row[T_AGREEMENT])
+            s3, sine = wanted_bend(x, pitch, uncertainty[n], row, settings)
+            tip_turn = nearest_turn(row[T_ROLL], sine, bend_sign[n], wound[n], settings.max_winding)
+            dead_band = settings.near_dead_band
+            if abs(x) > settings.near:
+                dead_band = settings.far_dead_band
+            dead_band += settings.scatter_dead_band * (1.0 - row[T_AGREEMENT])
             if abs(tip_turn) < dead_band:
                 tip_turn = 0.0
-            asked = base_turn(row, tip_turn, base[n], numbers.step_length)
-            turns += weight * min(max(asked, -numbers.largest_turn), numbers.largest_turn)
+            asked = base_turn(row, tip_turn, base[n], settings.step_length)
+            turns += weight * min(max(asked, -settings.largest_turn), settings.largest_turn)
             s3_mean += weight * s3
             weights += weight
         turn[n] = min(max(turns / weights, -limit), limit)
@@ -107,7 +149,7 @@ def roll_turns(
 
 @compiled
 def wanted_bend(
-    x: float, sin_pitch: float, uncertainty: Array, row: Array, numbers: RollLawNumbers
+    x: float, sin_pitch: float, uncertainty: Array, row: Array, settings: RollLawSettings
 ) -> tuple[float, float]:
     """Return the wanted s3 [1/m] and the sine of the roll that has it.
 
@@ -119,30 +161,30 @@ def wanted_bend(
         Of both, see `Hypotheses`.
     row : ndarray, shape (8,)
         A hypothesis, see `Hypotheses`.
-    numbers : RollLawNumbers
+    settings : RollLawSettings
         The settings.
     """
     curvature = row[T_CURVATURE]
     lag = min(row[T_LAG] / _USUAL_LAG, 1.0)
-    caution = 1.0 - numbers.lag_caution * lag
+    caution = 1.0 - settings.lag_caution * lag
     distance = abs(x)
-    far = min(max((distance - numbers.braking_from) / numbers.braking_over, 0.0), 1.0)
-    share = numbers.braking_share + numbers.braking_share_added * far
-    share *= 1.0 - numbers.braking_caution * min(lag + row[T_PLAY] / _USUAL_PLAY, 1.0)
+    far = min(max((distance - settings.braking_from) / settings.braking_over, 0.0), 1.0)
+    share = settings.braking_share + settings.braking_share_added * far
+    share *= 1.0 - settings.braking_caution * min(lag + row[T_PLAY] / _USUAL_PLAY, 1.0)
     # Level out on an arc of curvature share kappa: sin(pitch)^2 = 2 share kappa distance.
     steepest = math.sqrt(2.0 * share * curvature * distance)
-    slope = numbers.plane_gain * caution
+    slope = settings.plane_gain * caution
     descent = slope * distance
     if descent > steepest:
         descent = steepest
         slope = 0.5 * steepest / distance
     wanted_pitch = -descent if x > 0.0 else descent
     steerable = curvature * math.sqrt(max(1e-6, 1.0 - sin_pitch * sin_pitch))
-    gain = numbers.pitch_gain * caution
+    gain = settings.pitch_gain * caution
     variance = uncertainty[2] + slope * (2.0 * uncertainty[1] + slope * uncertainty[0])
     # Standard deviation of the demand as a share of what steering can do.
     doubt = gain / steerable * math.sqrt(max(variance, 0.0))
-    gain /= math.sqrt(1.0 + (numbers.doubt * doubt) ** 2)
+    gain /= math.sqrt(1.0 + (settings.doubt * doubt) ** 2)
     s3 = gain * (wanted_pitch - sin_pitch)
     s3 = min(max(s3, -steerable), steerable)
     return s3, min(max(s3 / steerable, -1.0), 1.0)
@@ -175,17 +217,35 @@ def nearest_turn(
         if bend_sign < 0.0 and side == 0:
             continue
         wanted = upright if side == 0 else math.pi - upright
-        turn = (wanted - roll + math.pi) % (2.0 * math.pi) - math.pi
-        for way in range(2):
-            if way == 1:
-                turn -= math.copysign(2.0 * math.pi, turn)
-            cost = abs(turn)
-            over = abs(wound + turn) - max_winding
-            if over > 0.0:
-                cost += 10.0 + over
-            if cost < cheapest:
-                best, cheapest = turn, cost
+        turn, cost = allowed_turn(wanted - roll, wound, max_winding)
+        if cost < cheapest:
+            best, cheapest = turn, cost
     return best
+
+
+@compiled
+def allowed_turn(turn: float, wound: float, max_winding: float) -> tuple[float, float]:
+    """Return the shorter way to an angle that the winding allows, and its cost [rad].
+
+    Parameters
+    ----------
+    turn : float
+        To the angle, by any way [rad].
+    wound, max_winding : float
+        See `nearest_turn`.
+    """
+    way = (turn + math.pi) % (2.0 * math.pi) - math.pi
+    best = cheapest = math.inf
+    for k in range(2):
+        if k == 1:
+            way -= math.copysign(2.0 * math.pi, way)
+        cost = abs(way)
+        over = abs(wound + way) - max_winding
+        if over > 0.0:
+            cost += 10.0 + over
+        if cost < cheapest:
+            best, cheapest = way, cost
+    return best, cheapest
 
 
 @compiled

@@ -8,7 +8,6 @@ broadcast.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -70,22 +69,6 @@ class RelativeMotion:
     shift_slope: Array
     rotation_slope: Array
 
-    def then(self, other: RelativeMotion) -> RelativeMotion:
-        """Return this motion followed by another."""
-        turned = np.cross(self.rotation_slope, other.shift) + other.shift_slope
-        back = np.swapaxes(other.rotation, -1, -2)
-        return RelativeMotion(
-            shift=self.shift + _apply(self.rotation, other.shift),
-            rotation=self.rotation @ other.rotation,
-            shift_slope=self.shift_slope + _apply(self.rotation, turned),
-            rotation_slope=_apply(back, self.rotation_slope) + other.rotation_slope,
-        )
-
-
-def no_motion() -> RelativeMotion:
-    """Return the motion that leads nowhere."""
-    return RelativeMotion(np.zeros(3), np.eye(3), np.zeros(3), np.zeros(3))
-
 
 def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) -> RelativeMotion:
     """Return the tip's motion over one advance; negative arguments take it back.
@@ -133,56 +116,6 @@ def arc(length: npt.ArrayLike, turn: npt.ArrayLike, curvature: npt.ArrayLike) ->
         shift_slope=slope * (inserted**2)[..., None],
         rotation_slope=turning * inserted[..., None],
     )
-
-
-class InputHistory:
-    """What was inserted and turned lately, for tips that come late.
-
-    Parameters
-    ----------
-    most : int
-        Advances that are kept.
-    """
-
-    def __init__(self, most: int = 64) -> None:
-        self._most = most
-        self._inputs: list[tuple[Array, Array]] = []
-
-    def clear(self) -> None:
-        """Forget all."""
-        self._inputs = []
-
-    def add(self, length: Array, turn: Array) -> None:
-        """Keep one advance [m], [rad]."""
-        self._inputs.append((length, turn))
-        del self._inputs[: -self._most]
-
-    def back(self, age: Array) -> Iterator[tuple[Array, Array]]:
-        """Yield (length, turn) that take the tip back by `age` [m], newest first, both negated.
-
-        What only turned at the place of exposure is not taken back.
-        """
-        left = age
-        for length, turn in reversed(self._inputs):
-            if not np.any(left > 0.0):
-                return
-            take = np.clip(length, 0.0, np.maximum(left, 0.0))
-            share = np.where(
-                length > 0.0, take / np.where(length > 0.0, length, 1.0), np.where(left > 0, 1.0, 0)
-            )
-            yield -take, -share * turn
-            left = left - take
-
-    def motion_back(self, age: Array, curvature: Array) -> RelativeMotion:
-        """Return the motion from the tip now to the tip `age` ago [m]."""
-        motion = no_motion()
-        for length, turn in self.back(age):
-            motion = motion.then(arc(length, turn, curvature))
-        return motion
-
-
-def _apply(matrix: Array, vector: Array) -> Array:
-    return np.asarray(np.einsum("...ij,...j->...i", matrix, vector))
 
 
 def _factors(squared: Array) -> tuple[Array, Array, Array]:

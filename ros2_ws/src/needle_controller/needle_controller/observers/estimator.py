@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
@@ -32,6 +33,10 @@ class Estimate:
         What a user should know of this estimate; empty as a rule.
     covariance_of : callable
         Returns `covariance`; studies of many needles do not pay for what they do not read.
+    doubtful : ndarray of bool, shape (...), optional
+        Whether the estimate cannot be relied on; None from an estimator that never says so.
+    doubts : tuple of str
+        Why not; of any of the needles.
     """
 
     coordinates: Array
@@ -39,6 +44,8 @@ class Estimate:
     curvature: Array
     warnings: tuple[str, ...]
     covariance_of: Callable[[], Array] = dataclasses.field(repr=False)
+    doubtful: npt.NDArray[np.bool_] | None = dataclasses.field(default=None, kw_only=True)
+    doubts: tuple[str, ...] = dataclasses.field(default=(), kw_only=True)
 
     @property
     def reduced(self) -> Array:

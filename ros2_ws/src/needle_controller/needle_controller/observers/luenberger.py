@@ -19,7 +19,6 @@ from needle_controller.model.feedback_linearization import (
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.kinematics import YAW, angles_from_rotation, rotation_from_angles
 from needle_controller.observers.estimator import Estimate
-from needle_controller.observers.innovation_gate import InnovationGate
 from needle_controller.observers.luenberger_steps import advance_states, correct_states
 from needle_controller.observers.saturation import saturate
 
@@ -42,9 +41,6 @@ class LuenbergerSettings:
         Distance of the estimate from the border of (6)'s region, in [0, 1).
     initial_yaw_std, initial_pitch_std, initial_roll_std : float
         How well the orientation at the entry is known [rad]; enters the covariance only.
-    gate : float
-        A tip is refused whose squared innovation is above this times its variance; infinite, as
-        in the paper, takes every tip.
     """
 
     curvature: float
@@ -55,7 +51,6 @@ class LuenbergerSettings:
     initial_yaw_std: float
     initial_pitch_std: float
     initial_roll_std: float
-    gate: float = math.inf
 
 
 class LuenbergerObserver:
@@ -89,7 +84,6 @@ class LuenbergerObserver:
         self._inserted: Array = np.zeros(())
         self._covariance: Array = np.zeros((3, 3))
         self._saturated: npt.NDArray[np.bool_] = np.zeros((), dtype=bool)
-        self._gate = InnovationGate(settings.gate)
 
     @property
     def settings(self) -> LuenbergerSettings:
@@ -100,13 +94,11 @@ class LuenbergerObserver:
     def settings(self, settings: LuenbergerSettings) -> None:
         reduced = reduced_from_linearized(self._s, self._settings.curvature)
         self._settings = settings
-        self._gate = InnovationGate(settings.gate)
         self._take(linearized_from_reduced(reduced, settings.curvature))
 
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement; see `Estimator.reset`."""
         settings = self._settings
-        self._gate.reset()
         tip, joints = np.asarray(tip, dtype=float), np.asarray(joints, dtype=float)
         turned = np.zeros((*joints.shape[:-1], 3))
         turned[..., 2] = joints[..., 1]
@@ -166,33 +158,30 @@ class LuenbergerObserver:
             found = found & np.isfinite(covariance[..., 0, 0])
             noise = np.where(np.isfinite(covariance[..., 0, 0]), covariance[..., 0, 0], noise)
         row = transition(-age)[..., 0, :]
-        used = found
-        if math.isfinite(settings.gate):
-            spread = np.einsum("...i,...ij,...j->...", row, self._covariance, row) + noise
-            innovation = tip[..., 0] - np.sum(row * self._s, axis=-1)
-            used = self._gate.admit(innovation**2 / spread, found)
-        all_used = bool(np.all(used))
+        all_used = bool(np.all(found))
         gain = sampled_observer_gain(settings.observer_poles, self._since_correction)
-        shape = np.broadcast_shapes(self._s.shape[:-1], used.shape, age.shape, gain.shape[:-1])
+        shape = np.broadcast_shapes(self._s.shape[:-1], found.shape, age.shape, gain.shape[:-1])
         states, saturated = _rows(self._s, shape), np.empty(math.prod(shape), dtype=bool)
-        x = tip[..., 0] if all_used else np.where(used, tip[..., 0], np.nan)
+        x = tip[..., 0] if all_used else np.where(found, tip[..., 0], np.nan)
         measured = np.broadcast_to(x, shape).flatten(), np.broadcast_to(age, shape).flatten()
         gains = gain.reshape(1, 3) if gain.ndim == 1 else _rows(gain, shape)
         region = settings.curvature, settings.saturation_margin
         correct_states(states, saturated, measured, gains, region)
         self._s, self._saturated = states.reshape(*shape, 3), saturated.reshape(shape)
-        self._tip = tip.copy() if all_used else np.where(used[..., None], tip, self._tip)
+        self._tip = tip.copy() if all_used else np.where(found[..., None], tip, self._tip)
         if covariance is not None:
-            self._tip_covariance = np.where(used[..., None, None], covariance, self._tip_covariance)
+            self._tip_covariance = np.where(
+                found[..., None, None], covariance, self._tip_covariance
+            )
         # Only what was used narrows the covariance; one shape for all needles while all were.
-        taken = gain if all_used else gain * used[..., None]
+        taken = gain if all_used else gain * found[..., None]
         keep = np.eye(3) - taken[..., :, None] * row[..., None, :]
         self._covariance = (
             keep @ self._covariance @ np.swapaxes(keep, -1, -2)
             + taken[..., :, None] * taken[..., None, :] * noise[..., None, None]
         )
         self._since_correction = (
-            np.zeros(()) if all_used else np.where(used, 0.0, self._since_correction)
+            np.zeros(()) if all_used else np.where(found, 0.0, self._since_correction)
         )
 
     def estimate(self) -> Estimate:
@@ -202,9 +191,9 @@ class LuenbergerObserver:
         x, pitch, roll = (reduced[..., i] for i in range(3))
         parts = (x, self._tip[..., 1], self._tip[..., 2], self._yaw, pitch, roll)
         coordinates = np.stack(np.broadcast_arrays(*parts), axis=-1)
-        warnings = self._gate.warnings()
+        warnings: tuple[str, ...] = ()
         if np.any(self._saturated):
-            warnings += (
+            warnings = (
                 "the estimate was saturated: the roll it wants is beyond what its coordinates say",
             )
         return Estimate(

@@ -4,21 +4,20 @@ from __future__ import annotations
 
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.law import StepLaw
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings
-from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.laws.roll_law import RollLaw
+from needle_controller.laws.roll_turns import RollLawSettings
+from needle_controller.presets.steering_settings import SteeringSettings
 
 
-def roll_law_settings(settings: ControlSettings) -> RollLawSettings:
-    """Return what the roll law takes from a rig's settings; all else is its own."""
-    return RollLawSettings(
-        step_length=settings.step_length,
-        max_rotation_per_length=settings.max_rotation_per_length,
-        max_winding=settings.max_winding,
-    )
-
-
-def with_flips(law: RollLaw, plan: FlipPlan) -> StepLaw:
+def roll_law(settings: SteeringSettings, plan: FlipPlan) -> StepLaw:
     """Return the law as it steers by a plan; without flips it bends to whatever side is nearer."""
+    law = RollLaw(
+        RollLawSettings(
+            step_length=settings.step_length,
+            max_rotation_per_length=settings.max_rotation_per_length,
+            max_winding=settings.max_winding,
+        )
+    )
     if not plan.depths:
         return lambda estimate, _: law(estimate)
     return lambda estimate, insertion: law(estimate, plan.bend_sign(insertion))

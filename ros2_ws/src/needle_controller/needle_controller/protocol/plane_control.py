@@ -7,21 +7,30 @@ import math
 
 import numpy as np
 
-from needle_controller.laws.law import Command
+from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.model.point_reach import point_reachability
+from needle_controller.model.reachability import Reachability, reachability
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
-from needle_controller.observers.measured_pitch import measured_pitch
-from needle_controller.observers.pitch_observer import PitchObserver
-from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.presets.path_steering import PathSteering, configured_obstacles
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.presets import make_controller
+from needle_controller.presets.steering_settings import (
+    ONE_SIDED_PRESETS,
+    POINT_PRESETS,
+    SteeringSettings,
+)
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_covariance import TipCovariance
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
 """Of presets whose coordinates end at roll +-90 deg [rad]."""
-_ONE_SIDED = ("paper", "open_loop")
+_FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
+TARGET_TOLERANCE = 1e-3
+"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,36 +41,51 @@ class ControlUpdate:
     ----------
     estimate : Estimate
         In `target_plane`.
-    command : Command
+    command : SteeringCommand
         For the next step.
     turned : float
         Rotation of the base since the first tip [rad].
+    reach : Reachability
+        Of the plane, or the point.
+    blocked : bool
+        Whether no way on is clear of the obstacles: no further step then.
     """
 
     estimate: Estimate
-    command: Command
+    command: SteeringCommand
     turned: float
+    reach: Reachability
+    blocked: bool = False
 
 
 class PlaneControl:
     """Estimator and law of one needle, in the target plane's coordinates.
 
+    While there is a target point the needle is steered to that, and the plane's frame is no more
+    than coordinates.
+
     Parameters
     ----------
-    settings : ControlSettings
+    settings : SteeringSettings
         What estimator and law are made of.
     plane : TargetPlane
         The wanted plane.
 
-    Raises
-    ------
-    UserError
-        Weights that give no gains, or flips with a preset that cannot make them.
+    Attributes
+    ----------
+    target_point : ndarray, shape (3,), or None
+        Where the tip is to go, in `rig` [m]; it may change at any time. None: into the plane.
+    obstacles : Obstacles
+        What it must not touch on its way to a point; it may change at any time.
     """
 
-    def __init__(self, settings: ControlSettings, plane: TargetPlane) -> None:
+    def __init__(self, settings: SteeringSettings, plane: TargetPlane) -> None:
         self._settings = settings
         self._plane = plane
+        self.target_point = _point(settings)
+        self._point_law = point_law(settings)
+        self.obstacles = configured_obstacles(settings)
+        self._path = PathSteering(settings)
         self._estimator, self._law = make_controller(settings, plane.T_plane_rig[:3, :3])
         self._joints: JointSample | None = None
         self._first_joints: JointSample | None = None
@@ -77,8 +101,11 @@ class PlaneControl:
         self._estimator.change_frame(plane.T_plane_rig @ self._plane.T_rig_plane)
         self._plane = plane
 
-    def configure(self, settings: ControlSettings) -> None:
-        """Take new settings, keeping the estimated pose; raises UserError with nothing changed."""
+    def configure(self, settings: SteeringSettings) -> None:
+        """Take new settings; the estimated pose stays, plane and point unless their own change.
+
+        A preset that cannot steer to a point ends it.
+        """
         if self._joints is None:
             rotation = self._plane.T_plane_rig[:3, :3]
             self._estimator, self._law = make_controller(settings, rotation)
@@ -88,6 +115,16 @@ class PlaneControl:
             unturned = rotation_from_angles([0.0, 0.0, -joints.rotation])
             self._estimator, self._law = make_controller(settings, now.rotation @ unturned)
             self._estimator.reset(now.position, [joints.insertion, joints.rotation])
+        if settings.target_offset != self._settings.target_offset:
+            self.plane = settings.plane()
+        if settings.target_point != self._settings.target_point:
+            self.target_point = _point(settings)
+        if settings.preset not in POINT_PRESETS:
+            self.target_point = None
+        if settings.obstacles != self._settings.obstacles:
+            self.obstacles = configured_obstacles(settings)
+        self._path = PathSteering(settings)
+        self._point_law = point_law(settings)
         self._settings = settings
 
     def restart(self) -> None:
@@ -104,7 +141,7 @@ class PlaneControl:
     @property
     def largest_start_roll(self) -> float:
         """Largest roll in the plane that the preset can start at [rad]."""
-        one_sided = self._settings.preset in _ONE_SIDED
+        one_sided = self._settings.preset in ONE_SIDED_PRESETS
         return float(LARGEST_START_ROLL) if one_sided else math.inf
 
     def start_roll(self, rotation: float) -> float:
@@ -145,27 +182,71 @@ class PlaneControl:
         self._joints = joints
         estimate = self._estimator.estimate()
         turned = joints.rotation - self._first_joints.rotation
-        return ControlUpdate(estimate, self._law(estimate, joints.insertion), turned)
+        command = self._command(estimate, joints)
+        reach = self._reach(estimate, joints)
+        if command is None:
+            still = np.zeros(())
+            return ControlUpdate(
+                estimate, SteeringCommand(still, still), turned, reach, blocked=True
+            )
+        return ControlUpdate(estimate, command, turned, reach)
+
+    def path_obstacle(self, rotation: float) -> str:
+        """Return why no path leads a needle that is out to its point, empty if one does.
+
+        Parameters
+        ----------
+        rotation : float
+            Of the base [rad].
+        """
+        if self.target_point is None or not len(self.obstacles):
+            return ""
+        return self._path.why_not(self.target_point, self.obstacles, rotation)
+
+    def _command(self, estimate: Estimate, joints: JointSample) -> SteeringCommand | None:
+        if self.target_point is None:
+            return self._law(estimate, joints.insertion)
+        if len(self.obstacles):
+            return self._path.command(
+                estimate, self._plane, self.target_point, self.obstacles, joints.insertion
+            )
+        return self._point_law(estimate, self._plane.from_rig(self.target_point))
+
+    def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
+        limits = {
+            "insertion": joints.insertion,
+            "end": self._settings.depth,
+            "tolerance": TARGET_TOLERANCE,
+        }
+        if self.target_point is None:
+            return reachability(estimate.reduced, estimate.curvature, **limits)
+        offset = self._plane.from_rig(self.target_point) - estimate.position
+        return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
 
     def _correct(self, position: Array, known: TipCovariance | None) -> None:
         estimator, settings = self._estimator, self._settings
         if known is None:
-            estimator.correct(position, settings.tip_covariance())
+            estimator.correct(position, settings.configured_covariance())
             return
         turn = self._plane.T_plane_rig[:3, :3]
         covariance = turn @ known.matrix @ turn.T + np.eye(3) * settings.measurement_std**2
-        if isinstance(estimator, PitchObserver):
-            pitch = measured_pitch(known.direction, known.direction_covariance, turn)
-            estimator.correct(position, covariance, pitch=pitch)
-        else:
-            estimator.correct(position, covariance)
+        estimator.correct(position, covariance)
 
     def _warm_up(self) -> None:
         """Run once what an update runs: compiled code is made here, not at the first tip."""
-        estimator, law = make_controller(self._settings, np.eye(3))
+        settings, length = self._settings, self._settings.step_length
+        estimator, law = make_controller(settings, np.eye(3))
         estimator.reset(np.zeros(3), np.zeros(2))
-        estimator.advance(self._settings.step_length, 0.0)
-        estimator.correct([0.0, 0.0, self._settings.step_length], self._settings.tip_covariance())
+        estimator.advance(length, 0.0)
+        estimator.correct([0.0, 0.0, length], settings.configured_covariance())
         estimate = estimator.estimate()
-        law(estimate, self._settings.step_length)
+        law(estimate, length)
+        if settings.preset in POINT_PRESETS:
+            self._point_law(estimate, [0.0, 0.0, 1.0])
+            ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
+            PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
         estimate.covariance  # noqa: B018 - lazy, and compiled too
+
+
+def _point(settings: SteeringSettings) -> Array | None:
+    return np.array(settings.target_point) if settings.target_point else None

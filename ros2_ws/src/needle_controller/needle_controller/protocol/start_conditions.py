@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import DEPTH_TOLERANCE
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_controller.protocol.steering_types import DeviceReport, SteeringSettings
+from needle_controller.protocol.steering_types import DeviceReport
 
 _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
@@ -104,4 +105,4 @@ def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: Steer
             f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
             f"{joints.rotation:.4g} rad), wants within {control.largest_start_roll:.3g} rad"
         )
-    return ""
+    return control.path_obstacle(joints.rotation)

@@ -1,15 +1,15 @@
 """The step protocol: when the needle is moved, by what data, and when not.
 
 States: IDLE -> STEERING <-> WAITING_FOR_TIP -> DONE | FAULT. Events come in, actions go out; time
-is only ever an argument. What is sent depends on stamps, never on the order in which topics
-happened to arrive.
+is an argument. What is sent depends on stamps, never on the order in which topics arrived.
 """
 
 from __future__ import annotations
 
 import math
 
-from needle_controller.model.reachability import Reachability, reachability
+from needle_controller.model.reachability import Reachability
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.failed_steps import FailedSteps
 from needle_controller.protocol.joint_history import Heard, JointSample
 from needle_controller.protocol.next_step import next_step
@@ -25,16 +25,14 @@ from needle_controller.protocol.steering_types import (
     PublishUpdate,
     SendStep,
     StartReply,
-    SteeringSettings,
     SteeringState,
 )
 from needle_controller.protocol.step_watch import Followed, StepWatch
 from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import AcceptedTip, Refusal, TipMeasurement
+from needle_controller.protocol.tip_gate import AcceptedTip, RefusedTip, TipMeasurement
 from needle_controller.protocol.tip_intake import TipIntake
+from needle_controller.protocol.trust import Trust, trust_of
 
-PLANE_TOLERANCE = 1e-3
-"""Distance from the plane at which the needle counts as in it, [KC09] IV-A [m]."""
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
 _DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
 
@@ -45,12 +43,12 @@ class Steering:
     Parameters
     ----------
     settings : SteeringSettings
-        The protocol's numbers; may be replaced while it runs.
-    control : PlaneControl
-        Estimator and law.
+        What estimator, law and protocol are made of; `configure` changes it.
 
     Attributes
     ----------
+    control : PlaneControl
+        Estimator and law.
     state, awaiting : SteeringState, Awaiting
         Where the protocol is, and what it needs to go on.
     reason : str
@@ -65,17 +63,17 @@ class Steering:
         How often the steady clock, not data, decided.
     insertion : float
         At the last used tip [m].
-    reach : Reachability or None
-        Of the plane, at the last used tip.
+    reach, trust : Reachability or None, Trust
+        Of plane or point, and of the estimate, at the last used tip.
     intake : TipIntake
         Tips and joints.
     patience : Patience
         How long has been waited, and for what.
     """
 
-    def __init__(self, settings: SteeringSettings, control: PlaneControl) -> None:
+    def __init__(self, settings: SteeringSettings) -> None:
         self.settings = settings
-        self.control = control
+        self.control = PlaneControl(settings, settings.plane())
         self.state = SteeringState.IDLE
         self.awaiting = Awaiting.NOTHING
         self.reason = "not started"
@@ -85,6 +83,7 @@ class Steering:
         self.watchdog_trips = 0
         self.insertion = 0.0
         self.reach: Reachability | None = None
+        self.trust = Trust()
         self.intake = TipIntake()
         self._retraction = RetractionWatch()
         self._device: DeviceReport | None = None
@@ -94,16 +93,16 @@ class Steering:
         self._failed = FailedSteps()
         self.patience = Patience()
 
-    # What a person asks for
+    def configure(self, settings: SteeringSettings) -> None:
+        """Go on with other settings; a given plane stays unless `target_offset` changes."""
+        self.control.configure(settings)
+        self.settings = settings
 
     def on_start(self) -> tuple[StartReply, list[Action]]:
         """Begin steering, or say why not."""
         joints = self.intake.joints.latest
-        why = obstacle(
-            Situation(self._steering, self._device, joints, self._retraction.obstacle),
-            self.control,
-            self.settings,
-        )
+        now = Situation(self._steering, self._device, joints, self._retraction.obstacle)
+        why = obstacle(now, self.control, self.settings)
         if why:
             return StartReply(False, why), [Log("warning", f"not started: {why}")]
         if joints is not None and is_out(joints, self.settings):
@@ -227,8 +226,6 @@ class Steering:
             return self._watch_result(waited, steady)
         return self._watch_tip(waited, steady)
 
-    # What follows
-
     @property
     def _steering(self) -> bool:
         return self.state in {SteeringState.STEERING, SteeringState.WAITING_FOR_TIP}
@@ -306,7 +303,7 @@ class Steering:
         self.reason = why
         return [Log("warning", why, "unfollowed")]
 
-    def _refuse(self, refusal: Refusal) -> list[Action]:
+    def _refuse(self, refusal: RefusedTip) -> list[Action]:
         self.rejection = refusal.text
         if self._steering:
             self.reason = f"tip refused: {refusal.text}"
@@ -328,22 +325,21 @@ class Steering:
         self.rejection = ""
         self.insertion = joints.insertion
         update = self.control.update(tip.position, joints, accepted.covariance)
-        self.reach = reachability(
-            update.estimate.reduced,
-            update.estimate.curvature,
-            insertion=joints.insertion,
-            end=settings.depth,
-            tolerance=PLANE_TOLERANCE,
-        )
+        self.reach = update.reach
+        self.trust = trust_of(update.estimate)
         self.reason = "; ".join(update.estimate.warnings)
         actions: list[Action] = [PublishUpdate(tip.stamp_ns, update)]
         if self.state is SteeringState.WAITING_FOR_TIP:
             self.state = SteeringState.STEERING
             actions.append(Log("info", "STEERING: a good tip came"))
-        rate = float(update.command.rotation_rate)
-        self._ready_step = next_step(tip.stamp_ns, joints, rate, settings)
+        if update.blocked:
+            why = f"no way on from insertion {joints.insertion:.4g} m is clear of the obstacles"
+            return actions + self._leave(SteeringState.IDLE, why, "warning")
+        self._ready_step = next_step(
+            tip.stamp_ns, joints, update.command, settings, slowly=self.trust.is_doubtful
+        )
         if self._ready_step is None:
-            text = f"insertion {joints.insertion:.6g} m reached"
+            text = f"insertion {joints.insertion:.6g} m reached; {self.trust.summary}"
             return actions + self._leave(SteeringState.DONE, text, "info")
         return actions + self._send()
 

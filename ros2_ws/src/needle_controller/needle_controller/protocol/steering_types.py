@@ -7,9 +7,6 @@ import enum
 
 from needle_controller.protocol.plane_control import ControlUpdate
 
-TIP_COVARIANCES = ("configured", "from_tip_pose")
-"""Where a tip's covariance comes from."""
-
 
 class SteeringState(enum.Enum):
     """The controller's states."""
@@ -29,45 +26,6 @@ class Awaiting(enum.Enum):
     TIP = "tip"
     DEVICE = "device"
     RESULT = "result"
-
-
-@dataclasses.dataclass(frozen=True)
-class SteeringSettings:
-    """The protocol's numbers.
-
-    Attributes
-    ----------
-    step_length : float
-        Insertion of one step [m].
-    nominal_speed : float
-        Insertion speed at speed scale 1 [m/s].
-    depth : float
-        Insertion at which steering ends [m].
-    tip_covariance : str
-        One of `TIP_COVARIANCES`: whether a tip is used with the configured noise, or with the
-        covariance that came with it and not without.
-    tip_timeout : float
-        Time without a good tip after which the state is WAITING_FOR_TIP [s], steady clock.
-    result_timeout : float
-        Time without an answer from a device that does not move, after which the state is FAULT [s],
-        steady clock.
-    tip_margin : float
-        What noise may add to a tip's place [m].
-    needle_out_insertion : float
-        Insertion below which the needle counts as out [m].
-    retraction_tolerance : float
-        Backward motion that counts as a retraction [m].
-    """
-
-    step_length: float
-    nominal_speed: float
-    depth: float
-    tip_covariance: str
-    tip_timeout: float
-    result_timeout: float
-    tip_margin: float
-    needle_out_insertion: float
-    retraction_tolerance: float
 
 
 @dataclasses.dataclass(frozen=True)

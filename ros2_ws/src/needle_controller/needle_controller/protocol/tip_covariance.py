@@ -1,4 +1,4 @@
-"""What a source of tips says of each beside its place: covariance and direction, by stamp."""
+"""What a source of tips says of each beside its place: its covariance, by stamp."""
 
 from __future__ import annotations
 
@@ -26,17 +26,11 @@ class TipCovariance:
         Frame of the covariance; must be `rig`.
     matrix : ndarray, shape (3, 3)
         Of the position [m^2]; infinite where no tip was found.
-    direction : ndarray, shape (3,)
-        Of the shaft at the tip, in the same frame; NaN where it is not known.
-    direction_covariance : ndarray, shape (3, 3)
-        Of rotations about that frame's axes [rad^2].
     """
 
     stamp_ns: int
     frame_id: str
     matrix: Array
-    direction: Array = dataclasses.field(default_factory=lambda: np.full(3, np.nan))
-    direction_covariance: Array = dataclasses.field(default_factory=lambda: np.full((3, 3), np.nan))
 
     def problem(self) -> str:
         """Return why no tip can be used with this, empty if one can."""

@@ -12,6 +12,8 @@ from needle_controller.model.target_plane import RIG
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_covariance import TipCovariance
 
+LARGEST_SCALE = 1.15
+"""How much farther than the stage moves a needle may go in: a stage's scale can be wrong."""
 STAMP_AHEAD_NS = 1_000_000_000
 """A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
 
@@ -70,7 +72,7 @@ class AcceptedTip:
 
 
 @dataclasses.dataclass(frozen=True)
-class Refusal:
+class RefusedTip:
     """A tip that is not used, and why."""
 
     tip: TipMeasurement
@@ -78,7 +80,7 @@ class Refusal:
     text: str
 
 
-def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> Refusal | None:
+def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> RefusedTip | None:
     """Return why a tip cannot be used whatever the needle did, None if it can.
 
     Parameters
@@ -89,19 +91,19 @@ def refuse_message(tip: TipMeasurement, last: AcceptedTip | None) -> Refusal | N
         The last tip that was used.
     """
     if tip.frame_id != RIG:
-        return Refusal(tip, Fault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
+        return RefusedTip(tip, Fault.FRAME, f"tip in frame '{tip.frame_id}', wants '{RIG}'")
     if not np.all(np.isfinite(tip.position)):
-        return Refusal(tip, Fault.NOT_FINITE, f"tip is not finite: {tip.position}")
+        return RefusedTip(tip, Fault.NOT_FINITE, f"tip is not finite: {tip.position}")
     if last is not None and tip.stamp_ns <= last.tip.stamp_ns:
         behind = (last.tip.stamp_ns - tip.stamp_ns) * 1e-9
         text = f"tip's stamp is not newer than the last used one's ({behind:g} s behind)"
-        return Refusal(tip, Fault.NOT_NEWER, text)
+        return RefusedTip(tip, Fault.NOT_NEWER, text)
     return None
 
 
 def refuse_stamp(
     tip: TipMeasurement, oldest: JointSample | None, latest: JointSample | None
-) -> Refusal | None:
+) -> RefusedTip | None:
     """Return why the joints at a tip's exposure will never be known, None if they may be.
 
     Parameters
@@ -112,17 +114,17 @@ def refuse_stamp(
         The ends of what is kept.
     """
     if oldest is not None and tip.stamp_ns < oldest.stamp_ns:
-        return Refusal(tip, Fault.BEFORE_JOINTS, "tip is older than any joint_states kept")
+        return RefusedTip(tip, Fault.BEFORE_JOINTS, "tip is older than any joint_states kept")
     if latest is not None and tip.stamp_ns > latest.stamp_ns + STAMP_AHEAD_NS:
         ahead = (tip.stamp_ns - latest.stamp_ns) * 1e-9
         text = f"tip's stamp is {ahead:.4g} s ahead of joint_states"
-        return Refusal(tip, Fault.AHEAD_OF_JOINTS, text)
+        return RefusedTip(tip, Fault.AHEAD_OF_JOINTS, text)
     return None
 
 
 def refuse_position(
     tip: TipMeasurement, joints: JointSample, last: AcceptedTip | None, margin: float
-) -> Refusal | None:
+) -> RefusedTip | None:
     """Return why no needle with these joints can have its tip there, None if one can.
 
     Parameters
@@ -137,13 +139,13 @@ def refuse_position(
         What noise may add [m].
     """
     distance = float(np.linalg.norm(tip.position))
-    reach = max(joints.insertion, 0.0) + margin
+    reach = LARGEST_SCALE * max(joints.insertion, 0.0) + margin
     if distance > reach:
         text = (
             f"tip is {distance:.4g} m from the entry point, wants <= {reach:.4g} m "
-            f"(insertion {joints.insertion:.4g} m + margin {margin:.4g} m)"
+            f"({LARGEST_SCALE:g} insertion {joints.insertion:.4g} m + margin {margin:.4g} m)"
         )
-        return Refusal(tip, Fault.TOO_FAR, text)
+        return RefusedTip(tip, Fault.TOO_FAR, text)
     if last is not None:
         jump = float(np.linalg.norm(tip.position - last.tip.position))
         allowed = abs(joints.insertion - last.joints.insertion) + margin
@@ -152,5 +154,5 @@ def refuse_position(
                 f"tip jumped {jump:.4g} m since the last used one, wants <= {allowed:.4g} m "
                 f"(insertion since then + margin {margin:.4g} m)"
             )
-            return Refusal(tip, Fault.JUMP, text)
+            return RefusedTip(tip, Fault.JUMP, text)
     return None

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections import Counter
 
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointHistory, JointSample
-from needle_controller.protocol.steering_types import SteeringSettings
 from needle_controller.protocol.step_watch import REST_INSERTION
 from needle_controller.protocol.tip_covariance import CovarianceHistory
 from needle_controller.protocol.tip_gate import (
     AcceptedTip,
     Fault,
-    Refusal,
+    RefusedTip,
     TipMeasurement,
     refuse_message,
     refuse_position,
@@ -63,7 +63,7 @@ class TipIntake:
 
     def offer(
         self, tip: TipMeasurement, settings: SteeringSettings, *, steering: bool, wanted: bool
-    ) -> Refusal | None:
+    ) -> RefusedTip | None:
         """Take a tip as it came; while the needle is steered it waits for what belongs to it.
 
         Parameters
@@ -79,7 +79,7 @@ class TipIntake:
 
         Returns
         -------
-        Refusal or None
+        RefusedTip or None
             Why it can never be used, whether wanted or not.
         """
         latest = self.joints.latest
@@ -103,7 +103,7 @@ class TipIntake:
         """Want no tip that was exposed before this [ns]."""
         self.after_ns = max(self.after_ns, stamp_ns)
 
-    def take(self, settings: SteeringSettings) -> AcceptedTip | Refusal | None:
+    def take(self, settings: SteeringSettings) -> AcceptedTip | RefusedTip | None:
         """Return the first tip that is wanted, once all that belongs to it has come.
 
         Parameters
@@ -113,7 +113,7 @@ class TipIntake:
 
         Returns
         -------
-        AcceptedTip, Refusal or None
+        AcceptedTip, RefusedTip or None
             None until then. A tip that is returned or refused waits no longer.
         """
         taken = self._take(settings)
@@ -156,7 +156,7 @@ class TipIntake:
         self.want_after(latest.stamp_ns)
         return True
 
-    def _take(self, settings: SteeringSettings) -> AcceptedTip | Refusal | None:
+    def _take(self, settings: SteeringSettings) -> AcceptedTip | RefusedTip | None:
         while self._waiting and self._waiting[0].stamp_ns <= self.after_ns:
             del self._waiting[0]
         if not self._waiting:
@@ -190,7 +190,7 @@ class TipIntake:
         self.last = None
         self.want_any()
 
-    def watch(self, steady: float, timeout: float) -> Refusal | None:
+    def watch(self, steady: float, timeout: float) -> RefusedTip | None:
         """Refuse a tip that has waited too long, so that the next one gets its chance.
 
         Parameters
@@ -207,7 +207,7 @@ class TipIntake:
             return None
         if self.joints.at(tip.stamp_ns) is None:
             text = "no joint_states around the tip's stamp"
-            return self._give_up(Refusal(tip, Fault.NO_JOINTS, text))
+            return self._give_up(RefusedTip(tip, Fault.NO_JOINTS, text))
         return self._give_up(_without_covariance(tip))
 
     def _keep(self, tip: TipMeasurement) -> None:
@@ -215,12 +215,12 @@ class TipIntake:
         # A topic keeps its order: what came before with a later stamp had a wrong one.
         while waiting and waiting[-1].stamp_ns > tip.stamp_ns:
             text = "a tip exposed before it came after it"
-            self._count(Refusal(waiting.pop(), Fault.AHEAD_OF_JOINTS, text))
+            self._count(RefusedTip(waiting.pop(), Fault.AHEAD_OF_JOINTS, text))
         if not waiting or waiting[-1].stamp_ns < tip.stamp_ns:
             waiting.append(tip)
         del waiting[:-_MOST_WAITING]
 
-    def _out_of_place(self, accepted: AcceptedTip, margin: float) -> Refusal | None:
+    def _out_of_place(self, accepted: AcceptedTip, margin: float) -> RefusedTip | None:
         tip, joints = accepted.tip, accepted.joints
         refusal = refuse_position(tip, joints, self.last, margin)
         if refusal is None or refusal.fault is not Fault.JUMP:
@@ -232,21 +232,21 @@ class TipIntake:
 
     def _with_covariance(
         self, tip: TipMeasurement, joints: JointSample
-    ) -> tuple[AcceptedTip | None, Refusal | None]:
+    ) -> tuple[AcceptedTip | None, RefusedTip | None]:
         covariance = self.covariances.at(tip.stamp_ns)
         if covariance is None:
             passed = self.covariances.has_passed(tip.stamp_ns)
             return None, _without_covariance(tip) if passed else None
         problem = covariance.problem()
         if problem:
-            return None, Refusal(tip, Fault.BAD_COVARIANCE, problem)
+            return None, RefusedTip(tip, Fault.BAD_COVARIANCE, problem)
         return AcceptedTip(tip, joints, covariance), None
 
-    def _give_up(self, refusal: Refusal) -> Refusal:
+    def _give_up(self, refusal: RefusedTip) -> RefusedTip:
         self._waiting.remove(refusal.tip)
         return self._count(refusal)
 
-    def _count(self, refusal: Refusal) -> Refusal:
+    def _count(self, refusal: RefusedTip) -> RefusedTip:
         self.refused[refusal.fault] += 1
         latest, stamp_ns = self.joints.latest, refusal.tip.stamp_ns
         if latest is not None and stamp_ns <= latest.stamp_ns + _JOINTS_LATE_NS:
@@ -254,9 +254,9 @@ class TipIntake:
         return refusal
 
 
-def _without_covariance(tip: TipMeasurement) -> Refusal:
+def _without_covariance(tip: TipMeasurement) -> RefusedTip:
     text = (
         "no needle/tip_pose with the tip's stamp (tip_covariance is from_tip_pose; for a source of "
         "needle/tip alone set it to configured)"
     )
-    return Refusal(tip, Fault.NO_COVARIANCE, text)
+    return RefusedTip(tip, Fault.NO_COVARIANCE, text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import (
@@ -21,6 +23,7 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import to_nanoseconds, to_stamp, values_of
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
+from needle_controller.model.point_reach import point_from_message
 from needle_controller.model.target_plane import TargetPlane, plane_from_pose
 from needle_controller.observers.estimator import Estimate
 from needle_controller.protocol.joint_history import JointSample
@@ -30,7 +33,7 @@ from needle_controller.protocol.steering_types import DeviceReport, SendStep, St
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import TipMeasurement
 
-TARGET_PLANE = "target_plane"
+TARGET_PLANE, TARGET_POINT = "target_plane", "target_point"
 INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
 
@@ -66,29 +69,22 @@ def to_tip(message: PointStamped) -> TipMeasurement:
 
 
 def to_tip_covariance(message: PoseWithCovarianceStamped) -> TipCovariance:
-    """Return covariance and direction of a measured tip as they came, nothing checked."""
+    """Return the covariance of a measured tip as it came, nothing checked."""
     covariance = np.array(message.pose.covariance).reshape(6, 6)
-    q = message.pose.pose.orientation
-    return TipCovariance(
-        to_nanoseconds(message.header.stamp),
-        message.header.frame_id,
-        covariance[:3, :3],
-        # The z axis of the pose.
-        direction=np.array(
-            [
-                2.0 * (q.x * q.z + q.w * q.y),
-                2.0 * (q.y * q.z - q.w * q.x),
-                q.w * q.w + q.z * q.z - q.x * q.x - q.y * q.y,
-            ]
-        ),
-        direction_covariance=covariance[3:, 3:],
-    )
+    stamp_ns = to_nanoseconds(message.header.stamp)
+    return TipCovariance(stamp_ns, message.header.frame_id, covariance[:3, :3])
 
 
 def to_plane(message: PoseStamped) -> TargetPlane:
     """Return the plane a message asks for; raises UserError as `plane_from_pose` does."""
     p, q = message.pose.position, message.pose.orientation
     return plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
+
+
+def to_target_point(message: PointStamped) -> Array:
+    """Return the point a message asks for; raises UserError as `point_from_message` does."""
+    p = message.point
+    return point_from_message(message.header.frame_id, [p.x, p.y, p.z])
 
 
 def to_device_status(message: DiagnosticStatus) -> DeviceReport:
@@ -159,14 +155,20 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
     if steering.reach is not None:
         reachable = str(bool(steering.reach.reachable)).lower()
         reachable_depth = repr(float(steering.reach.depth))
+    point = steering.control.target_point
     values = {
         "state": steering.state.value,
         "starts": str(steering.starts),
         "step": str(steering.step),
         "insertion_m": repr(steering.insertion),
         "target_offset_m": repr(steering.control.plane.offset),
+        "target_point_m": "" if point is None else ", ".join(repr(float(c)) for c in point),
+        "obstacles": str(len(steering.control.obstacles)),
         "reachable": reachable,
         "reachable_depth_m": reachable_depth,
+        "trusted": steering.trust.verdict,
+        "r1_low_m": _said(steering.trust.low),
+        "r1_high_m": _said(steering.trust.high),
         "reason": steering.patience.silence or steering.reason,
         "awaiting": steering.awaiting.value,
         "tip_after_ns": str(steering.intake.after_ns),
@@ -179,6 +181,11 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         "depth_m": repr(steering.settings.depth),
     }
     level = _LEVELS.get(steering.state, Level.OK)
-    if steering.rejection or steering.patience.silence:
+    if steering.rejection or steering.patience.silence or steering.trust.is_doubtful:
         level = max(level, Level.WARN)
     return Diagnostic(level, values["reason"] or steering.state.value, values)
+
+
+def _said(value: float) -> str:
+    """Return a number's text, empty for none."""
+    return repr(value) if math.isfinite(value) else ""

@@ -31,18 +31,20 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages
 from needle_controller.protocol.steering_types import Action, Log, SteeringState
 from needle_controller.ros import conversions
-from needle_controller.ros.conversions import TARGET_PLANE
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.ros.conversions import TARGET_PLANE, TARGET_POINT
+from needle_controller.ros.obstacle_messages import OBSTACLES
 from needle_controller.ros.steering_messages import OUTPUTS, SteeringMessages, output_messages
 
 HELP = """
-plane_controller: steers the needle into the target plane, one insertion step per measured tip.
+plane_controller: steers the needle into the target plane, or to the target point, one insertion
+step per measured tip.
 
-Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, joint_states, device/result,
-            device/status
+Subscribes  needle/tip, needle/tip_pose (its covariance), target_plane, target_point, obstacles,
+            joint_states, device/result, device/status
 Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, needle/linearized_state,
             needle/control_input, needle/controller_status, /diagnostics
 Services    ~/start, ~/stop
@@ -50,7 +52,8 @@ Services    ~/start, ~/stop
 
 # Steady time between two lines of log of one kind [s]: never every cycle.
 _LOG_PERIOD = 2.0
-_PLANES_SEEN = 32
+_TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
+_TARGETS_SEEN = 32
 
 
 class PlaneControllerNode(WholeNode):
@@ -77,7 +80,7 @@ class PlaneControllerNode(WholeNode):
         super().__init__(
             "plane_controller", context=context, parameter_overrides=parameter_overrides
         )
-        self._settings = NodeParameters(self, PlaneControllerParameters, self._on_parameters)
+        self._settings = NodeParameters(self, SteeringSettings, self._on_parameters)
         values = self._settings.values
         self._messages = SteeringMessages(values)
         self._steering = self._messages.steering
@@ -90,13 +93,13 @@ class PlaneControllerNode(WholeNode):
             topic: self.create_publisher(kind, topic, RELIABLE) for topic, kind in OUTPUTS.items()
         }
         self._status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
-        # A latched plane reaches whoever comes late; DDS gives a latched subscription nothing of a
+        # A latched target reaches whoever comes late; DDS gives a latched subscription nothing of a
         # plain publisher (`ros2 topic pub`, RViz), a plain one what both send from now on.
-        self._planes_seen: deque[int] = deque(maxlen=_PLANES_SEEN)
-        plane = self._messages.inputs[TARGET_PLANE]
-        self._hear(dataclasses.replace(plane, qos=RELIABLE))
+        self._targets_seen: deque[tuple[str, int]] = deque(maxlen=_TARGETS_SEEN)
+        for topic in _TARGETS:
+            self._hear(dataclasses.replace(self._messages.inputs[topic], qos=RELIABLE))
         sources = {row.topic: self._hear(row) for row in self._messages.inputs.values()}
-        not_awaited = {TARGET_PLANE}
+        not_awaited = {*_TARGETS}
         if values.tip_covariance != "from_tip_pose":
             not_awaited.add("needle/tip_pose")
         self._sources = [heard for topic, heard in sources.items() if topic not in not_awaited]
@@ -160,23 +163,23 @@ class PlaneControllerNode(WholeNode):
             partial(self._on_message, row.topic),
             row.qos,
             event_callbacks=SubscriptionEventCallbacks(
-                # A plain publisher of planes is heard by the plain subscription.
-                use_default_callbacks=(row.topic, row.qos) != (TARGET_PLANE, LATCHED)
+                # A plain publisher of targets is heard by the plain subscription.
+                use_default_callbacks=row.topic not in _TARGETS or row.qos != LATCHED
             ),
         )
 
     def _on_message(self, topic: str, message: Any, info: dict[str, int]) -> None:
         sent_ns = info["source_timestamp"]
-        if topic == TARGET_PLANE:
-            if sent_ns in self._planes_seen:
+        if topic in _TARGETS:
+            if (topic, sent_ns) in self._targets_seen:
                 # Of the other subscription.
                 return
-            self._planes_seen.append(sent_ns)
+            self._targets_seen.append((topic, sent_ns))
         self._heard.add(topic, sent_ns)
         self._do(self._messages.inputs[topic].take(message, sent_ns))
 
-    def _on_parameters(self, values: PlaneControllerParameters) -> None:
-        self._messages.change_parameters(values)
+    def _on_parameters(self, values: SteeringSettings) -> None:
+        self._steering.configure(values)
         self._do([Log("info", "parameters changed")])
 
     def _on_timer(self) -> None:
@@ -213,7 +216,9 @@ class PlaneControllerNode(WholeNode):
         }
         complaint = self._messages.joints_complaint or history.complaint
         self._diagnostics.set("joint_states", _health(complaint, joints))
-        self._diagnostics.set("target_plane", _health(self._messages.plane_complaint, {}))
+        self._diagnostics.set(TARGET_PLANE, _health(self._messages.plane_complaint, {}))
+        self._diagnostics.set(TARGET_POINT, _health(self._messages.point_complaint, {}))
+        self._diagnostics.set(OBSTACLES, _health(self._messages.obstacles_complaint, {}))
         diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
         self._diagnostics.set("steering", diagnostic)
         if diagnostic != self._published or self._heard.is_full:
@@ -230,9 +235,7 @@ def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; returns its exit code."""
-    return run_node(
-        PlaneControllerNode, help_text=HELP, parameters=PlaneControllerParameters, args=args
-    )
+    return run_node(PlaneControllerNode, help_text=HELP, parameters=SteeringSettings, args=args)
 
 
 if __name__ == "__main__":

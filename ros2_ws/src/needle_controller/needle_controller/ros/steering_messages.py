@@ -15,13 +15,16 @@ from geometry_msgs.msg import (
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import MarkerArray
 
 from needle_common.errors import UserError
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds
 from needle_common.ros.topic_input import TopicInput
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendStep
 from needle_controller.ros import conversions
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.ros.obstacle_messages import OBSTACLES, to_obstacles
 
 OUTPUTS: Mapping[str, type[Any]] = {
     "device/joint_trajectory": JointTrajectory,
@@ -38,7 +41,7 @@ class SteeringMessages:
 
     Parameters
     ----------
-    parameters : PlaneControllerParameters
+    settings : SteeringSettings
         The node's.
 
     Attributes
@@ -49,16 +52,17 @@ class SteeringMessages:
         By relative topic; `take` gets the time of sending [ns].
     bad_joints : int
         Joint states refused.
-    joints_complaint, plane_complaint : str
+    joints_complaint, plane_complaint, point_complaint, obstacles_complaint : str
         What is wrong with the latest; empty where nothing is.
     """
 
-    def __init__(self, parameters: PlaneControllerParameters) -> None:
-        self._parameters = parameters
-        self.steering = parameters.make_steering()
+    def __init__(self, settings: SteeringSettings) -> None:
+        self.steering = Steering(settings)
         self.bad_joints = 0
         self.joints_complaint = ""
         self.plane_complaint = ""
+        self.point_complaint = ""
+        self.obstacles_complaint = ""
         self.inputs: dict[str, TopicInput[Action]] = {
             row.topic: row
             for row in (
@@ -69,14 +73,11 @@ class SteeringMessages:
                 TopicInput(
                     "needle/tip_pose", PoseWithCovarianceStamped, RELIABLE, self._take_tip_pose
                 ),
-                TopicInput("target_plane", PoseStamped, LATCHED, self._take_plane),
+                TopicInput(conversions.TARGET_PLANE, PoseStamped, LATCHED, self._take_plane),
+                TopicInput(conversions.TARGET_POINT, PointStamped, LATCHED, self._take_point),
+                TopicInput(OBSTACLES, MarkerArray, LATCHED, self._take_obstacles),
             )
         }
-
-    def change_parameters(self, parameters: PlaneControllerParameters) -> None:
-        """Take over other parameters while it runs."""
-        parameters.change_steering(self.steering, self._parameters)
-        self._parameters = parameters
 
     def _take_joints(self, message: JointState, sent_ns: int) -> Iterable[Action]:
         try:
@@ -103,13 +104,37 @@ class SteeringMessages:
     def _take_plane(self, message: PoseStamped, _: int) -> Iterable[Action]:
         try:
             plane = conversions.to_plane(message)
-            self._parameters.check_plane(plane)
+            self.steering.settings.check_plane(plane)
         except UserError as error:
             self.plane_complaint = f"{error}; the last plane stays"
             return [Log("warning", self.plane_complaint)]
         self.plane_complaint = ""
         self.steering.control.plane = plane
+        self.steering.control.target_point = None
         return [Log("info", f"target_plane at offset {plane.offset:g} m")]
+
+    def _take_point(self, message: PointStamped, _: int) -> Iterable[Action]:
+        try:
+            point = conversions.to_target_point(message)
+            self.steering.settings.check_point(point)
+        except UserError as error:
+            self.point_complaint = f"{error}; the last target stays"
+            return [Log("warning", self.point_complaint, conversions.TARGET_POINT)]
+        self.point_complaint = ""
+        self.steering.control.target_point = point
+        x, y, z = point
+        text = f"target_point at ({x:g}, {y:g}, {z:g}) m"
+        return [Log("info", text, conversions.TARGET_POINT)]
+
+    def _take_obstacles(self, message: MarkerArray, _: int) -> Iterable[Action]:
+        try:
+            obstacles = to_obstacles(message)
+        except UserError as error:
+            self.obstacles_complaint = f"{error}; the last obstacles stay"
+            return [Log("warning", self.obstacles_complaint, OBSTACLES)]
+        self.obstacles_complaint = ""
+        self.steering.control.obstacles = obstacles
+        return [Log("info", f"{len(obstacles)} obstacles", OBSTACLES)]
 
 
 def output_messages(action: SendStep | PublishUpdate) -> list[tuple[str, Any]]:

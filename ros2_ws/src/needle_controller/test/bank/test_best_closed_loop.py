@@ -7,8 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.laws.roll_law import RollLaw
+from needle_controller.laws.roll_turns import RollLawSettings
 from needle_controller.model.arrays import Array
-from needle_controller.presets.best import BestSettings, make_best
 
 STEP = 0.001
 NEEDLES = 200
@@ -35,7 +37,8 @@ def steered(
     angles = np.deg2rad(rng.uniform(-1.0, 1.0, (count, 2)) * [10.0, 30.0])
     rotation = Rotation.from_euler("YZ", angles)
     base, turned, sign = np.zeros(count), np.zeros(count), 1.0
-    estimator, law = make_best(BestSettings(settings or FilterSettings()))
+    estimator = HypothesisFilter(settings or FilterSettings())
+    law = RollLaw(RollLawSettings())
     path, last = [tip[:, 0].copy()], np.empty(0)
     estimator.reset(tip + rng.uniform(-noise, noise, tip.shape), np.zeros((count, 2)))
     at = set(np.round(np.arange(1, flips + 1) * steps / (flips + 1)).astype(int).tolist())

@@ -7,24 +7,38 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from needle_controller.bank.hypothesis_lanes import (
+from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
-    BLOCK,
+    E_KAPPA,
+    E_SCALE,
+    E_SIZE,
+    ERROR,
     KAPPA,
     LAG,
-    LANES,
-    P77,
+    PAIRS,
     PER_SIZE,
+    PLACE,
     PLAY,
-    R00,
+    ROWS,
+    SCALE,
     TIP_ANGLE,
+    P,
+    R,
+    Tiles,
     X,
     covariances,
+    lower_half,
     rows,
-    set_covariances,
     set_rows,
+    tiles_of,
 )
-from needle_controller.bank.tip_motion import LARGEST_TURN, move, rotation_factors
+from needle_controller.bank.filter_settings import Drift
+from needle_controller.bank.tip_motion import (
+    LARGEST_TURN,
+    MOTION_ROWS,
+    move,
+    rotation_factors,
+)
 from needle_controller.model.arrays import Array
 
 CASES = [
@@ -35,33 +49,48 @@ CASES = [
     (0.0, 0.4),
     (0.01, 0.7),
 ]
+COUNT = 8
 PLAYS = np.array([0.0, 0.0, 0.1, 0.25, 0.33, 0.0, 0.0, 0.0])
 LAGS = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.004, 0.008, 0.002])
-SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1])
+SCALES = np.array([1e-3, 1e-3, 1e-3, 0.1, 0.1, 0.1, 1.0, 0.1, 0.05])
+NO_DRIFT = Drift(0.0, 0.0, 0.0, 0.0, 0.0)
 
 
-def block(seed: int = 1, *, torsion: bool = False) -> Array:
-    """Eight estimates, none like another, as a bank of one needle."""
+def estimates(seed: int = 1, *, torsion: bool = False) -> Tiles:
+    """Eight estimates of a needle, none like another."""
     rng = np.random.default_rng(seed)
-    state = np.zeros((1, 1, BLOCK))
-    set_rows(state, X, rng.normal(0.0, 0.01, (1, LANES, 3)))
-    set_rows(state, R00, Rotation.random(LANES, random_state=seed).as_matrix().reshape(1, LANES, 9))
-    state[0, 0, KAPPA : KAPPA + LANES] = rng.uniform(5.0, 11.0, LANES)
-    factor = rng.normal(size=(1, LANES, 8, 8)) * SCALES[:, None]
-    set_covariances(state, factor @ np.swapaxes(factor, -1, -2))
+    numbers = np.zeros((COUNT, ROWS))
+    numbers[:, X : X + 3] = rng.normal(0.0, 0.01, (COUNT, 3))
+    numbers[:, R : R + 9] = Rotation.random(COUNT, random_state=seed).as_matrix().reshape(-1, 9)
+    numbers[:, KAPPA] = rng.uniform(5.0, 11.0, COUNT)
+    numbers[:, SCALE] = rng.uniform(0.9, 1.1, COUNT)
+    factor = rng.normal(size=(COUNT, ERROR, ERROR)) * SCALES[:, None]
+    numbers[:, P : P + PAIRS] = lower_half(factor @ np.swapaxes(factor, -1, -2))
     if torsion:
-        state[0, 0, PLAY : PLAY + LANES], state[0, 0, LAG : LAG + LANES] = PLAYS, LAGS
-    return state
+        numbers[:, PLAY], numbers[:, LAG] = PLAYS, LAGS
+    return tiles_of(numbers, np.array([COUNT]))
 
 
-def moved(state: Array, length: float, turn: float) -> Array:
-    state = state.copy()
-    move(state[0, 0], 0.0, turn, length, 0.0, 0.0, 0.0, 0.0)
-    return state
+def copied(tiles: Tiles) -> Tiles:
+    return tiles._replace(state=tiles.state.copy())
 
 
-def orientations(state: Array) -> Array:
-    return np.asarray(rows(state, R00, 9)[0].reshape(LANES, 3, 3))
+def moved(tiles: Tiles, length: float, turn: float, drift: Drift = NO_DRIFT) -> Tiles:
+    tiles = copied(tiles)
+    lanes = tiles.state.shape[2]
+    move(
+        tiles.state[0],
+        np.zeros(lanes),
+        np.full(lanes, turn),
+        np.full(lanes, length),
+        drift,
+        np.empty((MOTION_ROWS, lanes)),
+    )
+    return tiles
+
+
+def orientations(tiles: Tiles) -> Array:
+    return np.asarray(rows(tiles, R, 9).reshape(-1, 3, 3))
 
 
 @pytest.mark.parametrize("angle", [1e-3, 0.5, 1.0, 2.0])
@@ -76,15 +105,16 @@ def test_rodrigues_factors(angle: float) -> None:
 
 @pytest.mark.parametrize(("length", "turn"), CASES)
 def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) -> None:
-    before = block()
+    before = estimates()
     after = moved(before, length, turn)
-    for h in range(LANES):
+    for h in range(COUNT):
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = orientations(before)[h], rows(before, X, 3)[0, h]
-        x, z = before[0, 0, KAPPA + h] * length, turn
-        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, length], [0, 0, 0, 0.0]])
+        pose[:3, :3], pose[:3, 3] = orientations(before)[h], rows(before, X, 3)[h]
+        gone = rows(before, SCALE, 1)[h, 0] * length
+        x, z = rows(before, KAPPA, 1)[h, 0] * gone, turn
+        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, gone], [0, 0, 0, 0.0]])
         wanted = pose @ expm(twist)
-        np.testing.assert_allclose(rows(after, X, 3)[0, h], wanted[:3, 3], atol=1e-12)
+        np.testing.assert_allclose(rows(after, X, 3)[h], wanted[:3, 3], atol=1e-12)
         np.testing.assert_allclose(orientations(after)[h], wanted[:3, :3], atol=1e-9)
 
 
@@ -92,63 +122,77 @@ def test_the_step_is_the_exponential_of_the_twist(length: float, turn: float) ->
 @pytest.mark.parametrize("torsion", [False, True])
 def test_covariance_goes_by_the_steps_derivative(length: float, turn: float, torsion: bool) -> None:
     """F by central differences of the step itself, in the error's own coordinates."""
-    state = block(torsion=torsion)
-    after = moved(state, length, turn)
+    tiles = estimates(torsion=torsion)
+    after = moved(tiles, length, turn)
+    has_lag = rows(tiles, LAG, 1) > 0.0
 
-    def end(error: Array) -> Array:
-        start = state.copy()
+    def end(error: Array) -> Tiles:
+        start = copied(tiles)
         set_rows(start, X, rows(start, X, 3) + error[:3])
         turned = Rotation.from_rotvec(error[3:6]).as_matrix() @ orientations(start)
-        set_rows(start, R00, turned.reshape(1, LANES, 9))
-        start[0, 0, KAPPA : KAPPA + LANES] += error[6]
-        has_lag = start[0, 0, LAG : LAG + LANES] > 0.0
-        start[0, 0, PLAY : PLAY + LANES] += np.where(has_lag, 0.0, error[7])
-        start[0, 0, LAG : LAG + LANES] += np.where(has_lag, error[7], 0.0)
+        set_rows(start, R, turned.reshape(-1, 9))
+        set_rows(start, KAPPA, rows(start, KAPPA, 1) + error[E_KAPPA])
+        set_rows(start, SCALE, rows(start, SCALE, 1) + error[E_SCALE])
+        set_rows(start, PLAY, rows(start, PLAY, 1) + np.where(has_lag, 0.0, error[E_SIZE]))
+        set_rows(start, LAG, rows(start, LAG, 1) + np.where(has_lag, error[E_SIZE], 0.0))
         return moved(start, length, turn)
 
-    transition = np.zeros((LANES, 8, 8))
-    transition[:, 6, 6] = transition[:, 7, 7] = 1.0
-    for i in range(8):
-        error = np.zeros(8)
-        error[i] = 1e-4 if i == 6 else 1e-6
-        if i == 7 and not torsion:
+    transition = np.zeros((COUNT, ERROR, ERROR))
+    transition[:, range(6, ERROR), range(6, ERROR)] = 1.0
+    for i in range(ERROR):
+        error = np.zeros(ERROR)
+        error[i] = 1e-4 if i == E_KAPPA else 1e-6
+        if i == E_SIZE and not torsion:
             continue
         ahead, behind = end(error), end(-error)
-        transition[:, :3, i] = (rows(ahead, X, 3) - rows(behind, X, 3))[0] / (2.0 * error[i])
+        transition[:, :3, i] = (rows(ahead, X, 3) - rows(behind, X, 3)) / (2.0 * error[i])
         turned = orientations(ahead) @ np.swapaxes(orientations(behind), -1, -2)
         transition[:, 3:6, i] = Rotation.from_matrix(turned).as_rotvec() / (2.0 * error[i])
     # The path's own shift with the torsion is left out: curvature length^2 of what it turns.
-    transition[:, :3, 7] = 0.0
+    transition[:, :3, E_SIZE] = 0.0
     # Without play and lag, more play is less turn; less than none there is not.
     used = slice(2, None) if torsion else slice(None)
     if not torsion:
-        ahead, behind = moved(state, length, turn + 1e-6), moved(state, length, turn - 1e-6)
+        ahead, behind = moved(tiles, length, turn + 1e-6), moved(tiles, length, turn - 1e-6)
         turned = orientations(ahead) @ np.swapaxes(orientations(behind), -1, -2)
-        transition[:, 3:6, 7] = -np.sign(turn) * Rotation.from_matrix(turned).as_rotvec() / 2e-6
-    before = covariances(state)[0]
+        by_turn = Rotation.from_matrix(turned).as_rotvec() / 2e-6
+        transition[:, 3:6, E_SIZE] = -np.sign(turn) * by_turn
+    before = covariances(tiles)
     wanted = transition @ before @ np.swapaxes(transition, -1, -2)
-    found = covariances(after)[0]
+    found = covariances(after)
     deviation = np.sqrt(np.diagonal(wanted, axis1=-2, axis2=-1))
     scale = deviation[:, :, None] * deviation[:, None, :]
     np.testing.assert_allclose((found / scale)[used], (wanted / scale)[used], atol=2e-3)
 
 
+@pytest.mark.parametrize("torsion", [False, True])
+def test_where_nothing_moves_not_a_bit_changes(torsion: bool) -> None:
+    """So a lane can wait while others go on."""
+    tiles = moved(estimates(torsion=torsion), 0.001, 0.3)
+    drift = Drift(1.0, 1.0, 1.0, 1.0, 1.0)
+    # The base stays where it is: its angle before is 0 here.
+    tiles.state[:, [TIP_ANGLE, BEHIND_PLAY]] = 0.0
+    np.testing.assert_array_equal(moved(tiles, 0.0, 0.0, drift).state, tiles.state)
+
+
 def test_torsions_angles_are_kept() -> None:
-    after = moved(block(torsion=True), 0.001, 0.5)[0, 0]
-    tip, behind = after[TIP_ANGLE : TIP_ANGLE + LANES], after[BEHIND_PLAY : BEHIND_PLAY + LANES]
+    after = moved(estimates(torsion=True), 0.001, 0.5)
+    tip, behind = rows(after, TIP_ANGLE, 1)[:, 0], rows(after, BEHIND_PLAY, 1)[:, 0]
     np.testing.assert_allclose(behind, 0.5 - PLAYS)
     np.testing.assert_allclose(tip[:5], behind[:5])
     assert np.all((tip[5:] > 0.0) & (tip[5:] < behind[5:]))
-    np.testing.assert_array_equal(after[PER_SIZE : PER_SIZE + 5], -1.0)
+    np.testing.assert_array_equal(rows(after, PER_SIZE, 1)[:5], -1.0)
 
 
 def test_process_noise_is_added_where_it_belongs() -> None:
-    state = block(torsion=True)
-    set_covariances(state, np.zeros((1, LANES, 8, 8)))
-    state[0, 0, P77 + 2 : P77 + LANES] = 1.0
-    move(state[0, 0], 0.0, 0.0, 0.0, 2.0, 3.0, 4.0, 5.0)
-    added = np.diagonal(covariances(state)[0], axis1=-2, axis2=-1).copy()
-    added[2:, 7] -= 1.0
-    np.testing.assert_array_equal(added[:, :7], np.tile([0, 0, 0, 2, 2, 2, 3.0], (LANES, 1)))
+    tiles = estimates(torsion=True)
+    tiles.state[:, P : P + PAIRS] = 0.0
+    tiles.state[0, PLACE[E_SIZE, E_SIZE], 2:COUNT] = 1.0
+    before = covariances(tiles)
+    added = covariances(moved(tiles, 0.001, 0.0, Drift(2.0, 3.0, 4.0, 5.0, 6.0))) - before
+    added[:, :6, 6:] = added[:, 6:, :6] = added[:, :3] = added[:, :, :3] = 0.0
+    added = 1000.0 * np.diagonal(added, axis1=-2, axis2=-1)
+    wanted = np.tile([0, 0, 0, 2, 2, 2, 3, 0, 4.0], (COUNT, 1))
     # A size that is known exactly stays so; a lag's noise is not a play's.
-    np.testing.assert_array_equal(added[:, 7], [0, 0, 4, 4, 4, 5, 5, 5])
+    wanted[:, E_SIZE] = [0, 0, 5, 5, 5, 6, 6, 6]
+    np.testing.assert_allclose(added, wanted, atol=1e-3)

@@ -1,4 +1,4 @@
-"""Updates by one tip: bounded and Gaussian noise, eight estimates at a time."""
+"""Updates by one tip: uniform and normal noise, outliers, and what a tip shows of the noise."""
 
 from __future__ import annotations
 
@@ -7,83 +7,99 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import multivariate_normal
 
-from needle_controller.bank.hypothesis_lanes import (
-    BLOCK,
+from needle_controller.bank.estimate_tiles import (
+    E_KAPPA,
+    E_SCALE,
+    ERROR,
+    EVIDENCE,
+    IS_UNIFORM,
     KAPPA,
-    LANES,
-    R00,
-    SIZE_CHANGE,
-    SURPRISE,
+    NOISE,
+    NOISES,
+    OUTLIER,
+    PAIRS,
+    PLAY,
+    ROWS,
+    SCALE,
     WEIGHT,
+    P,
+    R,
+    Tiles,
     X,
     covariances,
+    lower_half,
     rows,
-    set_covariances,
     set_rows,
+    tiles_of,
 )
-from needle_controller.bank.tip_update import (
-    SMALLEST_VARIANCE,
-    rotate,
-    squared_distance,
-    take_bounded,
-    take_gaussian,
-)
+from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_filter import readings
+from needle_controller.bank.tip_update import UPDATE_ROWS, rotate, take_tip
 from needle_controller.model.arrays import Array
 
-SCALES = np.array([3e-4, 3e-4, 3e-4, 0.1, 0.1, 0.3, 1.0, 0.1])
-SEVERAL = 8
+SCALES = np.array([3e-4, 3e-4, 3e-4, 0.1, 0.1, 0.3, 1.0, 0.1, 0.05])
+COUNT = 8
+BOUND = 0.001
+MIDDLE = np.array([0.01, 0.02, 0.03])
+PLAIN = FilterSettings(
+    softness=0.0, mistrust=0.0, outlier_share=1e-6, curvature_range=(0.01, 100.0)
+)
+WITH_OUTLIERS = FilterSettings(softness=0.0, mistrust=0.0)
 
 
-def estimates(covariance: Array | None = None, seed: int = 3) -> Array:
-    """Eight estimates about (1, 2, 3) cm as a bank of one needle; by default none like another."""
+def estimates(covariance: Array | None = None, *, is_uniform: bool = False, seed: int = 3) -> Tiles:
+    """Eight estimates about `MIDDLE`, by default none like another; noise is as claimed."""
     rng = np.random.default_rng(seed)
-    state = np.zeros((1, 1, BLOCK))
-    set_rows(state, X, np.array([0.01, 0.02, 0.03]) + rng.normal(0.0, 1e-3, (1, LANES, 3)))
-    set_rows(state, R00, Rotation.random(LANES, random_state=seed).as_matrix().reshape(1, LANES, 9))
+    numbers = np.zeros((COUNT, ROWS))
+    numbers[:, X : X + 3] = MIDDLE
+    numbers[:, R : R + 9] = Rotation.random(COUNT, random_state=seed).as_matrix().reshape(-1, 9)
     if covariance is None:
-        factor = rng.normal(size=(1, LANES, 8, 8)) * SCALES[:, None]
-        set_covariances(state, factor @ np.swapaxes(factor, -1, -2))
-    else:
-        set_covariances(state, np.broadcast_to(covariance, (1, LANES, 8, 8)))
-    state[0, 0, KAPPA : KAPPA + LANES] = 8.0
-    state[0, 0, WEIGHT : WEIGHT + LANES] = 1.0
-    return state
+        numbers[:, X : X + 3] += rng.normal(0.0, 1e-3, (COUNT, 3))
+        factor = rng.normal(size=(COUNT, ERROR, ERROR)) * SCALES[:, None]
+        covariance = factor @ np.swapaxes(factor, -1, -2)
+    numbers[:, P : P + PAIRS] = lower_half(np.broadcast_to(covariance, (COUNT, ERROR, ERROR)))
+    numbers[:, KAPPA], numbers[:, SCALE], numbers[:, PLAY] = 8.0, 1.0, 0.5
+    numbers[:, WEIGHT] = numbers[:, NOISE] = 1.0
+    numbers[:, IS_UNIFORM] = is_uniform
+    return tiles_of(numbers, np.array([COUNT]))
 
 
-def positions(state: Array) -> Array:
-    return np.asarray(rows(state, X, 3)[0])
-
-
-def orientations(state: Array) -> Array:
-    return np.asarray(rows(state, R00, 9)[0].reshape(LANES, 3, 3))
-
-
-def bounded(state: Array, tip: Array, softness: float = 0.0, surprise: float = 0.05) -> Array:
-    """Return what `take_bounded` makes of a bank, with a bound of 1 mm."""
-    state = state.copy()
-    take_bounded(state[0, 0], tip, 0.001, softness, surprise)
-    return state
-
-
-def changes(before: Array, after: Array) -> Array:
-    """What was added to the error's eight coordinates, (LANES, 8)."""
-    turned = orientations(after) @ np.swapaxes(orientations(before), -1, -2)
-    return np.concatenate(
-        [
-            positions(after) - positions(before),
-            Rotation.from_matrix(turned).as_rotvec(),
-            (after - before)[0, 0, KAPPA : KAPPA + LANES, None],
-            after[0, 0, SIZE_CHANGE : SIZE_CHANGE + LANES, None],
-        ],
-        axis=1,
+def taken(
+    tiles: Tiles,
+    tip: Array,
+    noise: Array = np.eye(3) * BOUND**2 / 3.0,  # noqa: B008
+    settings: FilterSettings = PLAIN,
+) -> Tiles:
+    tiles = tiles._replace(state=tiles.state.copy())
+    lanes = tiles.state.shape[2]
+    seen = np.repeat(readings(np.asarray(tip)[None], noise[None]), lanes, axis=0)
+    take_tip(
+        tiles.state[0],
+        np.ascontiguousarray(seen.T),
+        settings.noises(),
+        settings.limits(),
+        np.empty((UPDATE_ROWS, lanes)),
     )
+    return tiles
 
 
-def test_bounded_update_has_the_posteriors_moments() -> None:
+def orientations(tiles: Tiles) -> Array:
+    return np.asarray(rows(tiles, R, 9).reshape(-1, 3, 3))
+
+
+def changes(before: Tiles, after: Tiles) -> Array:
+    """What was added to the error's nine elements, (COUNT, 9)."""
+    turned = orientations(after) @ np.swapaxes(orientations(before), -1, -2)
+    added = rows(after, 0, ROWS) - rows(before, 0, ROWS)
+    turn = Rotation.from_matrix(turned).as_rotvec()
+    return np.column_stack([added[:, X : X + 3], turn, added[:, [KAPPA, PLAY, SCALE]]])
+
+
+def test_uniform_noise_gives_the_posteriors_moments() -> None:
     """Against samples of the prior, those in the box kept; one coordinate measured."""
     rng = np.random.default_rng(4)
-    covariance = np.zeros((8, 8))
-    used = [0, 4, 6, 7]
+    covariance = np.zeros((ERROR, ERROR))
+    used = [0, 4, E_KAPPA, E_SCALE]
     covariance[np.ix_(used, used)] = [
         [2.5e-7, 3e-5, 2e-4, 1e-5],
         [3e-5, 0.01, 0.02, 1e-3],
@@ -91,103 +107,107 @@ def test_bounded_update_has_the_posteriors_moments() -> None:
         [1e-5, 1e-3, 0.0, 0.01],
     ]
     covariance[1, 1] = covariance[2, 2] = 1e-12
-    samples = rng.multivariate_normal(np.zeros(8), covariance, 400_000)
-    before = estimates(covariance)
-    offset = np.array([0.0012, 0.0, 0.0])
-    tip = positions(before)[2] + offset
-    kept = samples[np.abs(samples[:, 0] - offset[0]) <= 0.001]
-    after = bounded(before, tip, surprise=1e-9)
-    assert after[0, 0, WEIGHT + 2] == pytest.approx(len(kept) / len(samples), rel=0.02)
-    deviation = np.sqrt(np.diag(np.cov(kept.T)))
+    samples = rng.multivariate_normal(np.zeros(ERROR), covariance, 400_000)
+    before = estimates(covariance, is_uniform=True)
+    kept = samples[np.abs(samples[:, 0] - 0.0012) <= BOUND]
+    after = taken(before, MIDDLE + np.array([0.0012, 0.0, 0.0]))
+    np.testing.assert_allclose(rows(after, EVIDENCE, 1), len(kept) / len(samples), rtol=0.02)
+    deviation = np.sqrt(np.diag(np.cov(kept.T)))[used]
+    found = changes(before, after)[2, used]
+    np.testing.assert_allclose(found / deviation, kept.mean(axis=0)[used] / deviation, atol=0.02)
     np.testing.assert_allclose(
-        changes(before, after)[2, used] / deviation[used],
-        kept.mean(axis=0)[used] / deviation[used],
-        atol=0.02,
-    )
-    scale = np.outer(deviation, deviation)[np.ix_(used, used)]
-    np.testing.assert_allclose(
-        covariances(after)[0, 2][np.ix_(used, used)] / scale,
-        np.cov(kept.T)[np.ix_(used, used)] / scale,
+        covariances(after)[2][np.ix_(used, used)] / np.outer(deviation, deviation),
+        np.cov(kept.T)[np.ix_(used, used)] / np.outer(deviation, deviation),
         atol=0.02,
     )
 
 
-def test_a_tip_that_surprises_nobody_changes_nothing() -> None:
-    before = estimates(np.diag((SCALES * 0.1) ** 2))
-    set_rows(before, X, np.broadcast_to([0.01, 0.02, 0.03], (1, LANES, 3)))
-    after = bounded(before, np.array([0.0101, 0.0199, 0.03]))
-    np.testing.assert_array_equal(after, before)
+CORRELATED = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
 
 
-@pytest.mark.parametrize("offset", [0.003, -0.003])
-def test_a_prior_outside_the_box_is_taken_to_its_edge(offset: float) -> None:
-    before = estimates(np.eye(8) * 1e-10)
-    set_rows(before, X, np.zeros((1, LANES, 3)))
-    after = bounded(before, np.array([offset, 0.0, 0.0]))
-    np.testing.assert_allclose(positions(after)[:, 0], offset - np.copysign(0.001, offset))
-    variance = covariances(after)[0, :, 0, 0]
-    assert np.all((variance > 0.0) & (variance < 1e-10))
-
-
-def test_no_single_tip_is_proof() -> None:
-    """However far off: each coordinate costs at most the factor `surprise`."""
-    before = estimates(np.eye(8) * 1e-10)
-    set_rows(before, X, np.zeros((1, LANES, 3)))
-    weights = [
-        bounded(before, np.array([offset, 0.0, 0.0]))[0, 0, WEIGHT]
-        for offset in (0.00102, 0.0011, 0.005)
-    ]
-    assert weights[0] > weights[1] >= weights[2] == pytest.approx(0.05)
-
-
-NOISE = np.array([[4e-7, 1e-7, 0.0], [1e-7, 9e-7, -2e-7], [0.0, -2e-7, 2.5e-7]])
-
-
-def test_gaussian_update_is_kalmans() -> None:
+def test_normal_noise_gives_kalmans_update() -> None:
     before = estimates()
     tip = np.array([0.0105, 0.0193, 0.031])
-    after = before.copy()
-    take_gaussian(after[0, 0], tip, NOISE)
-    measured = np.eye(8)[:3]
+    after = taken(before, tip, CORRELATED)
+    measured = np.eye(ERROR)[:3]
     found = changes(before, after)
-    for h in range(SEVERAL):
-        covariance, innovation = covariances(before)[0, h], tip - positions(before)[h]
-        spread = measured @ covariance @ measured.T + NOISE
+    for h in range(COUNT):
+        covariance, expected = covariances(before)[h], rows(before, X, 3)[h]
+        spread = measured @ covariance @ measured.T + CORRELATED
         gain = covariance @ measured.T @ np.linalg.inv(spread)
-        np.testing.assert_allclose(found[h], gain @ innovation, rtol=1e-6, atol=1e-9)
-        keep = np.eye(8) - gain @ measured
-        wanted = keep @ covariance @ keep.T + gain @ NOISE @ gain.T
+        wanted = gain @ (tip - expected)
+        np.testing.assert_allclose(found[h, :7], wanted[:7], rtol=1e-4, atol=1e-8)
+        keep = np.eye(ERROR) - gain @ measured
+        wanted = keep @ covariance @ keep.T + gain @ CORRELATED @ gain.T
         scale = np.outer(np.sqrt(np.diag(wanted)), np.sqrt(np.diag(wanted)))
-        np.testing.assert_allclose(covariances(after)[0, h] / scale, wanted / scale, atol=1e-6)
-        # Weight and distance together are the density, relative to that at the noise's middle.
-        density = multivariate_normal(positions(before)[h], spread).pdf(tip)
-        at_middle = multivariate_normal(np.zeros(3), NOISE).pdf(np.zeros(3))
-        likelihood = after[0, 0, WEIGHT + h] * np.exp(-0.5 * after[0, 0, SURPRISE + h])
-        assert likelihood == pytest.approx(density / at_middle, rel=1e-6)
+        np.testing.assert_allclose(covariances(after)[h] / scale, wanted / scale, atol=2e-4)
+        # Relative to the density of uniform noise of the same variances.
+        density = multivariate_normal(expected, spread).pdf(tip)
+        in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(CORRELATED))
+        assert rows(after, EVIDENCE, 1)[h, 0] == pytest.approx(density / in_box, rel=1e-4)
 
 
 def test_an_exact_tip_is_taken() -> None:
-    after = estimates()
-    take_gaussian(after[0, 0], np.array([0.01, 0.02, 0.03]), np.zeros((3, 3)))
-    assert np.all(np.isfinite(after))
-    np.testing.assert_allclose(positions(after), np.tile([0.01, 0.02, 0.03], (LANES, 1)), atol=1e-8)
-    assert SMALLEST_VARIANCE < 1e-12
+    after = taken(estimates(), MIDDLE, np.zeros((3, 3)))
+    assert np.all(np.isfinite(rows(after, 0, ROWS)))
 
 
-def test_squared_distance_adds_the_coordinates() -> None:
-    state = estimates(np.diag([1.0, 2.0, 3.0, 0, 0, 0, 0, 0]))
-    tip = positions(state)[5] + 2.0
-    distance = squared_distance(state[0, 0], 5, tip, np.eye(3))
-    assert distance == pytest.approx(4 / 2 + 4 / 3 + 4 / 4)
+@pytest.mark.parametrize("is_uniform", [False, True])
+def test_an_outlier_changes_nothing(is_uniform: bool) -> None:
+    before = estimates(np.diag((SCALES * 0.3) ** 2), is_uniform=is_uniform)
+    after = taken(before, MIDDLE + np.array([0.01, 0.0, 0.0]), settings=WITH_OUTLIERS)
+    np.testing.assert_allclose(rows(after, OUTLIER, 1), 1.0, atol=1e-3)
+    np.testing.assert_allclose(changes(before, after), 0.0, atol=1e-6)
+    np.testing.assert_allclose(covariances(after), covariances(before), rtol=1e-2)
+
+
+def test_a_doubtful_tip_gives_the_mixtures_moments() -> None:
+    """Half an outlier: the covariance of what was and of what would be, about their mean."""
+    before = estimates(np.diag((SCALES * 0.3) ** 2))
+    tip = MIDDLE + np.array([0.0022, 0.0, 0.0])
+    whole, after = taken(before, tip), taken(before, tip, settings=WITH_OUTLIERS)
+    share = rows(after, OUTLIER, 1)[0, 0]
+    assert 0.1 < share < 0.9
+    change = changes(before, whole)[0]
+    np.testing.assert_allclose(changes(before, after)[0], (1.0 - share) * change, atol=1e-7)
+    wanted = share * covariances(before)[0] + (1.0 - share) * covariances(whole)[0]
+    wanted += share * (1.0 - share) * np.outer(change, change)
+    np.testing.assert_allclose(np.diag(covariances(after)[0]), np.diag(wanted), rtol=1e-4)
+
+
+def test_no_tip_changes_nothing() -> None:
+    before = estimates()
+    after = taken(before, np.full(3, np.nan), settings=WITH_OUTLIERS)
+    same = [row for row in range(ROWS) if row not in {EVIDENCE, OUTLIER}]
+    # A turn by nothing may round.
+    np.testing.assert_allclose(
+        rows(after, 0, ROWS)[:, same], rows(before, 0, ROWS)[:, same], rtol=1e-14
+    )
+
+
+@pytest.mark.parametrize("is_uniform", [False, True])
+def test_tips_show_how_large_the_noise_is(is_uniform: bool) -> None:
+    settings = FilterSettings()
+    tiles = estimates(np.diag((SCALES * 0.1) ** 2), is_uniform=is_uniform)
+    shares = settings.noises()[int(is_uniform), 1]
+    set_rows(tiles, NOISE, np.tile(shares, (COUNT, 1)))
+    rng, true = np.random.default_rng(8), 1.6
+    for _ in range(30):
+        noise = rng.uniform(-1, 1, 3) if is_uniform else rng.normal(0, 1 / np.sqrt(3.0), 3)
+        tiles = taken(tiles, MIDDLE + true * BOUND * noise, settings=settings)
+    multiples = settings.noises()[int(is_uniform), 0]
+    likeliest = multiples[np.argmax(rows(tiles, NOISE, NOISES)[0])]
+    assert likeliest == min(m for m in multiples if m >= true)
+    np.testing.assert_allclose(np.sum(rows(tiles, NOISE, NOISES), axis=1), 1.0)
 
 
 def test_rotate_turns_about_the_frames_axes_but_not_too_far() -> None:
-    state = estimates()
+    tiles = estimates()
     for vector, turned in (([0.3, -0.2, 0.5], 1.0), ([0.0, 3.0, 0.0], 0.5)):
-        after = state.copy()
-        rotate(after[0, 0], 4, *vector)
+        after = tiles._replace(state=tiles.state.copy())
+        rotate(after.state[0], 4, *vector)
         wanted = Rotation.from_rotvec(np.array(vector) * turned).as_matrix()
         np.testing.assert_allclose(
-            orientations(after)[4], wanted @ orientations(state)[4], atol=1e-8
+            orientations(after)[4], wanted @ orientations(tiles)[4], atol=1e-8
         )
-        np.testing.assert_array_equal(orientations(after)[3], orientations(state)[3])
+        np.testing.assert_array_equal(orientations(after)[3], orientations(tiles)[3])

@@ -22,8 +22,8 @@ from needle_controller.bank.hypothesis_mixture import (
     Hypotheses,
     MixtureEstimate,
 )
-from needle_controller.laws.roll_law import RollLaw, RollLawSettings
-from needle_controller.laws.roll_turns import base_turn, nearest_turn
+from needle_controller.laws.roll_law import RollLaw
+from needle_controller.laws.roll_turns import RollLawSettings, base_turn, nearest_turn
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.observers.estimator import Estimate
@@ -180,4 +180,4 @@ def test_the_rate_is_limited() -> None:
 @pytest.mark.parametrize("name", ["step_length", "max_rotation_per_length", "pitch_gain"])
 def test_settings_out_of_bounds_are_refused(name: str) -> None:
     with pytest.raises(OutOfBoundsError, match=name):
-        RollLawSettings(**{name: -1.0})
+        law(**{name: -1.0})

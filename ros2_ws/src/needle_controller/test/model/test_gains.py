@@ -9,7 +9,7 @@ from scipy import integrate, linalg
 from needle_common.errors import UserError
 from needle_controller.model.feedback_linearization import A, B, C, process_covariance, transition
 from needle_controller.model.gains import Gains, design_gains, held_input, sampled_observer_gain
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.presets.steering_settings import SteeringSettings
 
 STD = 0.001 / np.sqrt(3.0)
 WEIGHTS: dict[str, Any] = {
@@ -99,8 +99,8 @@ def test_held_input_is_the_integral() -> None:
 
 
 def test_the_defaults_are_stable_in_steps() -> None:
-    parameters = PlaneControllerParameters()
-    design = parameters.control().gains()
+    parameters = SteeringSettings()
+    design = parameters.gains()
     length = parameters.step_length
     law = transition(length) - np.outer(held_input(length), design.feedback)
     assert np.max(np.abs(np.linalg.eigvals(law))) < 1.0

@@ -8,6 +8,7 @@ from needle_common.errors import UserError
 from needle_controller.model.target_plane import check_within_reach, offset_plane, plane_from_pose
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_gate import (
+    LARGEST_SCALE,
     AcceptedTip,
     TipMeasurement,
     refuse_message,
@@ -90,8 +91,9 @@ def test_bad_messages_are_named(measured: TipMeasurement, said: str) -> None:
 def test_places_no_needle_can_reach_are_named() -> None:
     assert "from the entry point" in str(refuse_position(tip(0.0, 0.0, 21.0), NOW, LAST, 0.004))
     assert "jumped" in str(refuse_position(tip(0.008, 0.0, 0.019), NOW, LAST, 0.004))
-    assert refuse_position(tip(0.0, 0.0, 0.0249), NOW, None, 0.004) is None
-    assert refuse_position(tip(0.0, 0.0, 0.0251), NOW, None, 0.004) is not None
+    farthest = LARGEST_SCALE * NOW.insertion + 0.004
+    assert refuse_position(tip(0.0, 0.0, farthest - 1e-4), NOW, None, 0.004) is None
+    assert refuse_position(tip(0.0, 0.0, farthest + 1e-4), NOW, None, 0.004) is not None
 
 
 @pytest.mark.parametrize("offset", [0.05, -0.05, 3.0])

@@ -12,23 +12,22 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import rotation_rate
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.presets.control_settings import ControlSettings
 from needle_controller.presets.presets import make_law, observer_settings
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_sim.needle.plant import NeedlePlant
 
-PARAMETERS = PlaneControllerParameters(measurement_std=ControlSettings.measurement_std)
-CURVATURE = PARAMETERS.curvature
+SETTINGS = SteeringSettings(**PAPER_NOISE)
+CURVATURE = SETTINGS.curvature
 STEP = 0.001
 
 
 def observer(**changes: Any) -> LuenbergerObserver:
-    settings = dataclasses.replace(PARAMETERS, **changes).control()
+    settings = dataclasses.replace(SETTINGS, **changes)
     return LuenbergerObserver(observer_settings(settings, settings.gains()))
 
 
 def law(**changes: Any) -> LinearizingLaw:
-    settings = dataclasses.replace(PARAMETERS, **changes).control()
+    settings = dataclasses.replace(SETTINGS, **changes)
     made = make_law(settings, settings.gains())
     assert isinstance(made, LinearizingLaw)
     return made
@@ -242,8 +241,8 @@ def test_covariance_is_honest() -> None:
     start = np.stack(
         [
             np.zeros(count),
-            rng.normal(0.0, PARAMETERS.initial_pitch_std / 2, count),
-            rng.normal(0.0, PARAMETERS.initial_roll_std / 2, count),
+            rng.normal(0.0, SETTINGS.initial_pitch_std / 2, count),
+            rng.normal(0.0, SETTINGS.initial_roll_std / 2, count),
         ],
         axis=-1,
     )
@@ -266,8 +265,8 @@ def test_covariance_is_honest() -> None:
     eigenvalues = np.linalg.eigvalsh(covariance)
     assert np.all(eigenvalues > 0.0)
     # y and z are as measured; the yaw is not observed.
-    np.testing.assert_allclose(covariance[:, 1, 1], PARAMETERS.measurement_std**2)
-    assert np.all(covariance[:, 3, 3] >= PARAMETERS.initial_yaw_std**2)
+    np.testing.assert_allclose(covariance[:, 1, 1], SETTINGS.measurement_std**2)
+    assert np.all(covariance[:, 3, 3] >= SETTINGS.initial_yaw_std**2)
 
 
 def test_saturation_is_said() -> None:
@@ -282,7 +281,7 @@ def test_new_settings_keep_the_pose() -> None:
     one = observer()
     one.reset([0.001, 0.0, 0.0], [0.0, 0.4])
     before = one.estimate().coordinates
-    settings = dataclasses.replace(PARAMETERS, curvature=6.0).control()
+    settings = dataclasses.replace(SETTINGS, curvature=6.0)
     one.settings = observer_settings(settings, settings.gains())
     np.testing.assert_allclose(one.estimate().coordinates, before, atol=1e-12)
     assert one.estimate().curvature == 6.0

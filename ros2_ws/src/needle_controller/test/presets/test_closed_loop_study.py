@@ -8,9 +8,8 @@ from numpy.random import default_rng
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.presets.control_settings import ControlSettings
 from needle_controller.presets.presets import make_law, observer_settings
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_sim.needle.plant import NeedlePlant
 
 STEP = 0.001
@@ -24,10 +23,7 @@ def endpoint_grid() -> Array:
 
 
 def final_x(preset: str, seed: int) -> Array:
-    parameters = PlaneControllerParameters(
-        preset=preset, measurement_std=ControlSettings.measurement_std
-    )
-    settings = parameters.control()
+    settings = SteeringSettings(preset=preset, **PAPER_NOISE)
     gains = settings.gains()
     law = make_law(settings, gains)
     observer = LuenbergerObserver(observer_settings(settings, gains))
@@ -35,7 +31,7 @@ def final_x(preset: str, seed: int) -> Array:
     pose = np.tile(np.eye(4), (len(start), 1, 1))
     pose[:, :3, :3] = rotation_from_angles(start * [0.0, 1.0, 1.0])
     pose[:, 0, 3] = start[:, 0]
-    plant, rng = NeedlePlant(pose, curvature=parameters.curvature), default_rng(seed)
+    plant, rng = NeedlePlant(pose, curvature=settings.curvature), default_rng(seed)
 
     def measured() -> Array:
         noise = rng.uniform(-1e-3, 1e-3, (len(start), 3))

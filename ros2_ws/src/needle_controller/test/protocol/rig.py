@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.plane_control import PlaneControl
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
@@ -17,7 +16,6 @@ from needle_controller.protocol.steering_types import (
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
-from needle_controller.ros.parameters import PlaneControllerParameters
 
 TICK = 20_000_000
 HELD = DeviceReport("HOLDING", True, "operator")
@@ -39,11 +37,10 @@ class Rig:
         insertion: float = 0.0,
         rotation: float = 0.0,
     ) -> None:
-        parameters = PlaneControllerParameters(
+        settings = SteeringSettings(
             preset=preset, depth=depth, target_offset=0.003, tip_covariance=tip_covariance
         )
-        control = PlaneControl(parameters.control(), offset_plane(0.003))
-        self.steering = Steering(parameters.steering(), control)
+        self.steering = Steering(settings)
         self.now = TICK
         self.insertion = insertion
         self.rotation = rotation

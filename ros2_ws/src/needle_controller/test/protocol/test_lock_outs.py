@@ -46,6 +46,28 @@ def test_two_bad_tips_in_a_row_do_not_lock_the_good_ones_out() -> None:
     steps(rig, 5)
 
 
+@pytest.mark.parametrize("bad", [2, 5])
+def test_stop_and_start_after_bad_tips_goes_on_from_good_ones(bad: int) -> None:
+    rig = Rig()
+    steps(rig, 20)
+    for _ in range(bad):
+        actions = rig.expose(shifted(rig, 0.0045))
+        if not none_sent(actions):
+            rig.run(sent(actions))
+    rig.steering.on_stop()
+    assert rig.steering.on_start()[0].success
+    rig.run(good_tips(rig))
+    steps(rig, 5)
+
+
+def test_a_needle_that_goes_in_farther_than_its_stage_is_steered_to_the_end() -> None:
+    rig = Rig()
+    while rig.insertion < 0.119:
+        tip = np.array([0.0, 0.0, 1.06 * rig.insertion])
+        rig.run(sent(rig.expose(TipMeasurement(rig.now + TICK, "rig", tip))))
+    assert rig.steering.intake.refused.total() == 0
+
+
 def test_single_tips_far_off_are_refused_each() -> None:
     rig = Rig()
     steps(rig, 20)

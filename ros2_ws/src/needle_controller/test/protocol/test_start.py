@@ -30,8 +30,7 @@ def test_start_says_why_not(device: DeviceReport | None, said: str) -> None:
 
 
 def test_start_needs_joints() -> None:
-    steering = Rig(started=False).steering
-    fresh = Steering(steering.settings, steering.control)
+    fresh = Steering(Rig(started=False).steering.settings)
     fresh.on_device(HELD)
     reply, _ = fresh.on_start()
     assert (reply.success, reply.message) == (False, "no joint_states have come")

@@ -21,11 +21,11 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
+from visualization_msgs.msg import Marker, MarkerArray
 
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
@@ -83,9 +83,18 @@ class Bench:
         self._results = outside.create_publisher(Header, "device/result", RELIABLE)
         self._device = outside.create_publisher(DiagnosticStatus, "device/status", LATCHED)
         self._planes = outside.create_publisher(PoseStamped, "target_plane", LATCHED)
+        self._points = outside.create_publisher(PointStamped, "target_point", LATCHED)
+        self.obstacles = outside.create_publisher(MarkerArray, "obstacles", LATCHED)
         self.now = TICK
         self.insertion = self.rotation = 0.0
-        publishers = (self._joints, self._tips, self._results, self._device, self._planes)
+        publishers = (
+            self._joints,
+            self._tips,
+            self._results,
+            self._device,
+            self._planes,
+            self._points,
+        )
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
         commands = self.node._outputs["device/joint_trajectory"]
         self.until(lambda: commands.get_subscription_count() > 0)
@@ -277,18 +286,11 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
     bench.close()
 
 
-def test_a_tip_pose_says_direction_and_covariance() -> None:
+def test_a_tip_pose_says_the_positions_covariance() -> None:
     message = PoseWithCovarianceStamped()
-    turned = Rotation.from_rotvec([0.3, -0.2, 0.9])
-    q = message.pose.pose.orientation
-    q.x, q.y, q.z, q.w = (float(part) for part in turned.as_quat())
     message.pose.covariance = np.arange(36.0)
     known = to_tip_covariance(message)
-    np.testing.assert_allclose(known.direction, turned.as_matrix()[:, 2], atol=1e-12)
     np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
-    np.testing.assert_array_equal(
-        known.direction_covariance, [[21, 22, 23], [27, 28, 29], [33, 34, 35]]
-    )
 
 
 def test_every_reason_to_refuse_a_tip_is_logged(
@@ -352,8 +354,43 @@ def test_a_plane_given_at_run_time_and_planes_refused(bench: Bench) -> None:
     assert bench.status["target_offset_m"] == "0.005"
 
 
+def test_a_point_given_at_run_time_until_a_plane_is(bench: Bench) -> None:
+    message = PointStamped()
+    message.header.frame_id = "rig"
+    message.point.x, message.point.z = 0.01, 0.1
+    bench._points.publish(message)
+    bench.until(lambda: bench.status["target_point_m"] == "0.01, 0.0, 0.1")
+    message.point.x = 0.09
+    bench._points.publish(message)
+    bench.until(lambda: bench.health("target_point")[0] == Level.WARN)
+    assert "entering at" in bench.health("target_point")[1]
+    assert bench.status["target_point_m"] == "0.01, 0.0, 0.1"
+    plane = PoseStamped()
+    plane.header.frame_id = "rig"
+    plane.pose.orientation.w = 1.0
+    bench._planes.publish(plane)
+    bench.until(lambda: not bench.status["target_point_m"])
+
+
 def at_offset(bench: Bench, offset: float) -> bool:
     return bench.status["target_offset_m"] == str(offset)
+
+
+def test_obstacles_given_at_run_time_and_obstacles_refused(bench: Bench) -> None:
+    assert bench.status["obstacles"] == "0"
+    made = Marker(type=Marker.SPHERE)
+    made.header.frame_id = "rig"
+    made.scale.x = made.scale.y = made.scale.z = 0.004
+    made.pose.position.z = 0.06
+    bench.obstacles.publish(MarkerArray(markers=[made]))
+    bench.until(lambda: bench.status["obstacles"] == "1")
+    bad = Marker(type=Marker.CUBE, header=made.header)
+    bench.obstacles.publish(MarkerArray(markers=[bad]))
+    bench.until(lambda: bench.health("obstacles")[0] == Level.WARN)
+    assert "the last obstacles stay" in bench.health("obstacles")[1]
+    assert bench.status["obstacles"] == "1"
+    bench.obstacles.publish(MarkerArray())
+    bench.until(lambda: bench.status["obstacles"] == "0")
 
 
 def test_a_plane_from_a_plain_publisher_is_taken_and_each_plane_once(

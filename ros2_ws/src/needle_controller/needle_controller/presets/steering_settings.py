@@ -1,44 +1,58 @@
-"""The parameters of plane_controller."""
+"""What steering is made of: the parameters of plane_controller."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, parameter
 from needle_controller.laws.flip_plan import FlipPlan
+from needle_controller.model.arrays import Array
+from needle_controller.model.gains import Gains, design_gains
+from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
-from needle_controller.presets.control_settings import PRESETS, TIP_NOISES, ControlSettings
-from needle_controller.presets.presets import make_controller
-from needle_controller.protocol.plane_control import PlaneControl
-from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import TIP_COVARIANCES, SteeringSettings
+
+ONE_SIDED_PRESETS = ("paper", "open_loop")
+"""Their coordinates end at roll +-90 deg."""
+PRESETS = ("best", *ONE_SIDED_PRESETS)
+POINT_PRESETS = ("best",)
+"""Those that estimate the whole pose, and so can steer to a point."""
+TIP_NOISES = ("bounded", "normal")
+TIP_COVARIANCES = ("configured", "from_tip_pose")
+"""Where a tip's covariance comes from."""
+PAPER_NOISE: dict[str, Any] = {
+    "tip_noise": "bounded",
+    "tip_noise_bound": 0.001,
+    "measurement_std": 0.001 / math.sqrt(3.0),
+}
+"""Coordinates uniformly off by up to 1 mm, as the simulations of [KC09] have them."""
 
 
 @dataclasses.dataclass(frozen=True)
-class PlaneControllerParameters:
-    """All of them; a change is taken as a whole or refused.
+class SteeringSettings:
+    """What estimator, law and step protocol are made of; taken as a whole or refused.
 
     Raises
     ------
     UserError
-        A value out of its bounds, or weights that give no stable gains.
+        A value out of its bounds, weights that give no stable gains, or flips with a preset that
+        cannot make them.
     """
 
     preset: str = parameter(
-        ControlSettings.preset,
+        "best",
         unit="-",
         description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
-        "open_loop = no rotation; for comparison: kalman = time-varying gain and that law, "
-        "measured_pitch = reduced-order observer (wants tip_covariance from_tip_pose), "
-        "extended_kalman and orientation_fit = estimators of the full pose and roll law.",
+        "open_loop = no rotation.",
         choices=PRESETS,
     )
     curvature: float = parameter(
-        ControlSettings.curvature,
+        1.0 / 0.122,
         unit="1/m",
         description="Curvature of the needle's path in the tissue.",
         lower=0.1,
@@ -51,15 +65,32 @@ class PlaneControllerParameters:
         lower=-0.1,
         upper=0.1,
     )
+    target_point: tuple[float, ...] = parameter(
+        (),
+        unit="m",
+        description="x, y, z in rig of the point to steer to in place of the plane, until a "
+        "target_point or target_plane is given; empty = the plane. Not with flip_depths, and with "
+        "presets that estimate the whole pose only.",
+        lower=-1.0,
+        upper=1.0,
+    )
+    obstacles: tuple[float, ...] = parameter(
+        (),
+        unit="m",
+        description="What the needle must not touch on its way to a point, until obstacles are "
+        "given: of each the x, y, z in rig of both ends of its axis, and its radius.",
+        lower=-1.0,
+        upper=1.0,
+    )
     depth: float = parameter(
         0.12,
         unit="m",
-        description="Insertion at which steering is done.",
+        description="Insertion at which steering is done; of a point, at the latest.",
         lower=0.0,
         upper=1.0,
     )
     step_length: float = parameter(
-        ControlSettings.step_length,
+        0.001,
         unit="m",
         description="Insertion of one step; the last one ends at the depth.",
         lower=1e-4,
@@ -73,14 +104,14 @@ class PlaneControllerParameters:
         upper=0.05,
     )
     max_rotation_per_length: float = parameter(
-        ControlSettings.max_rotation_per_length,
+        math.radians(30.0) / 0.001,
         unit="rad/m",
         description="Most the base is turned per inserted length.",
         lower=0.0,
         upper=1000.0,
     )
     max_winding: float = parameter(
-        ControlSettings.max_winding,
+        6.0 * math.pi,
         unit="rad",
         description="The roll law keeps rotation_joint within +- this: beyond, it turns the other "
         "way round. (The law of [KC09] never winds up.)",
@@ -139,14 +170,14 @@ class PlaneControllerParameters:
         choices=TIP_NOISES,
     )
     tip_noise_bound: float = parameter(
-        ControlSettings.tip_noise_bound,
+        0.001,
         unit="m",
         description="Largest error of one measured tip coordinate, where tip_noise is bounded.",
         lower=1e-6,
         upper=0.1,
     )
     flip_depths: tuple[float, ...] = parameter(
-        ControlSettings.flip_depths,
+        (),
         unit="m",
         description="Insertions at which the bevel is flipped within the plane, increasing; not "
         "with presets paper and open_loop.",
@@ -161,19 +192,19 @@ class PlaneControllerParameters:
         "partners know this node.",
     )
     state_weights: tuple[float, ...] = parameter(
-        ControlSettings.state_weights,
+        (1.0e6, 280.0, 0.0),
         unit="1/m^2, -, m^2",
         description="Cost of s1^2, s2^2, s3^2 per inserted length.",
         lower=0.0,
     )
     input_weight: float = parameter(
-        ControlSettings.input_weight,
+        2.9e-10,
         unit="m^4",
         description="Cost of v^2 per inserted length.",
         lower=0.0,
     )
     process_noise: tuple[float, ...] = parameter(
-        ControlSettings.process_noise,
+        (5.0e-7, 0.13, 24.0),
         unit="m, 1/m, 1/m^3",
         description="Variance per metre of white noise on the derivatives of s, for the observer.",
         lower=0.0,
@@ -187,35 +218,42 @@ class PlaneControllerParameters:
         upper=0.1,
     )
     saturation_margin: float = parameter(
-        ControlSettings.saturation_margin,
+        0.11,
         unit="-",
         description="The estimate is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
         lower=1e-6,
         upper=0.9,
     )
     demand_margin: float = parameter(
-        ControlSettings.demand_margin,
+        0.26,
         unit="-",
         description="The state the law demands is kept within s2^2 + (s3/curvature)^2 <= 1 - this.",
         lower=1e-6,
         upper=0.9,
     )
+    entry_angle_std: float = parameter(
+        math.radians(8.0),
+        unit="rad",
+        description="How well pitch and yaw at the entry are known, for preset best and for paths.",
+        lower=1e-3,
+        upper=math.pi,
+    )
     initial_yaw_std: float = parameter(
-        ControlSettings.initial_yaw_std,
+        math.radians(10.0),
         unit="rad",
         description="How well the yaw at the entry is known (covariance only).",
         lower=0.0,
         upper=math.pi,
     )
     initial_pitch_std: float = parameter(
-        ControlSettings.initial_pitch_std,
+        math.radians(10.0),
         unit="rad",
         description="How well the pitch at the entry is known (covariance only).",
         lower=0.0,
         upper=math.pi,
     )
     initial_roll_std: float = parameter(
-        ControlSettings.initial_roll_std,
+        math.radians(30.0),
         unit="rad",
         description="How well the roll at the entry is known (covariance only).",
         lower=0.0,
@@ -229,46 +267,61 @@ class PlaneControllerParameters:
             numbers = getattr(self, name)
             if len(numbers) != 3:
                 raise UserError(f"{name} = {list(numbers)}, wants three numbers, for s1, s2, s3")
-        if self.preset == "measured_pitch" and self.tip_covariance != "from_tip_pose":
-            raise UserError(
-                "preset measured_pitch takes the pitch from needle/tip_pose: wants tip_covariance "
-                f"from_tip_pose, is {self.tip_covariance}"
-            )
         self.check_plane(self.plane())
+        if self.target_point:
+            if len(self.target_point) != 3:
+                raise UserError(f"target_point = {list(self.target_point)}, wants x, y and z")
+            self.check_point(self.target_point)
+        if len(self.obstacles) % 7:
+            raise UserError(f"obstacles has {len(self.obstacles)} numbers, wants 7 for each")
         FlipPlan(self.flip_depths).check_within(self.depth)
-        self.control().gains()
-        make_controller(self.control(), np.eye(3))
+        if self.flip_depths and self.preset in ONE_SIDED_PRESETS:
+            raise UserError(
+                f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
+                "coordinates end at roll +-90 deg); best can"
+            )
+        self.gains()
 
-    def control(self) -> ControlSettings:
-        """Return what estimator and law are made of."""
-        return ControlSettings(
-            **{f.name: getattr(self, f.name) for f in dataclasses.fields(ControlSettings)}
+    def gains(self) -> Gains:
+        """Return the gains the weights give; raises UserError as `gains.design_gains` does."""
+        return design_gains(
+            state_weights=np.diag(self.state_weights),
+            input_weight=self.input_weight,
+            process_noise=np.diag(self.process_noise),
+            measurement_std=self.measurement_std,
+            step_length=self.step_length,
         )
+
+    @property
+    def has_bounded_noise(self) -> bool:
+        """Whether a bound is claimed of the tips' noise, not a covariance."""
+        return self.tip_covariance == "configured" and self.tip_noise == "bounded"
+
+    def configured_covariance(self) -> Array | None:
+        """Return a tip's covariance [m^2], shape (3, 3); None where the noise is bounded."""
+        if self.tip_noise == "bounded":
+            return None
+        return np.asarray(np.eye(3) * self.measurement_std**2)
 
     def plane(self) -> TargetPlane:
         """Return the wanted plane, until another one is given."""
         return offset_plane(self.target_offset)
 
+    def check_point(self, point: npt.ArrayLike) -> None:
+        """Refuse a point, (3,) in `rig` [m], that these settings cannot steer to; UserError."""
+        self.check_steers_to_points()
+        check_point(point, self.curvature, self.depth)
+
+    def check_steers_to_points(self) -> None:
+        """Refuse points altogether, with a preset or a plan that is for planes; UserError."""
+        if self.preset not in POINT_PRESETS:
+            raise UserError(
+                f"preset {self.preset} cannot steer to a point (it does not estimate the whole "
+                f"pose); {', '.join(POINT_PRESETS)} can"
+            )
+        if self.flip_depths:
+            raise UserError("a target point and flip_depths do not go together")
+
     def check_plane(self, plane: TargetPlane) -> None:
         """Refuse a wanted plane that is out of reach; raises UserError."""
         check_within_reach(plane, self.curvature, self.depth)
-
-    def steering(self) -> SteeringSettings:
-        """Return the step protocol's numbers."""
-        return SteeringSettings(
-            **{f.name: getattr(self, f.name) for f in dataclasses.fields(SteeringSettings)}
-        )
-
-    def make_steering(self) -> Steering:
-        """Return a step protocol with its estimator and law."""
-        return Steering(self.steering(), PlaneControl(self.control(), self.plane()))
-
-    def change_steering(self, steering: Steering, before: PlaneControllerParameters) -> None:
-        """Have a step protocol that was made or changed by `before` go on with these parameters.
-
-        A plane that was given meanwhile stays, unless `target_offset` is another.
-        """
-        steering.settings = self.steering()
-        steering.control.configure(self.control())
-        if self.target_offset != before.target_offset:
-            steering.control.plane = self.plane()

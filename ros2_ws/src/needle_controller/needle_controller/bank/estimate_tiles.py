@@ -1,0 +1,152 @@
+"""How many needles' estimates lie in memory: in tiles, side by side, one row for each number.
+
+Estimates follow one another, needle by needle, and fill tiles of `LANES`. What is done to one
+estimate is done to all of a tile in the same instructions, whichever needle each belongs to, and
+the order of operations does not depend on how many needles there are: a node and a study get the
+same bits. What fills the last tile has weight 0, as has an estimate that has ended.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_common.compiled import compiled
+from needle_controller.model.arrays import Array
+
+# Read by compiled code.
+LANES = 64
+"""Estimates in a tile."""
+ERROR = 9
+"""Length of the error: position and rotation vector, both along the axes of `target_plane` (the
+true rotation is exp(error) R), curvature, size of the torsion, insertion scale."""
+NOISES = 4
+"""Most noise models of one shape, uniform or normal."""
+E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
+"""Where each begins in the error."""
+PAIRS = ERROR * (ERROR + 1) // 2
+X, R, P = 0, 3, 12
+"""First rows of the tip [m], of its orientation row by row, and of the covariance's lower half."""
+KAPPA, SCALE, PLAY, LAG, TIP_ANGLE, BEHIND_PLAY, PER_SIZE = range(P + PAIRS, P + PAIRS + 7)
+"""Rows of curvature [1/m], insertion scale (length that the needle goes in per insertion), play
+[rad], lag length [m], angles of the tip and of the shaft behind the play since the start [rad],
+derivative of the tip's angle with respect to the torsion's size."""
+NOISE = PER_SIZE + 1
+"""First row of how likely each noise model is."""
+KIND, IS_UNIFORM, WEIGHT, EVIDENCE, OUTLIER = range(NOISE + NOISES, NOISE + NOISES + 5)
+"""Rows of the torsion hypothesis's number, whether noise is thought to be uniform, and the weight;
+and, of the last tip, its likelihood and how likely it was an outlier."""
+ROWS = OUTLIER + 1
+_LOWER = np.tril_indices(ERROR)
+PLACE = np.zeros((ERROR, ERROR), dtype=np.int64)
+"""Row of each element of the covariance."""
+PLACE[_LOWER] = PLACE[_LOWER[::-1]] = P + np.arange(PAIRS)
+
+
+class Tiles(NamedTuple):
+    """The estimates of all needles.
+
+    Attributes
+    ----------
+    state : ndarray, shape (tiles, ROWS, LANES)
+        The numbers; estimate e is in tile e // LANES, lane e % LANES.
+    first : ndarray of int, shape (N + 1,)
+        Each needle's first estimate, and the end of the last's.
+    owner : ndarray of int, shape (tiles * LANES,)
+        Each estimate's needle.
+    """
+
+    state: Array
+    first: npt.NDArray[np.int64]
+    owner: npt.NDArray[np.int64]
+
+
+def tiles_of(numbers: Array, counts: npt.NDArray[np.int64]) -> Tiles:
+    """Return estimates in tiles.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (M, ROWS)
+        All estimates, needle by needle.
+    counts : ndarray of int, shape (N,)
+        How many each needle has, at least 1.
+    """
+    first = np.concatenate([[0], np.cumsum(counts)])
+    filling = -len(numbers) % LANES
+    filled = np.concatenate([numbers, np.repeat(numbers[-1:], filling, axis=0)])
+    filled[len(numbers) :, WEIGHT] = 0.0
+    owner = np.repeat(np.arange(len(counts)), counts)
+    return Tiles(
+        np.ascontiguousarray(filled.reshape(-1, LANES, ROWS).transpose(0, 2, 1)),
+        first,
+        np.concatenate([owner, np.repeat(owner[-1:], filling)]),
+    )
+
+
+def rows(tiles: Tiles, first: int, count: int) -> Array:
+    """Return some rows of all estimates, shape (M, count), the filling left out."""
+    picked = tiles.state[:, first : first + count].transpose(0, 2, 1).reshape(-1, count)
+    return np.asarray(picked[: tiles.first[-1]])
+
+
+def set_rows(tiles: Tiles, first: int, values: Array) -> None:
+    """Write rows of all estimates: the inverse of `rows`, values of shape (M, count)."""
+    every = np.arange(tiles.first[-1])
+    tiles.state[every // LANES, first : first + values.shape[1], every % LANES] = values
+
+
+def tidied(tiles: Tiles) -> Tiles:
+    """Return the tiles with one estimate of weight 0 for each needle at most, its last."""
+    picked, counts = np.empty_like(tiles.owner), np.zeros(len(tiles.first) - 1, dtype=np.int64)
+    count = _pick(tiles, picked, counts)
+    if count == tiles.first[-1]:
+        return tiles
+    filled = -(-count // LANES) * LANES
+    picked[count:filled] = picked[count - 1]
+    state = np.empty((filled // LANES, ROWS, LANES))
+    _gather(tiles.state, picked[:filled], state)
+    state[-1, WEIGHT, LANES - (filled - count) :] = 0.0
+    return Tiles(state, np.concatenate([[0], np.cumsum(counts)]), tiles.owner[picked[:filled]])
+
+
+def covariances(tiles: Tiles) -> Array:
+    """Return the whole covariances of all estimates, shape (M, 9, 9)."""
+    lower = rows(tiles, P, PAIRS)
+    whole = np.empty((len(lower), ERROR, ERROR))
+    whole[:, _LOWER[0], _LOWER[1]] = lower
+    whole[:, _LOWER[1], _LOWER[0]] = lower
+    return whole
+
+
+def lower_half(covariance: Array) -> Array:
+    """Return the rows of symmetric matrices, (..., 9, 9) to (..., 45): undoes `covariances`."""
+    return covariance[..., _LOWER[0], _LOWER[1]]
+
+
+@compiled
+def _pick(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> int:
+    """Write which estimates stay, and how many of each needle; return how many in all."""
+    count = 0
+    for n in range(counts.size):
+        before, ended = count, -1
+        for e in range(tiles.first[n], tiles.first[n + 1]):
+            if tiles.state[e // LANES, WEIGHT, e % LANES] > 0.0:
+                picked[count] = e
+                count += 1
+            else:
+                ended = e
+        if ended >= 0:
+            picked[count] = ended
+            count += 1
+        counts[n] = count - before
+    return count
+
+
+@compiled
+def _gather(state: Array, picked: npt.NDArray[np.int64], target: Array) -> None:
+    for e in range(picked.size):
+        source, lane = state[picked[e] // LANES], picked[e] % LANES
+        for row in range(ROWS):
+            target[e // LANES, row, e % LANES] = source[row, lane]

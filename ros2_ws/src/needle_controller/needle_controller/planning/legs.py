@@ -1,0 +1,229 @@
+"""A leg of a path: the bevel is turned towards an aim, the needle bends, then goes on straight.
+
+While the bevel turns at its greatest rate the tip follows a helix; then an arc of the needle's
+curvature leads until the aim is straight ahead; then, the bevel turned to and fro or spun, the mean
+path is straight. Poses are (3, 4) arrays: the rotation's columns, then the position, in `rig`.
+"""
+
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from needle_common.compiled import compiled
+from needle_controller.model.arrays import Array
+
+_TURN_ITERATIONS = 10
+_TURN_FOUND = 2e-3
+_LARGEST_TURN = 1.3 * math.pi
+"""Where the way is longer, the other way round is taken [rad]."""
+_LONGEST_CHORD = 0.005
+"""An arc of 122 mm radius is 0.03 mm off such a chord [m]."""
+_LONGEST_STRAIGHT = 0.01
+MOST_POINTS = 96
+_AHEAD = 1e-4
+"""Distance aside within which an aim counts as straight ahead [m]."""
+
+
+class Leg(NamedTuple):
+    """One leg of a path.
+
+    Attributes
+    ----------
+    turn : float
+        Of the bevel at its start [rad].
+    turning, bend, straight : float
+        Lengths: while the bevel turns, of the arc after that, and of the straight rest [m].
+    curvature : float
+        Of the arc [1/m].
+    miss : float
+        Distance by which it passes the aim; 0 where it leads there [m].
+    scarce : float
+        The same for a share of the curvature: the rest is held back to correct with [m].
+    """
+
+    turn: float
+    turning: float
+    bend: float
+    straight: float
+    curvature: float
+    miss: float
+    scarce: float
+
+
+@compiled
+def move(pose: Array, length: float, turn: float, curvature: float, moved: Array) -> None:
+    """Write where one advance takes a tip: exp((V1 length + V2 turn)^) of [KC09] (2).
+
+    Parameters
+    ----------
+    pose, moved : ndarray, shape (3, 4)
+        Before and, written, after; may be the same.
+    length : float
+        Inserted [m].
+    turn : float
+        Of the tip about its axis over it [rad].
+    curvature : float
+        kappa [1/m].
+    """
+    x, z = curvature * length, turn
+    q = x * x + z * z
+    if q < 1e-8:
+        a, b, c = 1.0 - q / 6.0, 0.5 - q / 24.0, 1.0 / 6.0 - q / 120.0
+    else:
+        angle = math.sqrt(q)
+        a = math.sin(angle) / angle
+        b = 2.0 * (math.sin(0.5 * angle) / angle) ** 2
+        c = (1.0 - a) / q
+    sx, sy, sz = c * x * z * length, -b * x * length, (1.0 - c * x * x) * length
+    for i in range(3):
+        r0, r1, r2 = pose[i, 0], pose[i, 1], pose[i, 2]
+        moved[i, 3] = pose[i, 3] + r0 * sx + r1 * sy + r2 * sz
+        moved[i, 0] = r0 * (1.0 - b * z * z) + r1 * a * z + r2 * b * x * z
+        moved[i, 1] = -r0 * a * z + r1 * (1.0 - b * q) + r2 * a * x
+        moved[i, 2] = r0 * b * x * z - r1 * a * x + r2 * (1.0 - b * x * x)
+
+
+@compiled
+def seen_from(pose: Array, aim: Array) -> tuple[float, float, float]:
+    """Return a point in the axes of a tip [m].
+
+    Parameters
+    ----------
+    pose : ndarray, shape (3, 4)
+        The tip's.
+    aim : ndarray, shape (3,)
+        The point.
+    """
+    x, y, z = aim[0] - pose[0, 3], aim[1] - pose[1, 3], aim[2] - pose[2, 3]
+    return (
+        pose[0, 0] * x + pose[1, 0] * y + pose[2, 0] * z,
+        pose[0, 1] * x + pose[1, 1] * y + pose[2, 1] * z,
+        pose[0, 2] * x + pose[1, 2] * y + pose[2, 2] * z,
+    )
+
+
+@compiled
+def leg_towards(pose: Array, aim: Array, curvature: float, share: float, turn_rate: float) -> Leg:
+    """Return the leg that leads from a tip to an aim.
+
+    The turn, after which the aim lies in the plane of the bend, is found by iteration; arc and
+    straight rest are the tangent to the arc's circle through the aim, in closed form.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (3, 4)
+        Of the tip.
+    aim : ndarray, shape (3,)
+        Where to [m].
+    curvature : float
+        kappa [1/m].
+    share : float
+        Share of it that `scarce` is for.
+    turn_rate : float
+        Most that the bevel turns per inserted length [rad/m].
+    """
+    x, y, z = seen_from(pose, aim)
+    turn, change = 0.0, 0.0
+    turned = np.empty((3, 4))
+    first, aside, ahead = math.atan2(x, -y), math.hypot(x, y), z
+    if aside > _AHEAD:
+        change = first
+        for _ in range(_TURN_ITERATIONS):
+            turn += change
+            if abs(turn) > _LARGEST_TURN:
+                # The other way round is shorter.
+                turn -= math.copysign(2.0 * math.pi, turn)
+            move(pose, abs(turn) / turn_rate, turn, curvature, turned)
+            x, y, z = seen_from(turned, aim)
+            change = math.atan2(x, -y)
+            if abs(change) < _TURN_FOUND:
+                break
+    gentle = 2.0 * aside / (aside * aside + ahead * ahead)
+    if abs(change) >= _TURN_FOUND and gentle < curvature * share and ahead > 0.0:
+        # So nearly ahead that the bevel bends past it while it turns: to and fro, on the mean.
+        angle = 2.0 * math.atan2(aside, ahead)
+        return Leg(first, 0.0, angle / gentle, 0.0, gentle, 0.0, 0.0)
+    aside, turning = math.hypot(x, y), abs(turn) / turn_rate
+    if z <= 0.0:
+        return Leg(turn, turning, 0.0, 0.0, curvature, aside - z, aside - z)
+    scarce, _ = _tangent(aside, z, 1.0 / (curvature * share))
+    radius = 1.0 / curvature
+    miss, straight = _tangent(aside, z, radius)
+    angle = math.atan2(z, radius - aside) - math.atan2(straight, radius)
+    return Leg(turn, turning, max(angle, 0.0) * radius, straight, curvature, miss, scarce)
+
+
+@compiled
+def _tangent(aside: float, ahead: float, radius: float) -> tuple[float, float]:
+    """Return how deep in a circle a point lies, and its tangent's length if it lies outside [m]."""
+    over = radius - aside
+    square = ahead * ahead + over * over - radius * radius
+    if square < 0.0:
+        return radius - math.hypot(ahead, over), 0.0
+    return 0.0, math.sqrt(square)
+
+
+@compiled
+def cut_short(leg: Leg, longest: float) -> Leg:
+    """Return a leg that ends after a length [m], or where it ends anyway."""
+    turning = min(leg.turning, longest)
+    turn = leg.turn
+    if turning < leg.turning:
+        turn *= turning / leg.turning
+    bend = min(leg.bend, longest - turning)
+    straight = min(leg.straight, longest - turning - bend)
+    return Leg(turn, turning, bend, straight, leg.curvature, leg.miss, leg.scarce)
+
+
+@compiled
+def leg_length(leg: Leg) -> float:
+    """Return the length of a leg [m]."""
+    return leg.turning + leg.bend + leg.straight
+
+
+@compiled
+def trace(pose: Array, leg: Leg, curvature: float, length: float, points: Array, end: Array) -> int:
+    """Write the corners of a chain that follows a leg; return how many.
+
+    Parameters
+    ----------
+    pose : ndarray, shape (3, 4)
+        Where it starts.
+    leg : Leg
+        What is followed.
+    curvature : float
+        kappa [1/m].
+    length : float
+        Of the path up to there [m].
+    points : ndarray, shape (MOST_POINTS, 4), written
+        Corners, the start among them, and the path's length there [m].
+    end : ndarray, shape (3, 4), written
+        The tip's pose at the end.
+    """
+    end[:] = pose
+    points[0, :3] = pose[:, 3]
+    points[0, 3] = length
+    count = 1
+    if leg.turning == 0.0:
+        move(end, 0.0, leg.turn, 0.0, end)
+    parts = (
+        (leg.turning, leg.turn, curvature, _LONGEST_CHORD),
+        (leg.bend, 0.0, leg.curvature, _LONGEST_CHORD),
+        (leg.straight, 0.0, 0.0, _LONGEST_STRAIGHT),
+    )
+    for inserted, turn, bend, longest in parts:
+        if inserted <= 0.0:
+            continue
+        pieces = min(math.ceil(inserted / longest), (MOST_POINTS - 1) // 3)
+        for _ in range(pieces):
+            move(end, inserted / pieces, turn / pieces, bend, end)
+            length += inserted / pieces
+            points[count, :3] = end[:, 3]
+            points[count, 3] = length
+            count += 1
+    return count

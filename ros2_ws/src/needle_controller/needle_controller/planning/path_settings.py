@@ -1,0 +1,66 @@
+"""What paths are planned with, and what is known where one begins."""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple
+
+from needle_common.settings.bounds import Bounds
+
+
+# Read by compiled code.
+class PathSettings(NamedTuple):
+    """What a path is planned with.
+
+    Attributes
+    ----------
+    max_rotation_per_length : float
+        Most that the bevel turns per inserted length [rad/m].
+    curvature_share : float
+        Share of the curvature with which the target should be within reach: the rest corrects.
+    largest_curvature_share : float
+        Share of the curvature with which it must be before the needle is in.
+    needle_radius : float
+        Of the needle [m].
+    sigmas : float
+        So many standard deviations of what is unknown must be clear, beside the needle's radius.
+    settled_std : float
+        By how much a needle strays from the path that it follows [m].
+    correction_length : float
+        Insertion after which what is not known now has been seen and steered back [m].
+    committed_length : float
+        Insertion for which a path must be clear by what is known now: what is farther is planned
+        anew, from what is seen on the way, before the needle is there [m].
+    comfort : float
+        What a path had better be clear by beyond what it must be [m].
+    comfort_price : float
+        Length that a path may be longer for each length that it is clearer by, up to there.
+    longest : float
+        Of a path from the entry on [m].
+    """
+
+    max_rotation_per_length: Annotated[float, Bounds(1.0, 1e5, "rad/m")]
+    curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.8
+    largest_curvature_share: Annotated[float, Bounds(0.5, 1.0, "-")] = 0.9
+    needle_radius: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.00035
+    sigmas: Annotated[float, Bounds(0.0, 10.0, "-")] = 2.0
+    settled_std: Annotated[float, Bounds(0.0, 0.01, "m")] = 0.0002
+    correction_length: Annotated[float, Bounds(1e-3, 0.2, "m")] = 0.03
+    committed_length: Annotated[float, Bounds(1e-3, 0.2, "m")] = 0.01
+    comfort: Annotated[float, Bounds(0.0, 0.02, "m")] = 0.0015
+    comfort_price: Annotated[float, Bounds(0.0, 100.0, "-")] = 4.0
+    longest: Annotated[float, Bounds(0.001, 1.0, "m")] = 0.2
+
+
+class Unknown(NamedTuple):
+    """How well the tip's pose is known where a path begins.
+
+    Attributes
+    ----------
+    position_std : float
+        Of the tip, across the needle [m].
+    heading_std : float
+        Of its heading [rad].
+    """
+
+    position_std: float
+    heading_std: float

@@ -1,0 +1,77 @@
+"""The layout of estimates: what is written is what is read, and what has ended goes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from needle_controller.bank.estimate_tiles import (
+    ERROR,
+    LANES,
+    PAIRS,
+    PLACE,
+    ROWS,
+    WEIGHT,
+    P,
+    R,
+    X,
+    covariances,
+    lower_half,
+    rows,
+    set_rows,
+    tidied,
+    tiles_of,
+)
+
+COUNTS = np.array([LANES - 3, 9, 2 * LANES])
+
+
+def numbers(seed: int = 1) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(0.1, 1.0, (int(np.sum(COUNTS)), ROWS))
+
+
+def test_rows_come_back() -> None:
+    written = numbers()
+    tiles = tiles_of(written, COUNTS)
+    np.testing.assert_array_equal(rows(tiles, X, 3), written[:, X : X + 3])
+    # The second needle's fourth estimate: the second tile's first lane.
+    e = tiles.first[1] + 3
+    assert tiles.state[1, R + 5, 0] == written[e, R + 5]
+    assert tiles.owner[e] == 1
+    set_rows(tiles, R, -written[:, R : R + 9])
+    np.testing.assert_array_equal(rows(tiles, R, 9), -written[:, R : R + 9])
+
+
+def test_what_fills_the_last_tile_has_no_weight() -> None:
+    tiles = tiles_of(numbers(), COUNTS)
+    weights = tiles.state[:, WEIGHT].ravel()
+    assert np.all(weights[: tiles.first[-1]] > 0.0)
+    assert len(weights) > tiles.first[-1]
+    np.testing.assert_array_equal(weights[tiles.first[-1] :], 0.0)
+
+
+def test_covariances_come_back_whole() -> None:
+    factor = np.random.default_rng(2).normal(size=(int(np.sum(COUNTS)), ERROR, ERROR))
+    wanted = factor @ np.swapaxes(factor, -1, -2)
+    written = numbers()
+    written[:, P : P + PAIRS] = lower_half(wanted)
+    tiles = tiles_of(written, COUNTS)
+    np.testing.assert_allclose(covariances(tiles), wanted)
+    assert tiles.state[0, PLACE[3, 7], 5] == tiles.state[0, PLACE[7, 3], 5] == wanted[5, 7, 3]
+
+
+def test_what_has_ended_goes_but_one_of_each_needle() -> None:
+    written = numbers()
+    ends = np.random.default_rng(3).random(len(written)) < 0.5
+    # All of the first needle's go on.
+    ends[: COUNTS[0]] = False
+    written[ends, WEIGHT] = 0.0
+    tiles = tidied(tiles_of(written, COUNTS))
+    for n in range(3):
+        kept = rows(tiles, 0, ROWS)[tiles.first[n] : tiles.first[n + 1]]
+        mine = np.repeat(np.arange(3), COUNTS) == n
+        going = written[mine & ~ends]
+        np.testing.assert_array_equal(kept[: len(going)], going)
+        assert len(kept) == len(going) + (n > 0)
+        np.testing.assert_array_equal(kept[len(going) :, WEIGHT], 0.0)
+        np.testing.assert_array_equal(tiles.owner[tiles.first[n] : tiles.first[n + 1]], n)
+    np.testing.assert_array_equal(tiles.state[:, WEIGHT].ravel()[tiles.first[-1] :], 0.0)

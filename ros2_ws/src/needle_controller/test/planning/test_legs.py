@@ -1,0 +1,92 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.planning.legs import (
+    MOST_POINTS,
+    cut_short,
+    leg_length,
+    leg_towards,
+    move,
+    trace,
+)
+
+CURVATURE = 1.0 / 0.122
+RATE = math.radians(30.0) / 0.001
+
+
+def pose_of(roll: float = 0.0, pitch: float = 0.0, yaw: float = 0.0) -> Array:
+    pose = np.zeros((3, 4))
+    pose[:, :3] = rotation_from_angles([yaw, pitch, roll])
+    return pose
+
+
+@pytest.mark.parametrize(("length", "turn"), [(0.03, 1.5), (1e-5, 0.0), (0.002, -3.0), (0.0, 1.0)])
+def test_an_advance_is_the_exponential_of_its_twist(length: float, turn: float) -> None:
+    pose, moved = pose_of(0.7, 0.3, -0.2), np.empty((3, 4))
+    move(pose, length, turn, CURVATURE, moved)
+    bend = CURVATURE * length
+    twist = np.array(
+        [[0, -turn, 0, 0], [turn, 0, -bend, 0], [0, bend, 0, length], [0, 0, 0, 0]], dtype=float
+    )
+    before = np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+    np.testing.assert_allclose(moved, (before @ expm(twist))[:3], atol=1e-12)
+    move(pose, length, turn, CURVATURE, pose)
+    np.testing.assert_allclose(pose, moved)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_a_leg_leads_to_its_aim(seed: int) -> None:
+    rng = np.random.default_rng([11, seed])
+    pose = pose_of(*rng.uniform([-math.pi, -0.3, -0.3], [math.pi, 0.3, 0.3]))
+    aim = pose[:, :3] @ [*rng.uniform(-0.008, 0.008, 2), rng.uniform(0.06, 0.12)]
+    leg = leg_towards(pose, aim, CURVATURE, 0.8, RATE)
+    points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
+    count = trace(pose, leg, CURVATURE, 0.01, points, end)
+    assert leg.miss == leg.scarce == 0.0
+    assert leg.turning in (0.0, pytest.approx(abs(leg.turn) / RATE))
+    assert leg.curvature <= CURVATURE
+    np.testing.assert_allclose(end[:, 3], aim, atol=1e-4)
+    np.testing.assert_allclose(points[count - 1, :3], end[:, 3])
+    assert points[0, 3] == 0.01
+    assert points[count - 1, 3] == pytest.approx(0.01 + leg_length(leg))
+    assert np.all(np.linalg.norm(np.diff(points[:count, :3], axis=0), axis=1) < 0.0101)
+
+
+def test_an_aim_within_the_circle_is_missed_by_how_deep_it_lies() -> None:
+    # The needle bends to -y; the circle's centre is at y = -R. Here 3 mm within it.
+    radius = 1.0 / CURVATURE
+    aim = np.array([0.0, -radius + (radius - 0.003) * math.cos(0.4), 0.0])
+    aim[2] = (radius - 0.003) * math.sin(0.4)
+    leg = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
+    assert leg.miss == pytest.approx(0.003, abs=1e-6)
+    assert leg.scarce > leg.miss
+    behind = leg_towards(pose_of(), np.array([0.0, -0.001, -0.02]), CURVATURE, 0.8, RATE)
+    assert behind.miss > 0.02
+
+
+def test_scarce_is_what_a_share_of_the_curvature_misses() -> None:
+    aim = np.array([0.0, -0.0148, 0.0605])
+    full = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
+    share = leg_towards(pose_of(), aim, 0.8 * CURVATURE, 1.0, RATE)
+    assert full.miss == 0.0
+    assert full.scarce == pytest.approx(share.miss)
+    assert full.scarce > 1e-4
+
+
+@pytest.mark.parametrize("longest", [0.001, 0.01, 0.06, 1.0])
+def test_a_leg_is_cut_where_its_whole_goes_through(longest: float) -> None:
+    aim = np.array([0.006, 0.003, 0.09])
+    whole = leg_towards(pose_of(), aim, CURVATURE, 0.8, RATE)
+    part = cut_short(whole, longest)
+    assert leg_length(part) == pytest.approx(min(longest, leg_length(whole)))
+    points, end = np.empty((MOST_POINTS, 4)), np.empty((3, 4))
+    trace(pose_of(), part, CURVATURE, 0.0, points, end)
+    rest = leg_towards(end, aim, CURVATURE, 0.8, RATE)
+    assert leg_length(part) + leg_length(rest) == pytest.approx(leg_length(whole), abs=1e-4)
