@@ -51,6 +51,7 @@ _AFTER = ("timing", "events")
 TILES = (
     ("r1 at the start", "r1_initial_mm", "{:+.2f}", "mm"),
     ("r1 at the end (true)", "r1_final_mm", "{:+.2f}", "mm"),
+    ("Distance from the point at the end (true)", "point_error_mm", "{:.2f}", "mm"),
     ("r1 RMS, last 20 mm", "r1_rms_last_20_mm", "{:.2f}", "mm"),
     ("Tip error, 95 %", "tip_error_p95_mm", "{:.2f}", "mm"),
     ("Depth error, 95 %", "depth_error_p95_mm", "{:.2f}", "mm"),
@@ -121,13 +122,16 @@ def verdict_text(summary: Mapping[str, JsonValue]) -> tuple[str, str]:
             f"The bag has no sim/tip_pose, so it cannot tell how far the tip is from the plane. "
             f"Inserted {depth}."
         )
-    distance = f"The tip ended {html_page.number(final, '{:+.2f} mm')} from the wanted plane"
+    target, distance = "plane", html_page.number(final, "{:+.2f} mm")
+    if summary["point_error_mm"] is not None:
+        target, distance = "point", html_page.number(summary["point_error_mm"], "{:.2f} mm")
+    distance = f"The tip ended {distance} from the wanted {target}"
     if summary["converged"]:
         return "Converged", f"{distance} (goal: within ±1 mm), {depth} deep."
     if not summary["reached_depth"]:
         reason = summary["reason"] or f"state {summary['state'] or 'unknown'}"
         return "Not finished", f"{distance}, but stopped at {depth}: {reason}."
-    return "Missed the plane", f"{distance} (goal: within ±1 mm), {depth} deep."
+    return f"Missed the {target}", f"{distance} (goal: within ±1 mm), {depth} deep."
 
 
 def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> str:

@@ -148,7 +148,7 @@ class TopicResult:
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """All that was compared."""
+    """Result of comparing two bags."""
 
     topics: tuple[TopicResult, ...]
     fields: tuple[FieldResult, ...]

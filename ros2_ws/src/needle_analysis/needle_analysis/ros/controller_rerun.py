@@ -13,11 +13,11 @@ from needle_bags.reading.bag_order import SentMessage, messages_as_sent
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_common.errors import UserError
 from needle_common.ros.conversions import to_nanoseconds, values_of
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessage
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SteeringState
-from needle_controller.ros.conversions import TARGET_PLANE, to_joint_sample
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.ros.conversions import TARGET_PLANE, TARGET_POINT, to_joint_sample
 from needle_controller.ros.steering_messages import SteeringMessages, output_messages
 
 _STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
@@ -34,7 +34,7 @@ class ControllerStage:
 
     Parameters
     ----------
-    parameters : PlaneControllerParameters
+    settings : SteeringSettings
         The node's, as the run began.
     node : str
         The node's full name in the bag, whose changes of parameters are taken over.
@@ -53,14 +53,13 @@ class ControllerStage:
 
     def __init__(
         self,
-        parameters: PlaneControllerParameters,
+        settings: SteeringSettings,
         node: str,
         ends: Mapping[int, JointSample],
         unheard: frozenset[HeardMessage],
     ) -> None:
-        self._parameters = parameters
         self._node = node
-        self._messages = SteeringMessages(parameters)
+        self._messages = SteeringMessages(settings)
         self._steering = self._messages.steering
         self._ends = ends
         self._unheard = unheard
@@ -73,6 +72,7 @@ class ControllerStage:
             **{topic: row.take for topic, row in self._messages.inputs.items()},
             "device/result": self._take_result,
             TARGET_PLANE: self._take_plane,
+            TARGET_POINT: self._take_point,
             "needle/controller_status": self._take_status,
             "/parameter_events": self._take_parameters,
         }
@@ -109,6 +109,12 @@ class ControllerStage:
             self.notes.append(f"target_plane refused: {self._messages.plane_complaint}")
         return actions
 
+    def _take_point(self, message: Any, sent_ns: int) -> Iterable[Action]:
+        actions = self._messages.inputs[TARGET_POINT].take(message, sent_ns)
+        if self._messages.point_complaint:
+            self.notes.append(f"target_point refused: {self._messages.point_complaint}")
+        return actions
+
     def _take_status(self, message: Any, _: int) -> Iterable[Action]:
         """Start, stop and lose patience where the recorded controller did.
 
@@ -141,20 +147,19 @@ class ControllerStage:
     def _take_parameters(self, message: Any, _: int) -> Iterable[Action]:
         if message.node != self._node:
             return ()
-        known = {field.name for field in dataclasses.fields(self._parameters)}
+        known = {field.name for field in dataclasses.fields(SteeringSettings)}
         changes: dict[str, Any] = {}
         for parameter in message.changed_parameters:
             if parameter.name in known:
                 value = plain_value(parameter.value)
                 changes[parameter.name] = tuple(value) if isinstance(value, list) else value
         try:
-            values = dataclasses.replace(self._parameters, **changes)
+            settings = dataclasses.replace(self._steering.settings, **changes)
         except UserError as error:
             self.notes.append(f"change of parameters refused: {error}")
             return ()
-        if values != self._parameters:
-            self._messages.change_parameters(values)
-            self._parameters = values
+        if settings != self._steering.settings:
+            self._steering.configure(settings)
         return ()
 
 

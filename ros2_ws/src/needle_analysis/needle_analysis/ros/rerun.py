@@ -31,8 +31,7 @@ from needle_common.commands.options import CommandParser, output_file
 from needle_common.errors import UserError
 from needle_common.ros.parameters import OF_EVERY_NODE
 from needle_common.settings.parameter_files import read_parameters
-from needle_controller.presets.control_settings import PRESETS
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
 
@@ -221,7 +220,7 @@ def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
 
 
 def _controller(run: Run, node: Node) -> ControllerStage:
-    parameters = node.parameters(PlaneControllerParameters)
+    parameters = node.parameters(SteeringSettings)
     ends = step_ends(run.path, run.namespace)
     unheard = unheard_messages(run.path, run.namespace)
     return ControllerStage(parameters, node.name, ends, unheard)

@@ -33,12 +33,15 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     -------
     dict
         The keys of `scripts/simulate --json`; null for what the bag does not tell. r1 is the
-        signed true distance of the tip from the wanted plane.
+        signed true distance of the tip from the wanted plane, point_error its distance at the end
+        from the wanted point, null where the needle was not steered to one.
     """
     r1 = true_r1(run)
     depth = run.insertion_at(run.truth.stamps)
     error = tip_error(run)
     final = float(r1[-1]) if len(r1) else None
+    missed = point_error(run)
+    off = missed if missed is not None else final
     done = reached_depth(run)
     steps = sum(result.outcome == "succeeded" for result in run.results)
     insertion = run.joints.values[:, 0]
@@ -49,10 +52,11 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "rerun_of": rerun_of(run),
         "seed": _whole(run.run_info.get("seed"), run.parameter("sim_rig", "seed")),
         "steps": steps,
-        "converged": final is not None and abs(final) <= GOAL and done,
+        "converged": off is not None and abs(off) <= GOAL and done,
         "reached_depth": done,
         "r1_initial_mm": _mm(float(r1[0])) if len(r1) else None,
         "r1_final_mm": _mm(final),
+        "point_error_mm": _mm(missed),
         "r1_rms_last_20_mm": _mm(_rms_of_last(r1, depth)),
         "tip_error_p95_mm": _mm(_p95(np.linalg.norm(error, axis=1))),
         "depth_error_p95_mm": _mm(_p95(np.abs(error[:, 0]))),
@@ -90,6 +94,17 @@ def target_offset(run: Run) -> float:
     except ValueError:
         told = run.parameter("plane_controller", "target_offset")
         return float(told) if isinstance(told, (int, float)) else 0.0
+
+
+def point_error(run: Run) -> float | None:
+    """Return the true tip's distance at the end from the point it was steered to, if it was [m]."""
+    try:
+        point = [float(part) for part in run.last_status("target_point_m").split(",")]
+    except ValueError:
+        return None
+    if len(point) != 3 or not len(run.truth):
+        return None
+    return float(np.linalg.norm(run.truth.values[-1, :3] - point))
 
 
 def true_r1(run: Run) -> Floats:

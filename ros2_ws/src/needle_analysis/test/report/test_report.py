@@ -17,6 +17,7 @@ from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import commanded_rotation, summarize
 from needle_bags.reading.bag_reader import HealthEvent, Result, Status, read_run
+from needle_common.commands.cli import JsonValue
 
 MakeRun = Callable[..., Path]
 
@@ -186,6 +187,26 @@ def test_verdicts(make_run: MakeRun) -> None:
     assert "no tip for 2 s" in verdict_text(stopped)[1]
     missed = summarize(read_run(make_run("missed", steps=60)))
     assert verdict_text(missed)[0] == "Missed the plane"
+
+
+def test_a_run_to_a_point_is_judged_by_the_point(make_run: MakeRun) -> None:
+    run = read_run(make_run("to_a_point", steps=60))
+    last = run.controller_status[-1]
+
+    def told(text: str) -> dict[str, JsonValue]:
+        status = dataclasses.replace(last, values={**last.values, "target_point_m": text})
+        return summarize(dataclasses.replace(run, controller_status=[status]))
+
+    x, y, z = run.truth.values[-1, :3]
+    near = told(f"{x!s}, {y + 0.0003!s}, {z - 0.0004!s}")
+    assert near["point_error_mm"] == pytest.approx(0.5)
+    assert near["converged"] is True
+    assert "0.50 mm from the wanted point" in verdict_text(near)[1]
+    far = told(f"{x!s}, {y + 0.002!s}, {z!s}")
+    assert far["converged"] is False
+    assert verdict_text(far)[0] == "Missed the point"
+    for nothing in ("", "1, 2", "a, b, c"):
+        assert told(nothing)["point_error_mm"] is None
 
 
 def test_texts_from_the_bag_cannot_be_markup(make_run: MakeRun) -> None:

@@ -23,7 +23,7 @@ from needle_bags.format.bag_copy import BagCopy, standard_text, standard_topic
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import read_run
-from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_tracker.optics.calibration import StereoCalibration, parse_calibration
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -130,15 +130,15 @@ def test_another_preset_is_a_run_of_its_own(
 def test_a_gain_that_is_off_by_a_hundredth_is_seen(
     paper_bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    designed = ControlSettings.gains
+    designed = SteeringSettings.gains
 
-    def off(settings: ControlSettings) -> Any:
+    def off(settings: SteeringSettings) -> Any:
         gains = designed(settings)
         feedback = np.array(gains.feedback, copy=True)
         feedback.flat[0] *= 1.01
         return dataclasses.replace(gains, feedback=feedback)
 
-    monkeypatch.setattr(ControlSettings, "gains", off)
+    monkeypatch.setattr(SteeringSettings, "gains", off)
     result = tmp_path / "result.json"
     assert rerun(paper_bag, "--json", result) == 1
     assert "needle_control_input_v" in changed_fields(result)

@@ -20,9 +20,9 @@ from needle_bags.format.bag_copy import BagCopy
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import SentMessage, raw_as_sent
 from needle_bags.reading.bag_reader import read_run
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages
 from needle_controller.ros import conversions
-from needle_controller.ros.parameters import PlaneControllerParameters
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 BAG = Path(__file__).resolve().parents[5] / "bags" / "regression"
@@ -44,14 +44,14 @@ OUTPUTS = {f"/{topic}" for topic in TYPES if topic not in DELAYS}
 
 
 @functools.cache
-def settings() -> PlaneControllerParameters:
+def settings() -> SteeringSettings:
     run = read_run(BAG)
-    names = PlaneControllerParameters.__dataclass_fields__
+    names = SteeringSettings.__dataclass_fields__
     known = {n: run.parameter("plane_controller", n) for n in names}
     values: dict[str, Any] = {
         n: tuple(v) if isinstance(v, list) else v for n, v in known.items() if v is not None
     }
-    return PlaneControllerParameters(**values)
+    return SteeringSettings(**values)
 
 
 @functools.cache

@@ -10,7 +10,8 @@ from pathlib import Path
 from needle_bags.format.topic_choice import TopicChoice
 from needle_bags.reading.bag_files import BagContents
 from needle_common.commands.options import CommandParser
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.errors import UserError
+from needle_common.settings.bounds import check_bounds
 
 _DESCRIPTION = """\
 Plays a bag: sends its messages again, in their order and at their distances, with the quality of
@@ -18,9 +19,9 @@ service that they were recorded with. Late subscribers get the last message of t
 transient local.
 
 It never speaks to a rig. Commands (device/joint_trajectory), holds (device/hold), emergency stops
-(device/estop), targets (target_plane) and /parameter_events are played under /replay only. Beside
-a living rig (something publishes device/status) everything is; a rig that comes up later ends the
-playing.
+(device/estop), targets (target_plane, target_point, obstacles) and /parameter_events are played
+under /replay only. Beside a living rig (something publishes device/status) everything is; a rig
+that comes up later ends the playing.
 """
 _EPILOG = """\
 While it plays, in a terminal: the space bar pauses and goes on, up and down play a tenth faster
@@ -78,10 +79,10 @@ class PlayerOptions:
 
     def __post_init__(self) -> None:
         """Check the fields."""
-        _require("--rate", self.rate, MIN_RATE, MAX_RATE, "-")
-        _require("--start", self.start, 0.0, 1e9, "s")
+        check_bounds("--rate", self.rate, MIN_RATE, MAX_RATE, "-")
+        check_bounds("--start", self.start, 0.0, 1e9, "s")
         if self.clock is not None:
-            _require("--clock", self.clock, 0.1, 1000.0, "Hz")
+            check_bounds("--clock", self.clock, 0.1, 1000.0, "Hz")
         if not self.end > self.start:
             raise UserError(f"--end {self.end:g} s is not after --start {self.start:g} s")
 
@@ -155,8 +156,3 @@ def _remap(text: str) -> tuple[str, str]:
 
 def _absolute(name: str) -> str:
     return name if name.startswith("/") else f"/{name}"
-
-
-def _require(name: str, value: float, lower: float, upper: float, unit: str) -> None:
-    if not lower <= value <= upper:
-        raise OutOfBoundsError(name, value, lower, upper, unit)

@@ -13,6 +13,8 @@ _GUARDED_NAMES: Final = (
     "/device/hold",
     "/device/estop",
     "/target_plane",
+    "/target_point",
+    "/obstacles",
     "/parameter_events",
 )
 # The same, under whatever name it was recorded.

@@ -85,7 +85,7 @@ class HealthEvent:
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """All that a bag says about one run, images apart (`bag_images`).
+    """Contents of a bag about one run, images apart (`bag_images`).
 
     Attributes
     ----------

@@ -49,6 +49,8 @@ KEPT = (
     "stereo/left/camera_info",
     "stereo/right/camera_info",
     "target_plane",
+    "target_point",
+    "obstacles",
 )
 _COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _STORE = get_typestore(Stores.ROS2_JAZZY)

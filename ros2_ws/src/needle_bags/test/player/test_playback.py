@@ -100,6 +100,7 @@ def test_reading_ahead_hands_on_errors_and_ends_early() -> None:
         ("/device/estop", "std_msgs/msg/Bool"),
         ("/target_plane", POSE),
         ("/rig/target_plane", POSE),
+        ("/target_point", "geometry_msgs/msg/PointStamped"),
         ("/parameter_events", "rcl_interfaces/msg/ParameterEvent"),
     ],
 )

@@ -54,6 +54,8 @@ OPTIONS = {
     "bag": "--bag",
     "preset": "--controller",
     "depth": "--depth-mm",
+    "target_point": "--target",
+    "obstacles": "--obstacles",
 }
 
 # How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
@@ -127,6 +129,11 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         },
         "operator": {"wait_for_recorder": True},
     }
+    if options.target_mm is not None:
+        point = [c * 1e-3 for c in options.target_mm]
+        parameters["plane_controller"]["target_point"] = point
+    if options.obstacles is not None:
+        parameters["plane_controller"]["obstacles"] = _obstacles(options.obstacles)
     if options.noise_mm is not None:
         # The sensor's own data sheet: the controllers know how far off a tip can be.
         bound = max(options.noise_mm * 1e-3, SMALLEST_NOISE)
@@ -137,6 +144,14 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     for node, values in parameters.items():
         values["use_sim_time"] = node != "recorder"
     return {node: parameters[node] for node in nodes_of(options)}
+
+
+def _obstacles(path: Path) -> list[float]:
+    """Return a file's obstacles as plane_controller's parameter has them."""
+    # It brings compiled code along: half a second that only runs with obstacles pay for.
+    from needle_controller.planning.obstacle_files import read_obstacles  # noqa: PLC0415
+
+    return [float(value) for value in read_obstacles(path).table.ravel()]
 
 
 def can_adapter() -> Path:
@@ -179,6 +194,8 @@ def run_info(options: SimulateOptions) -> dict[str, Any]:
         "initial_roll_deg": options.initial_roll_deg,
         "noise_mm": options.noise_mm,
         "depth_mm": options.depth_mm,
+        "target_mm": options.target_mm,
+        "obstacles": None if options.obstacles is None else options.obstacles.name,
         "play_deg": options.play_deg,
         "lag_mm": options.lag_mm,
         "real_time_factor": options.real_time_factor,

@@ -291,6 +291,8 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
     if summary.get("reached_depth"):
         verdict = "CONVERGED" if summary.get("converged") else "MISSED"
         away = f"{figure('r1_final_mm')} mm from the plane"
+        if summary.get("point_error_mm") is not None:
+            away = f"{figure('point_error_mm')} mm from the point"
         head = [f"{verdict}: the tip ends {away} (goal: within 1 mm)"]
     else:
         reason = summary.get("reason") or "no reason given"
@@ -298,10 +300,11 @@ def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:
             f"NOT FINISHED: stopped at {figure('insertion_final_mm', 1)} mm: {reason}",
             f"  r1 there          {figure('r1_final_mm')} mm",
         ]
+    in_plane = f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms"
     lines = [
         *head,
         f"  depth             {figure('insertion_final_mm', 1)} mm in {summary.get('steps')} steps",
-        f"  r1, last 20 mm    {figure('r1_rms_last_20_mm')} mm rms",
+        *([in_plane] if summary.get("point_error_mm") is None else ()),
         f"  tip error         {figure('tip_error_p95_mm')} mm, of which in depth "
         f"{figure('depth_error_p95_mm')} mm (95th percentile)",
         f"  speed             {figure('steps_per_s', 1)} steps/s; {figure('wall_s', 1)} s in all",

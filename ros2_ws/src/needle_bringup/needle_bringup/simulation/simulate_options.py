@@ -37,20 +37,27 @@ examples:
       no steering: where the needle goes by itself (14.6 mm beside the plane; exit code 1)
   scripts/simulate --initial=5,-4,30 --depth-mm 80 --bag bags/my_run
       another start: 5 mm above the plane, pitched 4 deg down, rolled by 30 deg
+  scripts/simulate --target 10,-5,100
+      to a point 100 mm deep, 10 mm above the entry and 5 mm beside it
+  scripts/simulate --target 4,-6,100 --obstacles obstacles.yaml
+      round spheres and capsules, such as
+        frame: rig
+        spheres: [{center: [0.002, -0.003, 0.055], radius: 0.003}]
+        capsules: [{start: [-0.02, 0.006, 0.07], end: [0.02, 0.006, 0.07], radius: 0.003}]
   scripts/simulate --params my_rig.yaml
       with a ROS parameter file on top of the rig's configuration, such as
         plane_controller: {ros__parameters: {max_rotation_per_length: 300.0}}
 
-exit codes: 0 converged (|r1| <= 1 mm at the end), 1 ran but missed, 2 bad input or something
-missing, 130 interrupted.
+exit codes: 0 converged (within 1 mm of plane or point at the end), 1 ran but missed, 2 bad input or
+something missing, 130 interrupted.
 """
 
 LEVELS = ("tip", "camera", "drive")
-CONTROLLERS = (
-    "best", "paper", "open_loop",
-    "kalman", "measured_pitch", "extended_kalman", "orientation_fit",
-)  # fmt: skip
+CONTROLLERS = ("best", "paper", "open_loop")
 """plane_controller's presets; named here again, for to import them takes half a second."""
+
+
+DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,6 +71,8 @@ class SimulateOptions:
     initial_roll_deg: float = 15.0
     noise_mm: float | None = None
     depth_mm: float = 120.0
+    target_mm: tuple[float, float, float] | None = None
+    obstacles: Path | None = None
     play_deg: float = 0.0
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
@@ -90,6 +99,8 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     elif given.noise_mm is not None:
         raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
+    target = None if given.target is None else _target(given.target)
+    depth = given.depth_mm or (DEPTH_MM if target is None else f"{LARGEST_DEPTH_MM:g}")
     factor = number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
     return SimulateOptions(
         level=given.level,
@@ -98,13 +109,15 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         initial_pitch_deg=pitch_deg,
         initial_roll_deg=roll_deg,
         noise_mm=noise,
-        depth_mm=number("--depth-mm", given.depth_mm, 1.0, 150.0, "mm"),
+        depth_mm=number("--depth-mm", depth, 1.0, LARGEST_DEPTH_MM, "mm"),
+        target_mm=target,
+        obstacles=_obstacles(given.obstacles, target),
         play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         bag=_new_bag(given.bag),
-        params=_readable(given.params),
+        params=_readable("--params", given.params),
         json=output_file("--json", given.json),
     )
 
@@ -138,7 +151,23 @@ def _parser() -> CommandParser:
         metavar="A",
         help="level tip: the measured tip is off by up to A mm in each direction (default: 1.0)",
     )
-    add("--depth-mm", default="120", metavar="D", help="how far to insert (default: 120)")
+    add(
+        "--depth-mm",
+        metavar="D",
+        help=f"how far to insert (default: {DEPTH_MM}); with --target at most "
+        f"(default: {LARGEST_DEPTH_MM:g})",
+    )
+    add(
+        "--target",
+        metavar="X_MM,Y_MM,Z_MM",
+        help="steer to this point in place of the plane: X up, Z along the insertion, from the "
+        "entry point",
+    )
+    add(
+        "--obstacles",
+        metavar="FILE",
+        help="with --target: YAML file of spheres and capsules that the needle must not touch",
+    )
     add(
         "--play-deg",
         default="0",
@@ -170,6 +199,17 @@ def _parser() -> CommandParser:
     return parser
 
 
+def _target(text: str) -> tuple[float, float, float]:
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise UserError(f"--target {text!r} is not X_MM,Y_MM,Z_MM, such as 10,-5,100")
+    return (
+        number("--target X_MM", parts[0], -150.0, 150.0, "mm"),
+        number("--target Y_MM", parts[1], -150.0, 150.0, "mm"),
+        number("--target Z_MM", parts[2], 1.0, 150.0, "mm"),
+    )
+
+
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:
     if value not in known:
         raise UserError(f"{name} {value!r} is not one of {', '.join(known)}")
@@ -185,10 +225,16 @@ def _new_bag(text: str | None) -> Path | None:
     return path.absolute()
 
 
-def _readable(text: str | None) -> Path | None:
+def _obstacles(text: str | None, target: tuple[float, float, float] | None) -> Path | None:
+    if text is not None and target is None:
+        raise UserError("--obstacles goes with --target only")
+    return _readable("--obstacles", text)
+
+
+def _readable(name: str, text: str | None) -> Path | None:
     if text is None:
         return None
     path = Path(text).expanduser()
     if not path.is_file():
-        raise UserError(f"--params {text}: no such file")
+        raise UserError(f"{name} {text}: no such file")
     return path

@@ -15,7 +15,7 @@ from needle_bringup.simulation.rig_configuration import (
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import NODES, read_parameters
-from needle_controller.ros.parameters import PlaneControllerParameters
+from needle_controller.presets.steering_settings import SteeringSettings
 
 
 def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
@@ -24,6 +24,28 @@ def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:
     assert parameters["plane_controller"]["target_offset"] == pytest.approx(0.003)
     assert parameters["plane_controller"]["depth"] == pytest.approx(0.08)
     assert parameters["sim_rig"]["initial_pitch"] == pytest.approx(math.radians(2.0))
+
+
+def test_a_target_point_is_one_in_metres() -> None:
+    found = command_line_parameters(SimulateOptions(target_mm=(10.0, -5.0, 100.0)), Path("bag"))
+    assert found["plane_controller"]["target_point"] == pytest.approx([0.010, -0.005, 0.100])
+    assert (
+        "target_point"
+        not in command_line_parameters(SimulateOptions(), Path("b"))["plane_controller"]
+    )
+
+
+def test_obstacles_are_read_into_numbers(tmp_path: Path) -> None:
+    path = tmp_path / "obstacles.yaml"
+    path.write_text(
+        "frame: rig\nspheres: [{center: [0.0, 0.001, 0.05], radius: 0.004}]\n", encoding="utf-8"
+    )
+    options = SimulateOptions(target_mm=(0.0, 0.0, 100.0), obstacles=path)
+    found = command_line_parameters(options, Path("bag"))["plane_controller"]["obstacles"]
+    assert found == [0.0, 0.001, 0.05, 0.0, 0.001, 0.05, 0.004]
+    path.write_text("frame: map\n", encoding="utf-8")
+    with pytest.raises(UserError, match="frame 'map'"):
+        command_line_parameters(options, Path("bag"))
 
 
 def test_only_the_nodes_of_the_level_run() -> None:
@@ -120,7 +142,7 @@ def test_by_hand_is_the_rig_that_simulate_runs() -> None:
     assert told["sim_rig"] == of_needle
     assert told["plane_controller"] == {"depth", "target_offset"}
     assert told["stereo_tracker"] == set()
-    defaults = PlaneControllerParameters()
+    defaults = SteeringSettings()
     assert defaults.tip_covariance == "from_tip_pose"
     assert SimulateOptions().depth_mm == pytest.approx(defaults.depth * 1e3)
 

@@ -4,7 +4,7 @@ import pytest
 
 from needle_bringup.simulation.simulate_options import CONTROLLERS, SimulateOptions, parse
 from needle_common.errors import UserError
-from needle_controller.presets.control_settings import PRESETS
+from needle_controller.presets.steering_settings import PRESETS
 
 
 def test_every_preset_of_the_controller_can_be_asked_for() -> None:
@@ -22,6 +22,25 @@ def test_initial_takes_a_value_that_begins_with_a_minus(words: list[str]) -> Non
     assert start == (-3.0, 2.0, 15.0)
 
 
+@pytest.mark.parametrize("words", [["--target", "-8,5,90"], ["--target=-8,5,90"]])
+def test_a_target_is_a_point_with_all_the_depth_there_is(words: list[str]) -> None:
+    options = parse(words)
+    assert options.target_mm == (-8.0, 5.0, 90.0)
+    assert options.depth_mm == 150.0
+    assert parse([*words, "--depth-mm", "100"]).depth_mm == 100.0
+    assert parse([]).target_mm is None
+
+
+def test_obstacles_go_with_a_target(tmp_path: Path) -> None:
+    path = tmp_path / "obstacles.yaml"
+    path.write_text("frame: rig\n", encoding="utf-8")
+    assert parse(["--target", "0,0,90", "--obstacles", str(path)]).obstacles == path
+    with pytest.raises(UserError, match="--obstacles goes with --target only"):
+        parse(["--obstacles", str(path)])
+    with pytest.raises(UserError, match="--obstacles no such: no such file"):
+        parse(["--target", "0,0,90", "--obstacles", "no such"])
+
+
 def test_noise_belongs_to_level_tip() -> None:
     assert parse(["--level", "tip"]).noise_mm == 1.0
     assert parse(["--level", "tip", "--noise-mm", "0"]).noise_mm == 0.0
@@ -36,6 +55,8 @@ def test_noise_belongs_to_level_tip() -> None:
         (["--controller", "worst"], "worst"),
         (["--level", "x"], "'x'"),
         (["--initial", "-3,2"], "X_MM,PITCH_DEG,ROLL_DEG"),
+        (["--target", "3,2"], "X_MM,Y_MM,Z_MM"),
+        (["--target", "3,2,-5"], "--target Z_MM = -5"),
         (["--initial", "-3,nan,2"], "PITCH_DEG"),
         (["--initial", "-.5,-inf,2"], "PITCH_DEG"),
         (["--initial", "--seed"], "--initial"),

@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 from needle_common.errors import OutOfBoundsError, UserError
+from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_device_driver.link import objects as od
 
 # Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
@@ -67,8 +68,7 @@ class DriveSettings:
         UserError
             A value that is not finite, not positive where it must be, or no homing method.
         """
-        if not 1 <= self.node_id <= 126:
-            raise OutOfBoundsError("node_id", self.node_id, 1, 126, "-")
+        check_bounds("node_id", self.node_id, 1, 126, "-")
         for name in (
             "counts_per_unit",
             "speed",
@@ -78,9 +78,7 @@ class DriveSettings:
             "following_error_time",
             "tolerance",
         ):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise OutOfBoundsError(name, value, 0.0, math.inf, "SI")
+            check_bounds(name, getattr(self, name), ABOVE_0, math.inf, "SI")
         if self.homing_method not in HOMING_METHODS:
             raise UserError(f"homing_method = {self.homing_method} is none of CiA 402's")
         if not self.lower < self.upper:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from needle_common.errors import OutOfBoundsError
+from needle_common.settings.bounds import ABOVE_0, check_bounds
 
 # No configuration reaches beyond these: they are properties of the rig, not of a run.
 HARD_SPEED_CAP = 0.005
@@ -76,7 +76,7 @@ class SafetyLimits:
 
         Raises
         ------
-        OutOfBoundsError
+        UserError
             A limit that is not finite, not positive, or above its hard cap.
         """
         caps = {
@@ -87,10 +87,8 @@ class SafetyLimits:
             "hold_timeout": HARD_HOLD_TIMEOUT_CAP,
         }
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            upper = caps.get(field.name, math.inf)
-            if not (math.isfinite(value) and 0.0 < value <= upper):
-                raise OutOfBoundsError(field.name, value, 0.0, upper, "SI")
+            value, upper = getattr(self, field.name), caps.get(field.name, math.inf)
+            check_bounds(field.name, value, ABOVE_0, upper, "SI")
 
     @property
     def max_rotation(self) -> float:

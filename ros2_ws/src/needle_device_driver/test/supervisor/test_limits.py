@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from needle_common.errors import OutOfBoundsError
+from needle_common.errors import OutOfBoundsError, UserError
 from needle_device_driver.ros.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor import command_stamps, hold, limits, stamp_ages
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -54,7 +54,7 @@ def test_a_hard_bound_is_the_largest_that_can_be_configured(name: str) -> None:
 @pytest.mark.parametrize("name", BOUNDS)
 @pytest.mark.parametrize("bad", [0.0, -1.0, math.nan, math.inf])
 def test_a_bound_that_bounds_nothing_is_refused(name: str, bad: float) -> None:
-    with pytest.raises(OutOfBoundsError, match=name):
+    with pytest.raises(UserError, match=name):
         SafetyLimits(**{name: bad})
 
 
