@@ -23,12 +23,20 @@ from needle_common.process.ros_domain import own_domain
 from needle_controller.model.gains import design_gains
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.studies import control_studies
-from needle_verification.studies.control_studies import BEST, FIGURE_3, PAPER, SPEED, TROUBLE, Study
+from needle_verification.studies.control_studies import (
+    BEST,
+    FIGURE_3,
+    PAPER,
+    SPEED,
+    TOLD_WRONG,
+    TROUBLE,
+    Study,
+)
 from needle_verification.studies.pure_insertions import (
     NOISE,
     RADIUS,
@@ -57,7 +65,7 @@ class Size:
     """
 
     draws: int = 10
-    trouble: tuple[Study, ...] = TROUBLE
+    trouble: tuple[Study, ...] = TROUBLE + TOLD_WRONG
     insertions: int = 3000
 
 
@@ -125,10 +133,10 @@ def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
 
 def bad_parameters(bench: Workbench) -> Iterator[Finding]:
     """Refuse bad parameters and planes with what and why, and keep the last good ones."""
-    weights = np.diag(ControlSettings.state_weights)
+    weights = np.diag(SteeringSettings.state_weights)
     weights[0, 1] = 1.0
     try:
-        settings = ControlSettings()
+        settings = SteeringSettings(**PAPER_NOISE)
         design_gains(
             state_weights=weights,
             input_weight=settings.input_weight,
@@ -224,7 +232,7 @@ CHECKS: tuple[Check, ...] = (
 
 def update_times(preset: str) -> Floats:
     """Return how long each update of a run of 120 steps takes on the processor [s]."""
-    settings = dataclasses.replace(ControlSettings(), preset=preset)
+    settings = SteeringSettings(preset=preset, **PAPER_NOISE)
     control, rng = PlaneControl(settings, offset_plane(0.003)), np.random.default_rng(1)
     length, rotation, seconds = settings.step_length, 0.0, []
     place, turned = np.zeros(3), Rotation.identity()

@@ -22,6 +22,7 @@ from needle_verification.checks import (
     check_control,
     check_driver,
     check_simulation,
+    check_traced,
     check_tracker,
 )
 from needle_verification.descendants import ending_descendants
@@ -29,7 +30,7 @@ from needle_verification.descendants import ending_descendants
 STEPS: Mapping[str, tuple[Check, ...]] = {
     "A": check_simulation.CHECKS,
     "B": check_control.CHECKS,
-    "C": check_tracker.CHECKS,
+    "C": (*check_tracker.CHECKS, *check_traced.CHECKS),
     "D": check_driver.CHECKS,
     "E": check_bags.CHECKS,
 }

@@ -17,8 +17,8 @@ from needle_verification.paper.paper_results import (
     GOAL_MM,
     LONGER_MM,
     Floats,
-    Results,
-    Trial,
+    PaperRuns,
+    SteeringTrial,
 )
 from needle_verification.paper.paper_runs import Columns
 
@@ -48,7 +48,7 @@ _DOTS: dict[str, Any] = {
 }
 
 
-def figures_of(results: Results) -> Mapping[str, Figure]:
+def figures_of(results: PaperRuns) -> Mapping[str, Figure]:
     """Return all figures by their file's name."""
     with mpl.rc_context(STYLE):
         return {
@@ -59,7 +59,7 @@ def figures_of(results: Results) -> Mapping[str, Figure]:
         }
 
 
-def figure_3(results: Results) -> Figure:
+def figure_3(results: PaperRuns) -> Figure:
     """Return three columns: open loop, closed loop, and a trial whose truth is not shown."""
     figure = Figure(figsize=(9.0, 7.6), layout="constrained")
     grid = figure.subplots(4, 3, sharex=True, squeeze=False)
@@ -89,7 +89,7 @@ def figure_3(results: Results) -> Figure:
     return figure
 
 
-def figure_4(trials: list[Trial]) -> Figure:
+def figure_4(trials: list[SteeringTrial]) -> Figure:
     """Return mean and standard deviation of r1 over the trials, and the trial of figure 3."""
     figure = Figure(figsize=(6.6, 3.6), layout="constrained")
     axes = figure.add_subplot()
@@ -105,7 +105,7 @@ def figure_4(trials: list[Trial]) -> Figure:
     return figure
 
 
-def study_figure(results: Results) -> Figure:
+def study_figure(results: PaperRuns) -> Figure:
     """Return how far the study's runs end from the plane, at its depth and farther in."""
     figure = Figure(figsize=(8.4, 3.4), layout="constrained")
     share, later = figure.subplots(1, 2)
@@ -139,7 +139,7 @@ def study_figure(results: Results) -> Figure:
     return figure
 
 
-def domain_figure(results: Results) -> Figure:
+def domain_figure(results: PaperRuns) -> Figure:
     """Return from which starts the needle converges."""
     figure = Figure(figsize=(8.4, 3.8), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
@@ -167,7 +167,7 @@ def domain_figure(results: Results) -> Figure:
     return figure
 
 
-def common_r1(trials: list[Trial]) -> tuple[Floats, Floats]:
+def common_r1(trials: list[SteeringTrial]) -> tuple[Floats, Floats]:
     """Return insertion [mm], (M,), and the trials' estimated r1 there [mm], (trials, M)."""
     deepest = min(float(trial.insertion_mm[-1]) for trial in trials)
     insertion = np.arange(0.0, deepest + 0.5)

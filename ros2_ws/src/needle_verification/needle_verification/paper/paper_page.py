@@ -15,7 +15,7 @@ from needle_verification.paper.paper_results import (
     GRIDS,
     LONGER_MM,
     SCALES,
-    Results,
+    PaperRuns,
     final_r1_mm,
     missed_later,
     settled_mm,
@@ -71,14 +71,14 @@ The white box is what the paper's study covers. Depth 120 mm, +-1 mm noise.
 """
 
 
-def page(results: Results) -> str:
+def page(results: PaperRuns) -> str:
     """Return the whole page."""
     lines = ["| what | paper | here | difference |", "| --- | --- | --- | --- |"]
     lines += ["| " + " | ".join(row) + " |" for row in table(results)]
     return INTRODUCTION + "\n".join(lines) + "\n" + FIGURES
 
 
-def table(results: Results) -> Iterator[Row]:
+def table(results: PaperRuns) -> Iterator[Row]:
     """Yield what, paper's value, ours, and one line on the difference."""
     yield (
         "figure 3, open loop: r1 at 120 mm",
@@ -116,7 +116,7 @@ def table(results: Results) -> Iterator[Row]:
     yield from _curvature_rows(results)
 
 
-def key_figures(results: Results) -> dict[str, JsonValue]:
+def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
     """Return the figures for `--json`."""
     _, r1 = common_r1(results.trials)
     values: dict[str, JsonValue] = {
@@ -147,7 +147,7 @@ def key_figures(results: Results) -> dict[str, JsonValue]:
     return values
 
 
-def _study_rows(results: Results) -> Iterator[Row]:
+def _study_rows(results: PaperRuns) -> Iterator[Row]:
     for grid in GRIDS:
         figures = results.grids[grid]
         yield (
@@ -176,7 +176,7 @@ def _study_rows(results: Results) -> Iterator[Row]:
     )
 
 
-def _robustness_rows(results: Results) -> Iterator[Row]:
+def _robustness_rows(results: PaperRuns) -> Iterator[Row]:
     signs = ", ".join(f"{100.0 * (scale - 1.0):+.0f}" for scale in SCALES)
     at_end = ", ".join(_percent(results.scales[scale], "converged_at_end") for scale in SCALES)
     later = ", ".join(
@@ -203,7 +203,7 @@ def _robustness_rows(results: Results) -> Iterator[Row]:
     )
 
 
-def _curvature_rows(results: Results) -> Iterator[Row]:
+def _curvature_rows(results: PaperRuns) -> Iterator[Row]:
     found, errors = results.curvature, results.curvature_errors
     low, high = _figure(found, "radius_low_mm", 1), _figure(found, "radius_high_mm", 1)
     yield (
@@ -222,7 +222,7 @@ def _curvature_rows(results: Results) -> Iterator[Row]:
     )
 
 
-def _settled(results: Results) -> str:
+def _settled(results: PaperRuns) -> str:
     trial = results.closed_loop
     return f"{settled_mm(trial.insertion_mm, trial.truth[:, 0]):.0f}"
 

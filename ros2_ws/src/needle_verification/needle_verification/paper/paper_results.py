@@ -1,4 +1,4 @@
-"""Results of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
+"""PaperRuns of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GOAL_MM = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Trial:
+class SteeringTrial:
     """One trial over the insertion: what the controller saw and estimated, and the truth.
 
     Attributes
@@ -52,14 +52,14 @@ class Trial:
 
 
 @dataclasses.dataclass(frozen=True)
-class Results:
-    """All that was run.
+class PaperRuns:
+    """Runs of the paper's section IV.
 
     Attributes
     ----------
-    open_loop, closed_loop : Trial
+    open_loop, closed_loop : SteeringTrial
         The first two columns of figure 3.
-    trials : list of Trial
+    trials : list of SteeringTrial
         Figure 4; the first is figure 3's third column.
     start : dict
         Figures of many runs from figure 3's start.
@@ -80,9 +80,9 @@ class Results:
         What many pure insertions with the paper's noise give.
     """
 
-    open_loop: Trial
-    closed_loop: Trial
-    trials: list[Trial]
+    open_loop: SteeringTrial
+    closed_loop: SteeringTrial
+    trials: list[SteeringTrial]
     start: dict[str, JsonValue]
     grids: dict[str, dict[str, JsonValue]]
     runs: dict[str, Columns]
@@ -96,7 +96,7 @@ class Results:
     curvature_errors: CurvatureErrors
 
 
-def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
+def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> PaperRuns:
     """Run everything; `quick` means fewer trials and one draw in place of ten."""
     at = ("--controller", "paper", "--seed", str(seed))
     draws = ("--draws", "1" if quick else "10")
@@ -140,7 +140,7 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
         scales_longer[scale], _ = laboratory.study(
             f"scale_{scale:g}_longer", *wrong, "--depth-mm", f"{LONGER_MM:g}"
         )
-    return Results(
+    return PaperRuns(
         open_loop=read_trial(open_loop),
         closed_loop=read_trial(closed_loop),
         trials=trials,
@@ -159,14 +159,14 @@ def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> Results:
     )
 
 
-def read_trial(run: Run) -> Trial:
+def read_trial(run: Run) -> SteeringTrial:
     """Return what a bag says of a trial, at the exposures that all of it has."""
     offset = target_offset(run)
     stamps = run.reduced_state.stamps
     for series in (run.tips, run.truth, run.control_input):
         stamps = np.intersect1d(stamps, series.stamps)
     truth = Series(stamps, _rows(run.truth, stamps), stamps)
-    return Trial(
+    return SteeringTrial(
         insertion_mm=run.insertion_at(stamps) * 1e3,
         measured_mm=(_rows(run.tips, stamps)[:, 0] - offset) * 1e3,
         estimate=_readable(_rows(run.reduced_state, stamps)),
@@ -175,7 +175,7 @@ def read_trial(run: Run) -> Trial:
     )
 
 
-def final_r1_mm(trial: Trial) -> float:
+def final_r1_mm(trial: SteeringTrial) -> float:
     """Return the true r1 at a trial's end [mm]."""
     return float(trial.truth[-1, 0])
 

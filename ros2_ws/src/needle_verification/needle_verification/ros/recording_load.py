@@ -73,7 +73,7 @@ class LoadParameters:
         check_fields(self)
 
 
-class _Stream:
+class _PublishedStream:
     """One topic: a message whose stamp is counted up."""
 
     def __init__(self, node: Node, name: str, kind: type, rate: float, qos: QoSProfile) -> None:
@@ -96,7 +96,7 @@ class RecordingLoad(WholeNode):
         super().__init__("recording_load")
         self.values = NodeParameters(self, LoadParameters).values
         self.streams = [
-            _Stream(self, *stream)
+            _PublishedStream(self, *stream)
             for stream in STREAMS
             if self.values.images or stream[1] is not Image
         ]

@@ -20,6 +20,14 @@ SEED = "20090201"
 RUNS_A_DRAW = 1000
 ALL_TROUBLES = ("--outliers", "0.05", "--dropped", "0.2", "--delay", "1", "--kappa-patches", "0.2")
 """Together with 20 deg of play."""
+NORMAL = ("--noise-mm", "0.577", "--noise-shape", "normal")
+"""Noise of the same variance as the claimed +-1 mm has."""
+MIXED = (
+    *("--noise-mm", "1.2", "--outliers", "0.03", "--outlier-mm", "2,5", "--dropped", "0.1"),
+    *("--slip", "0.03", "--kappa-scale", "0.9", "--kappa-patches", "0.1", "--play-deg", "15"),
+    *("--bump-mm", "1"),
+)
+"""A little of everything at once."""
 # A study runs in one thread; numpy's others only wait, which counts as processor time too.
 ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
@@ -83,6 +91,7 @@ TROUBLE = tuple(
         ("outliers", ("--outliers", "0.05"), 0.998),
         ("dropped", ("--dropped", "0.2"), 0.998),
         ("late", ("--delay", "1"), 0.998),
+        ("late_untold", ("--untold-delay", "3"), 0.98),
         ("all_troubles", (*ALL_TROUBLES, "--play-deg", "20"), 0.975),
         ("roll_120", ("--roll-deg", "180"), 0.965),
         ("roll_160", ("--roll-deg", "180", "--depth-mm", "160"), 0.985),
@@ -91,6 +100,37 @@ TROUBLE = tuple(
         ("flips", ("--flips", "11"), 0.999),
     )
 )
+TOLD_WRONG = tuple(
+    Study(
+        key,
+        "best",
+        options,
+        {AT_END: least, "inside_2_sigma": 0.93, "inside_3_sigma": 0.99},
+    )
+    for key, options, least in (
+        ("normal_noise", NORMAL, 0.999),
+        ("noise_13", ("--noise-mm", "1.3"), 0.995),
+        ("noise_20", ("--noise-mm", "2"), 0.97),
+        *(
+            (f"outliers_{key}", ("--outliers", "0.05", "--outlier-mm", size), 0.995)
+            for key, size in (("far", "3,5"), ("near", "2,3.5"), ("nearest", "1.5,2.5"))
+        ),
+        *(
+            (f"slip_{key}", ("--slip", share), least)
+            for key, share, least in (
+                ("2", "0.02", 0.995),
+                ("5", "0.05", 0.99),
+                ("10", "0.1", 0.97),
+                ("minus_5", "-0.05", 0.99),
+            )
+        ),
+        ("sigma_2", (*NORMAL, "--sigma-scale", "2"), 0.99),
+        ("sigma_4", (*NORMAL, "--sigma-scale", "4"), 0.95),
+        ("bump", ("--bump-mm", "2"), 0.95),
+        ("mixed", MIXED, 0.97),
+    )
+)
+"""What is claimed to `best` stays +-1 mm, or the standard deviation that such noise has."""
 SPEED = (
     Study("speed_paper", "paper", (), {}, {"cpu_s": 0.2}),
     Study("speed_best", "best", (), {}, {"cpu_s": 10.0}),

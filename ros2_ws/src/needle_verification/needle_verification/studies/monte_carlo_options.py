@@ -16,8 +16,8 @@ from needle_common.commands.options import (
     whole_number,
 )
 from needle_common.errors import UserError
-from needle_sim.studies.disturbances import Disturbances
-from needle_sim.studies.start_grids import GRIDS, Bounds
+from needle_sim.studies.disturbances import NOISE_SHAPES, Disturbances
+from needle_sim.studies.start_grids import GRIDS, StartBounds
 
 DESCRIPTION = """\
 Steer many simulated needles to the plane x = 0 and say how many get there.
@@ -25,8 +25,8 @@ Steer many simulated needles to the plane x = 0 and say how many get there.
 The default is the study of [KC09]: 10 x 10 x 10 starts (x, pitch, roll up to the given bounds, roll
 centred on 0), each 10 times with other noise, 120 mm deep, +-1 mm noise on each coordinate of the
 tip. What is judged is the true tip. The first tip is measured before the needle moves, every other
-after a step of 1 mm. Disturbances act on the plant alone; the controller is told of none. It knows
-the sensor's noise bound.
+after a step of 1 mm, the last one after the last. Disturbances act on the plant alone; the
+controller is told of none, but of --delay. Of the noise it believes what --claimed-mm says.
 """
 
 EPILOG = """\
@@ -39,15 +39,28 @@ figures (--json FILE has all of them, flat; null where there is none):
   wall_s, cpu_s       time of the study, by the clock and on the processor (threads of numpy
                       that wait count too: OPENBLAS_NUM_THREADS=1 keeps them out)
   diverged            share that ends outside, farther off than its start, and still moving away
+  inside_N_sigma      share of x and of pitch (the mean of both shares), over the last 20 steps of
+                      all runs, within N of the estimate's own standard deviations from the truth;
+                      null for paper and open_loop, whose estimate makes no use of them
+  doubtful_at_end     share of runs whose estimate says at the end that it cannot be relied on
+with --targets, in place of all that speaks of the plane:
+  rms_point           of the tip's distance from its point at the end (p95, max likewise)
+  within_1_mm_point   share that ends within 1 mm of it; a point counts as one that can be reached
+                      where the arc from the true start to it takes at most 0.6 of the curvature
 
 examples:
   ros2 run needle_sim monte_carlo --controller paper
   ros2 run needle_sim monte_carlo --controller paper --grid cell --json paper.json
   ros2 run needle_sim monte_carlo --controller open_loop --initial=-3,2,15 --draws 1
   ros2 run needle_sim monte_carlo --controller paper --kappa-scale 0.8 --csv runs.csv
+  ros2 run needle_sim monte_carlo --noise-mm 0.58 --noise-shape normal
+  ros2 run needle_sim monte_carlo --targets 2000 --csv points.csv
+  ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 """
+
+_DEPTH_MM, _DEPTH_OF_POINTS_MM = "120", "150"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +70,14 @@ class MonteCarloOptions:
     controller: str
     grid: str
     draws: int
-    bounds: Bounds
+    bounds: StartBounds
     initial: tuple[float, float, float] | None
     depth: float
     disturbances: Disturbances
+    claimed_bound: float
+    sigma_scale: float
     flips: int
+    targets: int
     seed: int
     json: Path | None
     csv: Path | None
@@ -78,31 +94,39 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
     given = _parser().parse_args(join_start(arguments))
     if given.grid not in GRIDS:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
+    if given.noise_shape not in NOISE_SHAPES:
+        raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(NOISE_SHAPES)}")
+    depth = given.depth_mm or (_DEPTH_MM if given.targets == "0" else _DEPTH_OF_POINTS_MM)
     return MonteCarloOptions(
         controller=given.controller,
         grid=given.grid,
         draws=whole_number("--draws", given.draws, 1, 1000),
-        bounds=Bounds(
+        bounds=StartBounds(
             x=number("--x-mm", given.x_mm, 0.0, 100.0, "mm") * 1e-3,
             pitch=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 80.0, "deg")),
             roll=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         ),
         initial=None if given.initial is None else _initial(given.initial),
-        depth=number("--depth-mm", given.depth_mm, 1.0, 1000.0, "mm") * 1e-3,
+        depth=number("--depth-mm", depth, 1.0, 1000.0, "mm") * 1e-3,
         disturbances=Disturbances(
             noise=number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
+            noise_shape=given.noise_shape,
             outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
+            outlier_size=_outlier_size(given.outlier_mm),
             dropped=number("--dropped", given.dropped, 0.0, 1.0, "-"),
-            pitch_noise=math.radians(
-                number("--pitch-noise-deg", given.pitch_noise_deg, 0.0, 90.0, "deg")
-            ),
             delay=whole_number("--delay", given.delay, 0, 100),
+            untold_delay=whole_number("--untold-delay", given.untold_delay, 0, 100),
             curvature_scale=number("--kappa-scale", given.kappa_scale, 0.05, 20.0, "-"),
             curvature_patches=number("--kappa-patches", given.kappa_patches, 0.0, 0.95, "-"),
             play=math.radians(number("--play-deg", given.play_deg, 0.0, 180.0, "deg")),
             lag_length=number("--lag-mm", given.lag_mm, 0.0, 1000.0, "mm") * 1e-3,
+            slip=number("--slip", given.slip, -0.5, 2.0, "-"),
+            bump=number("--bump-mm", given.bump_mm, 0.0, 100.0, "mm") * 1e-3,
         ),
+        claimed_bound=number("--claimed-mm", given.claimed_mm, 0.01, 100.0, "mm") * 1e-3,
+        sigma_scale=number("--sigma-scale", given.sigma_scale, 0.01, 100.0, "-"),
         flips=whole_number("--flips", given.flips, 0, 100),
+        targets=whole_number("--targets", given.targets, 0, 1_000_000),
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         json=output_file("--json", given.json),
         csv=output_file("--csv", given.csv),
@@ -116,8 +140,7 @@ def _parser() -> CommandParser:
         "--controller",
         default="best",
         metavar="NAME",
-        help="best, paper, open_loop, kalman, measured_pitch, extended_kalman or orientation_fit "
-        "(default: best)",
+        help="best, paper or open_loop (default: best)",
     )
     add(
         "--grid",
@@ -127,28 +150,58 @@ def _parser() -> CommandParser:
     )
     numbers = (
         ("--draws", "10", "N", "runs from each start"),
-        ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip"),
-        ("--depth-mm", "120", "D", "how far to insert"),
+        (
+            "--noise-mm",
+            "1",
+            "A",
+            "error of each coordinate of a measured tip: of uniform noise the largest, of normal "
+            "noise the standard deviation",
+        ),
+        ("--noise-shape", "uniform", "|".join(NOISE_SHAPES), "how that noise is distributed"),
+        ("--claimed-mm", "1", "C", "largest error that the controller is told, whatever it is"),
+        (
+            "--sigma-scale",
+            "1",
+            "S",
+            "other than 1: each tip is given with a covariance in place of a bound, the standard "
+            "deviations of uniform noise within --claimed-mm, S times too small",
+        ),
         ("--x-mm", "3", "X", "bound of the starts' distance from the plane"),
         ("--pitch-deg", "10", "P", "bound of the starts' pitch"),
         ("--roll-deg", "30", "R", "bound of the starts' roll"),
         ("--kappa-scale", "1", "S", "the needle's curvature, in terms of what is assumed"),
         ("--play-deg", "0", "D", "dead band between base and tip angle, +-"),
         ("--lag-mm", "0", "L", "length over which the tip's angle follows the base's"),
-        ("--outliers", "0", "F", "share of measurements off by 5-10 mm in a random direction"),
+        ("--outliers", "0", "F", "share of measurements off in a random direction"),
+        ("--outlier-mm", "5,10", "LO,HI", "how far those are off, uniform in between"),
         ("--dropped", "0", "F", "share of measurements that are missing"),
-        ("--pitch-noise-deg", "2", "P", "controller measured_pitch: largest error of the pitch"),
-        ("--delay", "0", "N", "steps that a measurement comes late"),
+        ("--delay", "0", "N", "steps that a measurement comes late, as the controller is told"),
+        ("--untold-delay", "0", "N", "steps that it comes late, as if it were new"),
+        ("--slip", "0", "F", "share by which the stage moves farther than the needle goes in"),
+        ("--bump-mm", "0", "D", "how far the phantom, with the needle, is moved at half the depth"),
         ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
         ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),
+        (
+            "--targets",
+            "0",
+            "N",
+            "steer N needles to points in place of the plane: each from a random start within the "
+            "bounds to a random point of its own, 60 to 120 mm ahead",
+        ),
         ("--seed", "1", "N", "seed of all randomness: same seed, same figures"),
     )
     for name, default, metavar, text in numbers:
         add(name, default=default, metavar=metavar, help=f"{text} (default: {default})")
     add(
+        "--depth-mm",
+        metavar="D",
+        help=f"how far to insert, at most where there are targets (default: {_DEPTH_MM}; with "
+        f"--targets {_DEPTH_OF_POINTS_MM})",
+    )
+    add(
         "--initial",
         metavar="X_MM,PITCH_DEG,ROLL_DEG",
-        help="all 1000 N runs from this one start instead of a grid",
+        help="all runs from this one start instead of a grid",
     )
     add("--json", metavar="FILE", help="write the figures as one flat JSON object")
     add("--csv", metavar="FILE", help="one line for each run: its start and what became of it")
@@ -158,3 +211,12 @@ def _parser() -> CommandParser:
 def _initial(text: str) -> tuple[float, float, float]:
     x_mm, pitch_deg, roll_deg = start(text, largest_x=100.0, largest_pitch=80.0)
     return x_mm * 1e-3, math.radians(pitch_deg), math.radians(roll_deg)
+
+
+def _outlier_size(text: str) -> tuple[float, float]:
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise UserError(f"--outlier-mm {text!r} is not LO,HI, such as 5,10")
+    low = number("--outlier-mm LO", parts[0], 0.0, 1000.0, "mm")
+    high = number("--outlier-mm HI", parts[1], low, 1000.0, "mm")
+    return low * 1e-3, high * 1e-3

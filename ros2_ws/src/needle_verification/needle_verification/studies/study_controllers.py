@@ -5,7 +5,6 @@ This is the only module of needle_sim that knows the controller under test.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -13,16 +12,27 @@ import numpy as np
 
 from needle_common.errors import UserError
 from needle_controller.laws.law import StepLaw
-from needle_controller.observers.estimator import Estimator
-from needle_controller.observers.pitch_observer import PitchObserver
-from needle_controller.presets.control_settings import PRESETS, ControlSettings
+from needle_controller.laws.roll_law import hypotheses_of
+from needle_controller.model.arrays import Array
+from needle_controller.observers.estimator import Estimate, Estimator
+from needle_controller.observers.luenberger import LuenbergerObserver
+from needle_controller.presets.point_steering import point_law
 from needle_controller.presets.presets import make_controller
+from needle_controller.presets.steering_settings import (
+    ONE_SIDED_PRESETS,
+    PRESETS,
+    SteeringSettings,
+)
 from needle_sim.needle.se3 import FloatArray
+from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.study import CHUNK
 
-CURVATURE = ControlSettings.curvature
-STEP_LENGTH = ControlSettings.step_length
-# A sensor without noise still has this bound for the controllers' design [m].
-_SMALLEST_NOISE = 1e-5
+CURVATURE = SteeringSettings.curvature
+STEP_LENGTH = SteeringSettings.step_length
+# What the linear observer knows of a needle is a twentieth of what the bank does.
+_LINEAR_CHUNK = 20 * CHUNK
+# Studies have depths of their own; what limits flips here is what the settings take [m].
+_DEEPEST = 1.0
 
 
 class SteeredNeedles:
@@ -34,13 +44,17 @@ class SteeredNeedles:
         For as many needles as there will be tips.
     law : callable
         Returns the command for an estimate at an inserted length [m].
+    covariance : ndarray, shape (3, 3), optional
+        What each tip's is said to be [m^2]; the estimator's own assumption if none is given.
     """
 
-    def __init__(self, estimator: Estimator, law: StepLaw) -> None:
+    def __init__(self, estimator: Estimator, law: StepLaw, covariance: Array | None = None) -> None:
         self._estimator = estimator
         self._law = law
+        self._covariance = covariance
         self._insertion = 0.0
-        self.measures_pitch = isinstance(estimator, PitchObserver)
+        self._estimate: Estimate | None = None
+        self._left: FloatArray | None = None
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
@@ -48,23 +62,66 @@ class SteeredNeedles:
         return self._rate()
 
     def step(
-        self, d_insertion: float, d_rotation: FloatArray, tips: FloatArray, age: float
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
-        self._insertion += d_insertion
+        self._insertion += float(np.max(d_insertion))
         self._estimator.advance(d_insertion, d_rotation)
-        if isinstance(self._estimator, PitchObserver):
-            self._estimator.correct(tips[:, :3], age=age, pitch=tips[:, 3])
-        else:
-            self._estimator.correct(tips, age=age)
+        self._estimator.correct(tips, self._covariance, age)
         return self._rate()
 
+    def belief(self) -> Belief | None:
+        """Return what is known after the last step; see `study.Controller.belief`.
+
+        Nothing of `LuenbergerObserver`, whose steady gain makes no use of its covariance: a study
+        of the paper's law does not pay for it.
+        """
+        estimate = self._estimate
+        if estimate is None or isinstance(self._estimator, LuenbergerObserver):
+            return None
+        uncertainty = hypotheses_of(estimate).uncertainty
+        return Belief(
+            x=estimate.linearized[..., 0],
+            x_std=np.sqrt(np.maximum(uncertainty[..., 0], 0.0)),
+            sin_pitch=estimate.linearized[..., 1],
+            sin_pitch_std=np.sqrt(np.maximum(uncertainty[..., 2], 0.0)),
+            doubtful=estimate.doubtful,
+        )
+
+    def insertion_left(self) -> FloatArray:
+        """Return how far each needle has to go; see `point_study.PointController`.
+
+        Raises
+        ------
+        RuntimeError
+            The law does not say.
+        """
+        if self._left is None:
+            raise RuntimeError("a law for planes does not say how far a needle has to go")
+        return self._left
+
     def _rate(self) -> FloatArray:
-        return self._law(self._estimator.estimate(), self._insertion).rotation_rate
+        self._estimate = self._estimator.estimate()
+        command = self._law(self._estimate, self._insertion)
+        self._left = command.insertion_left
+        return command.rotation_rate
+
+
+def needles_at_a_time(name: str) -> int:
+    """Return how many needles of a preset to steer at a time: so many fit into a cache."""
+    return _LINEAR_CHUNK if name in ONE_SIDED_PRESETS else CHUNK
 
 
 def controller_factory(
-    name: str, noise: float, flip_depths: Sequence[float] = ()
+    name: str,
+    claimed: float,
+    flip_depths: Sequence[float] = (),
+    *,
+    sigma_scale: float = 1.0,
 ) -> Callable[[], SteeredNeedles]:
     """Return what makes the controller of some needles.
 
@@ -72,25 +129,61 @@ def controller_factory(
     ----------
     name : str
         One of `PRESETS`.
-    noise : float
-        Largest error of a measured coordinate that the sensor is known to make [m].
+    claimed : float
+        Largest error of a measured coordinate that it is told the sensor makes [m].
     flip_depths : sequence of float
         Insertions at which the bevel is flipped, mirrored, in rising order [m].
+    sigma_scale : float
+        Other than 1: it is not told of a bound; instead each tip comes with a covariance, whose
+        standard deviations are those of uniform noise within `claimed`, divided by this.
 
     Raises
     ------
     UserError
         If there is no such controller, or it cannot flip.
     """
+    settings = _settings(name, claimed, sigma_scale, flip_depths)
+    covariance = _told_covariance(settings, sigma_scale)
+    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3)), covariance)
+
+
+def point_controller_factory(
+    name: str, claimed: float, *, sigma_scale: float = 1.0
+) -> Callable[[FloatArray], SteeredNeedles]:
+    """Return what makes the controller of some needles from their points, (N, 3) [m].
+
+    Parameters, and what is raised, as of `controller_factory`; a preset that does not estimate the
+    whole pose is refused.
+    """
+    settings = _settings(name, claimed, sigma_scale)
+    settings.check_steers_to_points()
+    covariance = _told_covariance(settings, sigma_scale)
+    law = point_law(settings)
+
+    def make(targets: FloatArray) -> SteeredNeedles:
+        estimator, _ = make_controller(settings, np.eye(3))
+        return SteeredNeedles(estimator, lambda estimate, _: law(estimate, targets), covariance)
+
+    return make
+
+
+def _settings(
+    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float] = ()
+) -> SteeringSettings:
     if name not in PRESETS:
         raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
-    noise = max(noise, _SMALLEST_NOISE)
-    settings = dataclasses.replace(
-        ControlSettings(),
+    return SteeringSettings(
         preset=name,
-        tip_noise_bound=noise,
-        measurement_std=noise / math.sqrt(3.0),
+        tip_covariance="configured" if sigma_scale == 1.0 else "from_tip_pose",
+        tip_noise="bounded",
+        tip_noise_bound=claimed,
+        measurement_std=claimed / math.sqrt(3.0),
+        depth=_DEEPEST,
         flip_depths=tuple(flip_depths),
     )
-    make_controller(settings, np.eye(3))
-    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3)))
+
+
+def _told_covariance(settings: SteeringSettings, sigma_scale: float) -> Array | None:
+    if sigma_scale == 1.0:
+        return None
+    return np.asarray(np.eye(3) * (settings.measurement_std / sigma_scale) ** 2)

@@ -15,7 +15,7 @@ _FINE = 3
 
 @dataclasses.dataclass(frozen=True)
 class Pose:
-    """Where a needle is in a patch.
+    """Place of a needle in a patch.
 
     Attributes
     ----------

@@ -12,7 +12,7 @@ from needle_verification.training.traced_scenes import TracedScene
 Array = NDArray[np.float64]
 
 BORDER = 32
-"""What is seen around a patch [px]."""
+"""Margin rendered around a patch [px]."""
 _AT_END, _ON_SHAFT = 0.55, 0.3  # so often there; else anywhere
 _BESIDE_PX = 38.0  # so far from the middle may be what a patch is about
 _SMALLER, _BLUR = 0.8, 0.45  # images made smaller than that are blurred, by so many new pixels

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.camera.projection import project
-from needle_sim.camera.stereo_rig import Camera, StereoRig
+from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.path_traced.appearance import draw_appearance
 from needle_sim.path_traced.insertion import trace_insertion
 from needle_sim.path_traced.tracer import Mitsuba
@@ -77,7 +77,7 @@ def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int, plain_width_px: flo
 
 
 def _shaft(
-    line: NDArray[np.float64], diameter: float, camera: Camera, rig: StereoRig
+    line: NDArray[np.float64], diameter: float, camera: SimulatedCamera, rig: StereoRig
 ) -> tuple[NDArray[np.uint8], NDArray[np.float64], float]:
     """Return 255 times the share of each pixel, the end and the width [px]."""
 

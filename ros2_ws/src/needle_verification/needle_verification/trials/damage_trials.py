@@ -62,7 +62,7 @@ class Extent:
 
 
 @dataclasses.dataclass(frozen=True)
-class Trial:
+class DamageTrial:
     """One damaged bag.
 
     Attributes
@@ -83,7 +83,7 @@ class Trial:
     was_read: bool
 
 
-def damage_trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
+def damage_trials(folder: Path, count: int, seed: int) -> Iterator[DamageTrial]:
     """Damage bags of all kinds in turn at random places, recover each, and look at it.
 
     Parameters
@@ -105,7 +105,7 @@ def damage_trials(folder: Path, count: int, seed: int) -> Iterator[Trial]:
         yield _trial(bag, kind, extents[kind], rng)
 
 
-def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator) -> Trial:
+def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator) -> DamageTrial:
     damage, place = str(rng.choice(DAMAGES)), str(rng.choice(PLACES))
     name, start, end = _damage(bag, damage, place, rng)
     what = f"{kind}: {damage} at {start} to {end} of {name}"
@@ -122,10 +122,10 @@ def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator
     try:
         recovery = recover_bag(bag)
     except UserError as error:
-        return Trial(what, [f"not recovered: {error}"], 0, before is not None)
+        return DamageTrial(what, [f"not recovered: {error}"], 0, before is not None)
     after = _read(bag)
     if after is None:
-        return Trial(what, ["not read after recover"], 0, before is not None)
+        return DamageTrial(what, ["not read after recover"], 0, before is not None)
     if gone := readable - after:
         faults.append(f"{gone.total()} readable messages are gone")
     if new := (after - recorded).total() - altered:
@@ -140,7 +140,7 @@ def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator
         faults.append(f"{len(missing)} of the damaged files are destroyed")
     if not recover_bag(bag).was_whole:
         faults.append("not whole after recover")
-    return Trial(what, faults, lost.total(), before is not None)
+    return DamageTrial(what, faults, lost.total(), before is not None)
 
 
 def _compare(what: str, seen: Counter[Key], wanted: Counter[Key], altered: int) -> list[str]:

@@ -10,13 +10,13 @@ import pytest
 from needle_common.errors import UserError
 from needle_verification.paper.paper import main
 from needle_verification.paper.paper_figures import common_r1, converged_share
-from needle_verification.paper.paper_results import Floats, Trial, missed_later, settled_mm
+from needle_verification.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm
 from needle_verification.paper.paper_runs import Laboratory
 
 
-def trial(insertion_mm: Floats, r1_mm: Floats) -> Trial:
+def trial(insertion_mm: Floats, r1_mm: Floats) -> SteeringTrial:
     states = np.column_stack([r1_mm, np.zeros((len(r1_mm), 2))])
-    return Trial(insertion_mm, r1_mm, states, states, np.zeros(len(r1_mm)))
+    return SteeringTrial(insertion_mm, r1_mm, states, states, np.zeros(len(r1_mm)))
 
 
 def test_settled_is_the_last_entry_into_the_band() -> None:

@@ -21,6 +21,11 @@ KEYS = {
     "settle_p95_mm",
     "rotation_mean_deg",
     "wall_s",
+    "inside_2_sigma",
+    "inside_3_sigma",
+    "doubtful_at_end",
+    "within_1_mm_point",
+    "rms_point_mm",
 }
 
 
@@ -35,6 +40,8 @@ def test_open_loop_s_known_answer_in_json_and_csv(tmp_path: Path) -> None:
     assert figures["final_max_mm"] == pytest.approx(14.62, abs=0.005)
     assert figures["settle_median_mm"] is None
     assert figures["rotation_mean_deg"] == 0.0
+    assert figures["inside_2_sigma"] is None
+    assert figures["doubtful_at_end"] is None
     with (tmp_path / "f.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 1000
@@ -55,6 +62,26 @@ def test_the_same_seed_gives_the_same_figures(tmp_path: Path) -> None:
     assert seen[0]["rms_last_20_mm"] != seen[2]["rms_last_20_mm"]
 
 
+def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path) -> None:
+    files = ["--json", str(tmp_path / "f.json"), "--csv", str(tmp_path / "f.csv")]
+    assert main(["--targets", "7", "--depth-mm", "10", *files]) == 0
+    figures = json.loads((tmp_path / "f.json").read_text("utf-8"))
+    assert set(figures) >= KEYS
+    assert figures["runs"] == 7
+    assert figures["converged_at_end"] is None
+    # 10 mm are not enough for any of them
+    assert figures["within_1_mm_point"] == 0.0
+    assert figures["missed_runs"] == 7
+    with (tmp_path / "f.csv").open(encoding="utf-8") as stream:
+        rows = list(csv.DictReader(stream))
+    error = np.array([float(row["error_mm"]) for row in rows])
+    assert figures["rms_point_mm"] == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-4)
+    ahead = [float(row["target_z_mm"]) for row in rows]
+    np.testing.assert_allclose(error, np.array(ahead) - 10.0, atol=30.0)
+    assert parse(["--targets", "7"]).depth == pytest.approx(0.150)
+    assert parse([]).depth == pytest.approx(0.120)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -69,6 +96,16 @@ def test_the_same_seed_gives_the_same_figures(tmp_path: Path) -> None:
         (["--controller", "paper", "--roll-deg", "181"], "--roll-deg = 181"),
         (["--controller", "paper", "--kappa-scale", "0"], "--kappa-scale = 0"),
         (["--controller", "paper", "--outliers", "5"], "--outliers = 5"),
+        (["--targets", "-1"], "--targets = -1"),
+        (["--targets", "5", "--controller", "paper"], "paper cannot steer to a point"),
+        (["--outlier-mm", "5"], "--outlier-mm '5'"),
+        (["--outlier-mm", "5,2"], "--outlier-mm HI = 2"),
+        (["--noise-shape", "round"], "--noise-shape 'round'"),
+        (["--claimed-mm", "0"], "--claimed-mm = 0"),
+        (["--sigma-scale", "0"], "--sigma-scale = 0"),
+        (["--slip", "-1"], "--slip = -1"),
+        (["--bump-mm", "-2"], "--bump-mm = -2"),
+        (["--untold-delay", "1.5"], "--untold-delay"),
         (["--controller", "paper", "--dropped", "x"], "'x'"),
         (["--controller", "paper", "--delay", "-1"], "--delay = -1"),
         (["--controller", "paper", "--flips", "3"], "flip"),
@@ -93,8 +130,22 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
         main(["--help"])
     assert end.value.code == 0
     text = capsys.readouterr().out
-    assert all(f"--{name}" in text for name in ("grid", "kappa-patches", "flips", "csv"))
+    names = ("grid", "kappa-patches", "flips", "csv", "noise-shape", "claimed-mm", "untold-delay")
+    assert all(f"--{name}" in text for name in names)
     assert np.all([len(line) <= 100 for line in text.splitlines()])
+
+
+def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
+    words = "--noise-mm 0.58 --noise-shape normal --outlier-mm 2,3.5 --slip -0.05 --bump-mm 2"
+    options = parse([*words.split(), "--untold-delay", "3", "--sigma-scale", "2"])
+    found = options.disturbances
+    assert found.noise == pytest.approx(0.00058)
+    assert found.noise_shape == "normal"
+    assert found.outlier_size == pytest.approx((0.002, 0.0035))
+    assert (found.slip, found.bump, found.untold_delay) == (-0.05, 0.002, 3)
+    assert options.claimed_bound == 0.001
+    assert options.sigma_scale == 2.0
+    assert parse(["--claimed-mm", "0.5"]).claimed_bound == 0.0005
 
 
 def test_the_default_controller_is_the_best() -> None:

@@ -1,0 +1,253 @@
+"""Generated scenes with obstacles: which can be solved, which are taken on, and how they end.
+
+python -m needle_verification.studies.obstacle_study --scenes 1000 --seed 1
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import sys
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_common.commands.options import CommandParser, number, output_file, whole_number
+from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.next_step import next_step
+from needle_controller.protocol.plane_control import PlaneControl
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.needle.se3 import FloatArray
+from needle_verification.studies.obstacle_scenes import ObstacleScene, clearance, make_scene
+from needle_verification.studies.path_judge import way_after
+
+NEEDLE_RADIUS = 0.00035
+CURVATURE = SteeringSettings.curvature
+NOISE = 0.001
+"""Largest error of a measured coordinate [m]."""
+SAMPLES = 4000
+"""Points of the search that judges a scene."""
+DEPTH = 0.2
+_SUBSTEPS = 4
+LABELS = {
+    "scenes": "scenes",
+    "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
+    "solvable_taken": "  taken on",
+    "solvable_reached": "  reached within 1 mm, of those solvable",
+    "roomy": "solvable with 85 % of the curvature, 1.25 mm clear",
+    "roomy_reached": "  reached within 1 mm, of those",
+    "unsolvable": "no way with all the curvature, 0.35 mm clear",
+    "unsolvable_refused": "  refused before insertion, of those",
+    "taken": "taken on of all",
+    "reached_of_taken": "  reached within 1 mm, of those",
+    "stopped": "  stopped on the way",
+    "contacts": "needles that touched an obstacle",
+    "update_p95_ms": "estimate, plan and law, 95 % [ms]",
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneOutcome:
+    """How a scene ended.
+
+    Attributes
+    ----------
+    bare, solvable, roomy : bool
+        Whether the judge finds a way with all, 90 % or 85 % of the curvature, 0.35, 0.75 or 1.25 mm
+        clear of everything.
+    taken, stopped : bool
+        Whether the controller set out, and whether it saw no way on.
+    miss : float
+        True distance from the target at the end [m]; inf where it was not taken on.
+    least : float
+        Least clearance of the true needle's surface [m]; likewise.
+    """
+
+    bare: bool
+    solvable: bool
+    roomy: bool
+    taken: bool = False
+    stopped: bool = False
+    miss: float = math.inf
+    least: float = math.inf
+
+
+def judge(scene: ObstacleScene, settings: SteeringSettings) -> SceneOutcome:
+    """Return whether a scene can be solved, of a needle that has not set out."""
+    bare, solvable, roomy = (
+        way_after(
+            scene.target,
+            scene.obstacles,
+            share * CURVATURE,
+            settings.max_rotation_per_length,
+            clear,
+            SAMPLES,
+            1,
+        )
+        >= 0
+        for share, clear in ((1.0, NEEDLE_RADIUS), (0.9, 0.00075), (0.85, 0.00125))
+    )
+    return SceneOutcome(bare, solvable, roomy)
+
+
+def steer(
+    scene: ObstacleScene,
+    judged: SceneOutcome,
+    settings: SteeringSettings,
+    rng: np.random.Generator,
+    times: list[float],
+) -> SceneOutcome:
+    """Steer a needle through a scene as the node does; return how it ended.
+
+    Parameters
+    ----------
+    scene, judged : ObstacleScene, SceneOutcome
+        The scene, and what is known of it.
+    settings : SteeringSettings
+        The controller's.
+    rng : numpy.random.Generator
+        Of the tips' noise.
+    times : list of float
+        What each update takes is added here [s].
+    """
+    settings = dataclasses.replace(
+        settings, obstacles=tuple(float(value) for value in scene.obstacles.ravel())
+    )
+    control = PlaneControl(settings, offset_plane(0.0))
+    control.target_point = scene.target
+    if control.path_obstacle(0.0):
+        return judged
+    plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
+    joints, least = JointSample(0, 0.0, 0.0), math.inf
+    for k in itertools.count(1):
+        tip = _tip(plant) + rng.uniform(-NOISE, NOISE, 3)
+        begin = time.perf_counter()
+        update = control.update(tip, joints)
+        times.append(time.perf_counter() - begin)
+        step = next_step(k, joints, update.command, settings, slowly=False)
+        if update.blocked or step is None:
+            miss = float(np.linalg.norm(_tip(plant) - scene.target))
+            return dataclasses.replace(
+                judged, taken=True, stopped=update.blocked, miss=miss, least=least
+            )
+        length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
+        for _ in range(_SUBSTEPS):
+            plant.advance(length / _SUBSTEPS, turn / _SUBSTEPS)
+            least = min(least, clearance(scene.obstacles, _tip(plant)) - NEEDLE_RADIUS)
+        joints = JointSample(k, step.insertion, step.rotation)
+    raise AssertionError
+
+
+def study(
+    scenes: int,
+    seed: int,
+    *,
+    pitch_bound: float,
+    roll_bound: float,
+    entry_angle_std: float,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> dict[str, float | None]:
+    """Return the figures of some scenes, by the names of `LABELS`.
+
+    Parameters
+    ----------
+    scenes, seed : int
+        How many, and the key of all randomness.
+    pitch_bound, roll_bound : float
+        Of the needles at their entries [rad].
+    entry_angle_std : float
+        What the controller is told of that [rad].
+    on_progress : callable
+        Told after each scene how many are done.
+    """
+    settings = SteeringSettings(depth=DEPTH, entry_angle_std=entry_angle_std, **PAPER_NOISE)
+    outcomes: list[SceneOutcome] = []
+    times: list[float] = []
+    for n in range(scenes):
+        scene = make_scene(
+            seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
+        )
+        rng = np.random.default_rng([seed, n, 1])
+        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times))
+        on_progress(n + 1)
+    return figures(outcomes, times)
+
+
+def figures(outcomes: Sequence[SceneOutcome], times: Sequence[float]) -> dict[str, float | None]:
+    """Return the figures of some outcomes, by the names of `LABELS`; shares where they are of."""
+
+    def share(of: Sequence[SceneOutcome], what: Callable[[SceneOutcome], bool]) -> float | None:
+        return sum(what(one) for one in of) / len(of) if of else None
+
+    def reached(one: SceneOutcome) -> bool:
+        return one.miss <= 1e-3
+
+    solvable = [one for one in outcomes if one.solvable]
+    roomy = [one for one in outcomes if one.roomy]
+    unsolvable = [one for one in outcomes if not (one.bare or one.solvable or one.roomy)]
+    taken = [one for one in outcomes if one.taken]
+    return {
+        "scenes": len(outcomes),
+        "solvable": len(solvable),
+        "solvable_taken": share(solvable, lambda one: one.taken),
+        "solvable_reached": share(solvable, reached),
+        "roomy": len(roomy),
+        "roomy_reached": share(roomy, reached),
+        "unsolvable": len(unsolvable),
+        "unsolvable_refused": share(unsolvable, lambda one: not one.taken),
+        "taken": len(taken),
+        "reached_of_taken": share(taken, reached),
+        "stopped": sum(one.stopped for one in taken),
+        "contacts": sum(one.least < 0.0 for one in taken),
+        "update_p95_ms": 1e3 * float(np.percentile(times, 95.0)) if times else None,
+    }
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the study; returns its exit code."""
+    words = sys.argv[1:] if arguments is None else arguments
+    return run_command(lambda: _run(words))
+
+
+def _run(words: Sequence[str]) -> int:
+    parser = CommandParser("obstacle_study", "Steer needles past generated obstacles.", "")
+    for option, default, metavar, text in (
+        ("--scenes", "1000", "N", "how many"),
+        ("--seed", "1", "N", "seed of all randomness"),
+        ("--pitch-deg", "1", "P", "bound of the needles' pitch at their entries"),
+        ("--roll-deg", "10", "R", "bound of their roll"),
+        ("--told-deg", "2", "S", "standard deviation of the pitch that the controller is told"),
+    ):
+        parser.add_argument(
+            option, default=default, metavar=metavar, help=f"{text} (default: {default})"
+        )
+    parser.add_argument("--json", metavar="FILE", help="write the figures there too")
+    given = parser.parse_args(words)
+    path = output_file("--json", given.json)
+    seen = study(
+        whole_number("--scenes", given.scenes, 1, 100_000),
+        whole_number("--seed", given.seed, 0, 2**31 - 1),
+        pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
+        roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
+        entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
+    )
+    for name, label in LABELS.items():
+        value = seen[name]
+        print(f"{label:55s}", "-" if value is None else f"{value:.4g}")
+    if path is not None:
+        told: dict[str, JsonValue] = {**seen}
+        write_json(path, told)
+    return EXIT_DONE
+
+
+def _tip(plant: NeedlePlant) -> FloatArray:
+    return np.array(plant.T_rig_tip[:3, 3])
+
+
+if __name__ == "__main__":
+    sys.exit(main())
