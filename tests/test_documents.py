@@ -62,6 +62,7 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
             return command
         words, _, _ = command.partition("#")
         words = re.sub(r"--depth-mm \d+", "", words) + f" --depth-mm {SHORT_MM}"
+        words = re.sub(r"--target \S+", f"--target 0,0,{SHORT_MM - 1}", words)
         wanted = re.search(r" --bag (\S+)", words)
         bag = wanted[1] if wanted else f"{scratch}/run_{next(numbers)}"
         words = " ".join(words.replace(wanted[0] if wanted else "", "").split())

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 
 from code_lines import ROOT, code_lines, modules
-from pytest_stages import LONG_FILES
+from pytest_lanes import LONG_FILES
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15

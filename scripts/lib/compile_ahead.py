@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.control_settings import PRESETS, ControlSettings
+from needle_controller.presets.steering_settings import PAPER_NOISE, PRESETS, SteeringSettings
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_sim.camera.insertions import render_insertion
 from needle_sim.camera.scenarios import CLEAN
@@ -33,11 +33,11 @@ CALIBRATION = (
 def controllers() -> None:
     """Each preset as the node has it, and in a study."""
     for preset in PRESETS:
-        PlaneControl(ControlSettings(preset=preset), offset_plane(0.003))
+        PlaneControl(SteeringSettings(preset=preset, **PAPER_NOISE), offset_plane(0.003))
         settings = StudySettings(
-            curvature=ControlSettings.curvature,
+            curvature=SteeringSettings.curvature,
             depth=0.003,
-            step_length=ControlSettings.step_length,
+            step_length=SteeringSettings.step_length,
             disturbances=Disturbances(),
             seed=0,
         )

@@ -1,4 +1,4 @@
-"""What the bag tests share: the bag of a made-up run whose figures are known."""
+"""Shared by the bag tests: the bag of a made-up run whose figures are known."""
 
 from __future__ import annotations
 

@@ -22,17 +22,17 @@ from needle_common.errors import UserError
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.control_settings import ControlSettings
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.needle_batch import NeedleBatch
-from needle_sim.studies.start_grids import GRIDS, Bounds
+from needle_sim.studies.start_grids import GRIDS, StartBounds
 from needle_sim.studies.study import StudySettings, run_study
 from needle_verification.descendants import ending_descendants
-from needle_verification.studies.study_controllers import controller_factory
+from needle_verification.studies.study_controllers import controller_factory, needles_at_a_time
 
 DESCRIPTION = """\
 Measure what is fast enough and what is not, each figure beside a reference in the same run: the
@@ -56,8 +56,8 @@ PLAIN_NEEDLES = 40
 CONTROL_NEEDLES = 3
 ALONE_NEEDLES = 20
 UPDATES = 2_000
-SETTINGS = ControlSettings()
-STARTS = GRIDS["endpoint"](Bounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 10, 1)
+SETTINGS = SteeringSettings(**PAPER_NOISE)
+STARTS = GRIDS["endpoint"](StartBounds(0.003, np.deg2rad(10.0), np.deg2rad(30.0)), 10, 1)
 STUDY = StudySettings(SETTINGS.curvature, 0.120, SETTINGS.step_length, Disturbances(NOISE), seed=1)
 
 
@@ -132,7 +132,8 @@ def studies() -> Iterator[Row]:
     for name, times in (("paper", 5), ("best", 1)):
         factory = controller_factory(name, NOISE)
         run_study(STARTS[:2], factory, STUDY)  # compiles
-        seconds = _least_time(partial(run_study, STARTS, factory, STUDY), times)
+        chunk = needles_at_a_time(name)
+        seconds = _least_time(partial(run_study, STARTS, factory, STUDY, chunk=chunk), times)
         what = f"{name}, {NEEDLES:,} x {STEPS} steps"
         yield Row(f"study_{name}", what, "s", seconds, "paper in plain Python", plain)
         yield Row(f"study_{name}", what, "s", seconds, "paper in python-control", with_control)

@@ -1,8 +1,8 @@
-"""A pytest plugin of scripts/test: two lanes, failed stages by name, processes that tests left.
+"""A pytest plugin of scripts/test: lanes, and the processes that tests left.
 
 scripts/test sets NEEDLE_TEST_RUN, unique to the run and inherited by every process that a test
-starts, and NEEDLE_FAILED_STAGES, with commas between the names. pytest-xdist runs the test files in
-lanes, each a process of its own; nodes of one lane must not hear those of another.
+starts. pytest-xdist runs the test files in lanes, each a process of its own; nodes of one lane must
+not hear those of another.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import pytest
 from needle_common.process.ros_domain import own_domain
 
 RUN = os.environ.get("NEEDLE_TEST_RUN", "")
-FAILED_STAGES = [name for name in os.environ.get("NEEDLE_FAILED_STAGES", "").split(",") if name]
 # These take half a minute and more: begun last, one of them would hold up the end of the run.
 LONG_FILES = (
     "tests/test_documents.py",
+    "tests/test_lint.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
@@ -95,8 +95,6 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print what else failed, right above pytest's closing line."""
-    for name in FAILED_STAGES:
-        terminalreporter.write_line(f"FAILED stage {name} (its output is at the top)", red=True)
+    """Print what was left, right above pytest's closing line."""
     for line in _left:
         terminalreporter.write_line(f"FAILED process left behind: {line}", red=True)
