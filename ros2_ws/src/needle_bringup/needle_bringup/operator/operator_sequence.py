@@ -44,6 +44,9 @@ REFUSAL_PATIENCE = 2.0
 # only after a release: so long it is waited for the press, and so long it is then released [s].
 PRESS_PATIENCE = 2.0
 RELEASE_TIME = 0.25
+# A stand-in that did not run for a while has not waited: what came meanwhile is not heard yet, and
+# a release on the strength of old news would abort a step [s].
+LONGEST_LOOK = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -113,7 +116,8 @@ class OperatorSequence:
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
         self._hold_counts = False
-        self._press_since = now
+        self._looked_at = now
+        self._pressed_in_vain = 0.0
         self._released_until = now
         self.presses_again = 0
         self.insertion = 0.0
@@ -187,7 +191,8 @@ class OperatorSequence:
         self._refusal = ""
         self._refused_since = None
         self._deadline = now + self._wait_timeout
-        self._progress_at = self._press_since = now
+        self._progress_at = now
+        self._pressed_in_vain = 0.0
 
     def see_devices(self, names: Sequence[str]) -> None:
         """Take who publishes device/status: with more than one, nobody knows what would move."""
@@ -211,10 +216,7 @@ class OperatorSequence:
         self._homing_seen = self._homing_seen or self._moving
         if self._called(HOME) and self._homed and self._homing_seen:
             self._go_on(now)
-        counts = bool(values.get("hold_owner"))
-        if self._hold_counts and not counts:
-            self._press_since = now
-        self._hold_counts = counts
+        self._hold_counts = bool(values.get("hold_owner"))
         if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
             self._end(f"device {values['state']}: {_why(values)}")
 
@@ -257,11 +259,16 @@ class OperatorSequence:
 
     def check_time(self, now: float) -> None:
         """Press again where the hold does not count; end the run where the rig took too long."""
+        looked_for = min(now - self._looked_at, LONGEST_LOOK)
+        self._looked_at = now
         if self.outcome is not None:
             return
-        if self.hold(now) and not self._hold_counts and now >= self._press_since + PRESS_PATIENCE:
+        in_vain = self.hold(now) and not self._hold_counts
+        self._pressed_in_vain = self._pressed_in_vain + looked_for if in_vain else 0.0
+        if self._pressed_in_vain >= PRESS_PATIENCE:
             self.presses_again += 1
-            self._released_until = self._press_since = now + RELEASE_TIME
+            self._pressed_in_vain = 0.0
+            self._released_until = now + RELEASE_TIME
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
                 self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
