@@ -58,8 +58,8 @@ OPTIONS = {
     "obstacles": "--obstacles",
 }
 
-# How long nodes wait for each other in lock step, where needle and motors stand still meanwhile:
-# seven processes that start on two cores keep one waiting for seconds [s].
+# How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
+# seven processes that start on two cores keep one waiting for a second [s].
 PATIENT_WATCHDOG = 5.0
 # The same in real time: as long as on a rig whose motors turn by themselves it may be [s].
 REAL_TIME_WATCHDOG = 0.5
@@ -114,10 +114,6 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     driver["watchdog"] = driver["reply_age_limit"] = (
         PATIENT_WATCHDOG if driver["lock_step"] else REAL_TIME_WATCHDOG
     )
-    waits: dict[str, Any] = {}
-    if driver["lock_step"]:
-        sim_rig |= {"reexpose_after": PATIENT_WATCHDOG, "tick_timeout": PATIENT_WATCHDOG}
-        waits["tip_timeout"] = PATIENT_WATCHDOG
     parameters: Parameters = {
         "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
         "sim_rig": sim_rig,
@@ -130,7 +126,6 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
             "depth": options.depth_mm * 1e-3,
             "target_offset": -options.initial_x_mm * 1e-3,
             "wait_for_recorder": True,
-            **waits,
         },
         "operator": {"wait_for_recorder": True},
     }

@@ -75,7 +75,7 @@ class SimRigParameters:
         "partners know this node.",
     )
     reexpose_after: float = fixed_parameter(
-        2.0,
+        5.0,
         "s",
         "Lock step: expose again when a steered, held needle hears nothing so long.",
         0.1,
