@@ -25,13 +25,14 @@ from needle_bags.recording.recorder_health import RecorderHealth
 from needle_bags.recording.recording import Received, Recording
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
-from needle_bags.ros.recorder_parameters import PARAMETERS_OF, RecorderParameters
+from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.files.bag_directory import recover_hint
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_common.ros.discovery import PARAMETERS_OF
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 

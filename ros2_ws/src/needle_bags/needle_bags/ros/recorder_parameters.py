@@ -11,9 +11,6 @@ from needle_bags.recording.recording import RESERVE
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 
-# The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
-PARAMETERS_OF = "parameters_of"
-
 
 @dataclasses.dataclass(frozen=True)
 class RecorderParameters:

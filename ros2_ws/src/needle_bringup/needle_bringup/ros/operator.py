@@ -16,7 +16,6 @@ from rclpy.task import Future
 from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
-from needle_bags.ros.recorder_parameters import PARAMETERS_OF
 from needle_bringup.operator.operator_sequence import (
     DISABLE,
     PREPARATION,
@@ -31,7 +30,7 @@ from needle_common.process.end_request import EndRequest
 from needle_common.process.reach import DISCOVERY, is_open
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
 from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
-from needle_common.ros.discovery import RECORDER, full_name, publishers_of
+from needle_common.ros.discovery import PARAMETERS_OF, RECORDER, full_name, publishers_of
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode

@@ -19,6 +19,8 @@ from type_description_interfaces.srv import GetTypeDescription
 from needle_common.ros.question import Question
 
 RECORDER = "recorder"
+# The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
+PARAMETERS_OF = "parameters_of"
 # A question that any node answers at once: there is no such type.
 _NO_TYPE = GetTypeDescription.Request(type_name="none/msg/None", type_hash="RIHS01_" + "0" * 64)
 # What the graph calls a node whose endpoint has come and whose name has not.

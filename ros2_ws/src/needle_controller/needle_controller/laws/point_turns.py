@@ -111,15 +111,17 @@ def point_turns(
     limit = settings.max_rotation_per_length * settings.step_length
     need = np.empty(2)
     for n in range(position.shape[0]):
-        left[n] = write_need(rotation[n].T @ (target[n] - position[n]), need)
+        ahead = rotation[n].T @ (target[n] - position[n])
+        way = write_need(ahead, need)
+        left[n] = way_as_bent(ahead, way, curvature[n])
         turn[n] = 0.0
-        if left[n] <= 0.0:
+        if way <= 0.0:
             continue
         variance = uncertainty[n, 0]
-        variance += left[n] * (2.0 * uncertainty[n, 1] + left[n] * uncertainty[n, 2])
+        variance += way * (2.0 * uncertainty[n, 1] + way * uncertainty[n, 2])
         std = math.sqrt(max(variance, 0.0))
         slack = mean_slack(table[n], settings.max_rotation_per_length)
-        wanted = wanted_turn(need, left[n], curvature[n], std, slack, settings)
+        wanted = wanted_turn(need, way, curvature[n], std, slack, settings)
         heaviest = np.max(table[n, :, T_WEIGHT])
         turns = weights = 0.0
         for k in range(table.shape[1]):
@@ -163,6 +165,28 @@ def write_need(target: Array, need: Array) -> float:
     # The arc's curvature is 2 across / square.
     need[:] = target[:2] * (length * length / square)
     return length
+
+
+@compiled
+def way_as_bent(target: Array, way: float, curvature: float) -> float:
+    """Return how far a needle has to go until it is as near to a target as it gets [m].
+
+    Where no arc of the needle's leads there, that is where the tightest one comes nearest.
+
+    Parameters
+    ----------
+    target : ndarray, shape (3,)
+        In the tip's frame [m].
+    way : float
+        On the arc that leads there, see `write_need` [m].
+    curvature : float
+        Of the needle's path [1/m].
+    """
+    across = math.hypot(target[0], target[1])
+    square = across * across + target[2] * target[2]
+    if target[2] <= 0.0 or 2.0 * across <= curvature * square:
+        return way
+    return math.atan2(target[2], 1.0 / curvature - across) / curvature
 
 
 @compiled

@@ -1,10 +1,107 @@
-"""The point law within a preset: with a rig's settings."""
+"""The point law within a preset: with a rig's settings, on a target that may move."""
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import PointLawSettings
+from needle_controller.model.arrays import Array
+from needle_controller.model.target_motion import WINDOWS, TargetMotion
+from needle_controller.observers.estimator import Estimate
 from needle_controller.presets.steering_settings import SteeringSettings
+
+_LOOKS = 4
+"""How often the time of arrival is corrected at a step; it goes on from that of the step before."""
+_CORRECTED = 0.5
+"""Share of such a correction: the target may come towards the needle faster than that goes in."""
+_AVERAGED = 0.010
+"""The needle will be as fast as over so much insertion [m]."""
+_CLOCKS_APART = 1.0
+"""A target seen so long after the tip is stamped by another clock [s]."""
+
+
+class PointSteering:
+    """Steers to where a target will be when the needle is there.
+
+    Parameters
+    ----------
+    settings : SteeringSettings
+        What the law is made of; `SteeringSettings.check_steers_to_points` says who can.
+    motion : TargetMotion
+        Where the target was seen, in `rig`; times are seconds of the tips' clock.
+
+    Attributes
+    ----------
+    motion : TargetMotion
+        See above.
+    """
+
+    def __init__(self, settings: SteeringSettings, motion: TargetMotion) -> None:
+        self._law = point_law(settings)
+        self.motion = motion
+        self._insertions: deque[tuple[float, float]] = deque()
+        self._arrival: Array | None = None
+        self._foretold: Array | None = None
+
+    @property
+    def aim(self) -> Array:
+        """Where the target is expected when the needle is there, in `rig`, shape (..., 3) [m]."""
+        return self.motion.last if self._foretold is None else self._foretold
+
+    def command(
+        self,
+        estimate: Estimate,
+        time: Array | float,
+        insertion: Array | float,
+        from_rig: Callable[[Array], Array] = np.asarray,
+    ) -> SteeringCommand:
+        """Return the rotation rate to hold over the next step, and the insertion left.
+
+        Parameters
+        ----------
+        estimate : Estimate
+            Of the needle at `time`.
+        time : float, or ndarray, shape (...)
+            Of the tip that it is made from [s].
+        insertion : float, or ndarray, shape (...)
+            Then [m].
+        from_rig : callable
+            Takes points of `rig` to the estimate's frame.
+        """
+        now = float(np.max(time))
+        speed = self._speed(now, float(np.max(insertion)))
+        if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOWS[0]:
+            self._foretold = None
+            return self._law(estimate, from_rig(self.aim))
+        if self._arrival is None:
+            self._arrival = time + self._left(estimate, from_rig(self.aim)) / speed
+        for _ in range(_LOOKS):
+            self._foretold = self.motion.at(self._arrival)
+            left = self._left(estimate, from_rig(self.aim))
+            self._arrival = self._arrival + _CORRECTED * (time + left / speed - self._arrival)
+        return self._law(estimate, from_rig(self.aim))
+
+    def _left(self, estimate: Estimate, target: npt.ArrayLike) -> Array:
+        left = self._law(estimate, target).insertion_left
+        assert left is not None
+        return np.maximum(left, 0.0)
+
+    def _speed(self, time: float, insertion: float) -> float | None:
+        """Return how fast the needle goes in [m/s]; None while it has not moved."""
+        seen = self._insertions
+        if seen and (time <= seen[-1][0] or insertion < seen[-1][1]):
+            seen.clear()
+        seen.append((time, insertion))
+        while len(seen) > 2 and insertion - seen[1][1] >= _AVERAGED:
+            seen.popleft()
+        began, inserted = seen[0]
+        return (insertion - inserted) / (time - began) if insertion > inserted else None
 
 
 def point_law(settings: SteeringSettings) -> PointLaw:

@@ -12,11 +12,12 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.model.point_reach import point_reachability
 from needle_controller.model.reachability import Reachability, reachability
+from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
 from needle_controller.observers.estimator import Estimate
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.path_steering import PathSteering, configured_obstacles
-from needle_controller.presets.point_steering import point_law
+from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import (
     ONE_SIDED_PRESETS,
@@ -73,8 +74,6 @@ class PlaneControl:
 
     Attributes
     ----------
-    target_point : ndarray, shape (3,), or None
-        Where the tip is to go, in `rig` [m]; it may change at any time. None: into the plane.
     obstacles : Obstacles
         What it must not touch on its way to a point; it may change at any time.
     """
@@ -82,8 +81,8 @@ class PlaneControl:
     def __init__(self, settings: SteeringSettings, plane: TargetPlane) -> None:
         self._settings = settings
         self._plane = plane
+        self._points: PointSteering | None = None
         self.target_point = _point(settings)
-        self._point_law = point_law(settings)
         self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
         self._estimator, self._law = make_controller(settings, plane.T_plane_rig[:3, :3])
@@ -100,6 +99,34 @@ class PlaneControl:
     def plane(self, plane: TargetPlane) -> None:
         self._estimator.change_frame(plane.T_plane_rig @ self._plane.T_rig_plane)
         self._plane = plane
+
+    @property
+    def target_point(self) -> Array | None:
+        """Where the tip is to go, in `rig`, shape (3,) [m]; None: into the plane.
+
+        What is set rests there; see `see_target_point`.
+        """
+        return None if self._points is None else self._points.motion.last
+
+    @target_point.setter
+    def target_point(self, point: Array | None) -> None:
+        self._points = None
+        if point is not None:
+            self.see_target_point(point, 0.0)
+
+    def see_target_point(self, point: Array, time: float) -> None:
+        """Take where the target is at a time of the tips' clock; what moves is foretold.
+
+        Parameters
+        ----------
+        point : ndarray, shape (3,)
+            In `rig` [m].
+        time : float
+            When it was there [s].
+        """
+        if self._points is None:
+            self._points = PointSteering(self._settings, TargetMotion())
+        self._points.motion.see(time, point)
 
     def configure(self, settings: SteeringSettings) -> None:
         """Take new settings; the estimated pose stays, plane and point unless their own change.
@@ -124,14 +151,17 @@ class PlaneControl:
         if settings.obstacles != self._settings.obstacles:
             self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
-        self._point_law = point_law(settings)
         self._settings = settings
+        if self._points is not None:
+            self._points = PointSteering(settings, self._points.motion)
 
     def restart(self) -> None:
         """Forget the needle: the next tip is the first."""
         rotation = self._plane.T_plane_rig[:3, :3]
         self._estimator, self._law = make_controller(self._settings, rotation)
         self._joints = self._first_joints = None
+        if self._points is not None:
+            self._points = PointSteering(self._settings, self._points.motion)
 
     @property
     def started(self) -> bool:
@@ -204,13 +234,16 @@ class PlaneControl:
         return self._path.why_not(self.target_point, self.obstacles, rotation)
 
     def _command(self, estimate: Estimate, joints: JointSample) -> SteeringCommand | None:
-        if self.target_point is None:
+        if self._points is None:
             return self._law(estimate, joints.insertion)
         if len(self.obstacles):
+            point = self._points.motion.last
             return self._path.command(
-                estimate, self._plane, self.target_point, self.obstacles, joints.insertion
+                estimate, self._plane, point, self.obstacles, joints.insertion
             )
-        return self._point_law(estimate, self._plane.from_rig(self.target_point))
+        return self._points.command(
+            estimate, joints.stamp_ns * 1e-9, joints.insertion, self._plane.from_rig
+        )
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
         limits = {
@@ -218,9 +251,9 @@ class PlaneControl:
             "end": self._settings.depth,
             "tolerance": TARGET_TOLERANCE,
         }
-        if self.target_point is None:
+        if self._points is None:
             return reachability(estimate.reduced, estimate.curvature, **limits)
-        offset = self._plane.from_rig(self.target_point) - estimate.position
+        offset = self._plane.from_rig(self._points.aim) - estimate.position
         return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
 
     def _correct(self, position: Array, known: TipCovariance | None) -> None:
@@ -242,7 +275,7 @@ class PlaneControl:
         estimate = estimator.estimate()
         law(estimate, length)
         if settings.preset in POINT_PRESETS:
-            self._point_law(estimate, [0.0, 0.0, 1.0])
+            point_law(settings)(estimate, [0.0, 0.0, 1.0])
             ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
             PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
         estimate.covariance  # noqa: B018 - lazy, and compiled too

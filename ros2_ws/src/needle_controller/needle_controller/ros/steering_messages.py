@@ -121,7 +121,12 @@ class SteeringMessages:
             self.point_complaint = f"{error}; the last target stays"
             return [Log("warning", self.point_complaint, conversions.TARGET_POINT)]
         self.point_complaint = ""
-        self.steering.control.target_point = point
+        stamp_ns = to_nanoseconds(message.header.stamp)
+        if stamp_ns:
+            self.steering.control.see_target_point(point, stamp_ns * 1e-9)
+        else:
+            # Placed by hand: nobody says when it was there.
+            self.steering.control.target_point = point
         x, y, z = point
         text = f"target_point at ({x:g}, {y:g}, {z:g}) m"
         return [Log("info", text, conversions.TARGET_POINT)]

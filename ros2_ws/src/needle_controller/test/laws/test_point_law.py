@@ -24,7 +24,12 @@ from needle_controller.bank.hypothesis_mixture import (
     MixtureEstimate,
 )
 from needle_controller.laws.point_law import PointLaw
-from needle_controller.laws.point_turns import PointLawSettings, rest_after, write_need
+from needle_controller.laws.point_turns import (
+    PointLawSettings,
+    rest_after,
+    way_as_bent,
+    write_need,
+)
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.observers.estimator import Estimate
@@ -87,6 +92,20 @@ def test_a_point_beside_or_behind_needs_nothing_and_is_passed() -> None:
     assert write_need(np.array([0.001, 0.0, -0.002]), need) == -0.002
     np.testing.assert_array_equal(need, 0.0)
     assert write_need(np.array([0.0, 0.0, 0.05]), need) == 0.05
+
+
+@pytest.mark.parametrize(
+    "target", [(0.0, -0.003, 0.005), (0.001, 0.002, 0.02), (0.06, 0.0, 0.03), (0.0, 0.0, 0.05)]
+)
+def test_what_no_arc_leads_to_is_nearest_after_what_is_said(target: tuple[float, ...]) -> None:
+    """The oracle looks along the arcs of all curvatures up to the needle's."""
+    aside, ahead = np.hypot(target[0], target[1]), target[2]
+    lengths = np.linspace(0.0, 0.1, 5001)[:, None]
+    bend = np.linspace(1e-6, CURVATURE, 101)
+    x, z = (1.0 - np.cos(bend * lengths)) / bend, np.sin(bend * lengths) / bend
+    nearest = np.argmin(np.hypot(x - aside, z - ahead)) // len(bend)
+    found = way_as_bent(np.array(target), write_need(np.array(target), np.empty(2)), CURVATURE)
+    assert found == pytest.approx(lengths[nearest, 0], abs=1e-4)
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-7, 200.0, -523.0])

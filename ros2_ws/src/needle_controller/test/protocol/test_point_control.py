@@ -23,13 +23,22 @@ TARGET = (0.008, -0.006, 0.07)
 SETTINGS = SteeringSettings(target_point=TARGET, depth=0.12, **PAPER_NOISE)
 
 
+STEP_NS = 500_000_000
+
+
 def steer(
     settings: SteeringSettings,
     *,
     offset: float = 0.0,
     target_at: Callable[[int], Array] | None = None,
-) -> tuple[Array, list[bool]]:
-    """Steer an exact needle to the end; return its tip in `rig`, and what it said of its reach."""
+    seen_at: Callable[[float], Array] | None = None,
+    clocks_apart: float = 0.0,
+) -> tuple[Array, list[bool], float]:
+    """Steer an exact needle to the end.
+
+    Returns its tip in `rig`, what it said of its reach, and the time [s]. `target_at` places the
+    target before each step, `seen_at` tells where it was at a time, which is stamped.
+    """
     plant = NeedlePlant(initial_pose(np.deg2rad(3.0), np.deg2rad(20.0)), curvature=1 / 0.122)
     control = PlaneControl(settings, offset_plane(offset))
     rng = np.random.default_rng(5)
@@ -38,21 +47,26 @@ def steer(
     for k in itertools.count():
         if target_at is not None:
             control.target_point = target_at(k)
+        time = joints.stamp_ns * 1e-9
+        if seen_at is not None:
+            control.see_target_point(seen_at(time), time + clocks_apart)
         tip = plant.T_rig_tip[:3, 3] + rng.uniform(-0.0005, 0.0005, 3)
         update = control.update(tip, joints)
         reachable.append(bool(update.reach.reachable))
         step = next_step(k, joints, update.command, settings, slowly=False)
         if step is None:
-            return np.array(plant.T_rig_tip[:3, 3]), reachable
-        plant.advance(step.insertion - joints.insertion, step.rotation - joints.rotation)
-        joints = JointSample(k + 1, step.insertion, step.rotation)
+            return np.array(plant.T_rig_tip[:3, 3]), reachable, time
+        length = step.insertion - joints.insertion
+        plant.advance(length, step.rotation - joints.rotation)
+        took_ns = round(STEP_NS * length / settings.step_length)
+        joints = JointSample(joints.stamp_ns + took_ns, step.insertion, step.rotation)
     raise AssertionError
 
 
 @pytest.mark.parametrize("offset", [0.0, 0.004])
 def test_the_tip_ends_at_the_point_whatever_the_plane(offset: float) -> None:
     settings = dataclasses.replace(SETTINGS, target_offset=offset)
-    tip, reachable = steer(settings, offset=offset)
+    tip, reachable, _ = steer(settings, offset=offset)
     assert np.linalg.norm(tip - TARGET) < 0.0006
     assert reachable[0]
     assert reachable[-1]
@@ -60,19 +74,38 @@ def test_the_tip_ends_at_the_point_whatever_the_plane(offset: float) -> None:
 
 def test_a_point_to_the_side_stays_in_reach_as_the_needle_bends_to_it() -> None:
     aside = (0.02, 0.005, 0.08)
-    tip, reachable = steer(dataclasses.replace(SETTINGS, target_point=aside))
+    tip, reachable, _ = steer(dataclasses.replace(SETTINGS, target_point=aside))
     assert np.linalg.norm(tip - aside) < 0.0006
     assert all(reachable[:-5])
 
 
 def test_a_point_that_moves_on_the_way_is_followed() -> None:
     moved = np.array([0.002, 0.001, 0.0])
-    tip, _ = steer(SETTINGS, target_at=lambda k: np.array(TARGET) + moved * min(k / 40.0, 1.0))
+    tip, _, _ = steer(SETTINGS, target_at=lambda k: np.array(TARGET) + moved * min(k / 40.0, 1.0))
     assert np.linalg.norm(tip - TARGET - moved) < 0.0006
 
 
+def breathing(time: float) -> Array:
+    return np.array(TARGET) + [0.0, 0.003 * np.sin(2.0 * np.pi * 0.2 * time), 2e-5 * time]
+
+
+def test_a_point_that_breathes_is_met_where_it_will_be() -> None:
+    tip, _, time = steer(SETTINGS, seen_at=breathing)
+    assert np.linalg.norm(tip - breathing(time)) < 0.0006
+
+
+def test_a_point_stamped_by_another_clock_is_where_it_was_last_seen() -> None:
+    """Nobody knows how old it is: what is foretold would be of another time."""
+    resting, _, _ = steer(SETTINGS, seen_at=lambda _: np.array(TARGET))
+    apart, _, _ = steer(SETTINGS, seen_at=lambda _: np.array(TARGET), clocks_apart=1.7e9)
+    np.testing.assert_array_equal(apart, resting)
+    tip, _, time = steer(SETTINGS, seen_at=breathing, clocks_apart=1.7e9)
+    off = np.linalg.norm([tip - breathing(time - k * 0.5) for k in range(3)], axis=1)
+    assert np.min(off) < 0.004
+
+
 def test_the_depth_ends_it_before_the_point() -> None:
-    tip, reachable = steer(
+    tip, reachable, _ = steer(
         dataclasses.replace(SETTINGS, target_point=(0.0, 0.0, 0.04), depth=0.05),
         target_at=lambda _: np.array([0.0, 0.0, 0.1]),
     )

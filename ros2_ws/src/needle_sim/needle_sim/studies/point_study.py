@@ -12,7 +12,7 @@ from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import BeliefTally
 from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import BAND, BoolArray, joined, mean_of_what_is_said
-from needle_sim.studies.point_targets import NEAREST
+from needle_sim.studies.point_targets import INSERTION_SPEED, NEAREST, MovingTargets
 from needle_sim.studies.study import CHUNK, Controller, StudySettings
 
 ARRIVED = 1e-4
@@ -20,7 +20,13 @@ ARRIVED = 1e-4
 
 
 class PointController(Controller, Protocol):
-    """Controller of some needles that knows where each one's way ends."""
+    """Controller of some needles that knows where each one's way ends.
+
+    It is told where the targets are before its start and before each step.
+    """
+
+    def see_targets(self, time: float, targets: FloatArray) -> None:
+        """Take where the targets are, (N, 3) [m], at a time [s]."""
 
     def step(
         self,
@@ -63,8 +69,8 @@ class PointOutcomes:
 
 def run_point_study(
     starts: FloatArray,
-    targets: FloatArray,
-    new_controller: Callable[[FloatArray], PointController],
+    targets: MovingTargets,
+    new_controller: Callable[[], PointController],
     settings: StudySettings,
     *,
     on_progress: Callable[[int], None] = lambda _: None,
@@ -76,10 +82,10 @@ def run_point_study(
     ----------
     starts : ndarray, shape (N, 3)
         x [m], pitch, roll [rad] of each needle.
-    targets : ndarray, shape (N, 3)
-        Its point [m].
+    targets : MovingTargets
+        A point for each.
     new_controller : callable
-        Returns a controller for needles that have these points.
+        Returns a controller for some needles.
     settings : StudySettings
         What the needles have in common; a needle that is not there at the depth stays there.
     on_progress : callable
@@ -103,8 +109,8 @@ def run_point_study(
             seed=settings.seed,
             first=first,
         )
-        controller = new_controller(targets[part])
-        parts.append(_steer(needles, targets[part], controller, settings, on_progress))
+        some = targets.part(first, len(starts[part]))
+        parts.append(_steer(needles, some, new_controller(), settings, on_progress))
     return joined(parts)
 
 
@@ -126,12 +132,13 @@ def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
 
 def _steer(
     needles: DisturbedNeedles,
-    targets: FloatArray,
+    targets: MovingTargets,
     controller: PointController,
     settings: StudySettings,
     on_progress: Callable[[int], None],
 ) -> PointOutcomes:
-    count, true = len(targets), needles.true
+    count, true = len(targets.places), needles.true
+    controller.see_targets(0.0, targets.at(0.0))
     rate = controller.start(needles.first_seen())
     inserted, rotation, error = np.zeros(count), np.zeros(count), np.full(count, np.nan)
     inside, doubtful = np.full((2, count), np.nan), np.full(count, np.nan)
@@ -144,7 +151,8 @@ def _steer(
         if np.any(arrived):
             said = BeliefTally(count)
             said.add(controller.belief(), true.x, true.pitch)
-            off = np.linalg.norm(true.tips - targets, axis=1)
+            there = targets.at(inserted / INSERTION_SPEED)
+            off = np.linalg.norm(true.tips - there, axis=1)
             error[arrived], doubtful[arrived] = off[arrived], said.doubtful[arrived]
             inside[:, arrived] = said.inside[:, arrived]
             on_the_way &= ~arrived
@@ -159,6 +167,8 @@ def _steer(
         needles.insert(begin, end, length, turned)
         begin = end
         on_progress(int(np.sum(on_the_way)))
+        time = end / INSERTION_SPEED
+        controller.see_targets(time, targets.at(time))
         tips, age = needles.seen(inserted)
         rate = controller.step(length, turned, tips, age)
     return PointOutcomes(error, rotation, inside[0], inside[1], doubtful)

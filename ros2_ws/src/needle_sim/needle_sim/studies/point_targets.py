@@ -1,6 +1,8 @@
-"""Points for the needles of a study to go to."""
+"""Points for the needles of a study to go to, and how they move meanwhile."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import numpy as np
 
@@ -12,6 +14,57 @@ NEAREST, FARTHEST = 0.060, 0.120
 CURVATURE_SHARE = 0.6
 """Share of the needle's curvature that the arc from the true start to the point takes at most. What
 a hand can aim at is more; but over its first centimetres a needle does not know yet how it lies."""
+BREATHING_RATE = 0.2
+"""Of targets that breathe [Hz]."""
+INSERTION_SPEED = 0.002
+"""How fast the needles of a study go in, where that matters [m/s]."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MovingTargets:
+    """Targets that drift and breathe, each in directions and with a phase of its own.
+
+    Attributes
+    ----------
+    places : ndarray, shape (N, 3)
+        Where they are at the begin but for the breath [m].
+    drift : float
+        How far they have drifted after `FARTHEST` of insertion [m].
+    breath : float
+        Amplitude of their breathing, a sine of time [m].
+    seed, first : int
+        Key the randomness: of the study, and the first target.
+    """
+
+    places: FloatArray
+    drift: float = 0.0
+    breath: float = 0.0
+    seed: int = 0
+    first: int = 0
+
+    def part(self, first: int, count: int) -> MovingTargets:
+        """Return `count` of the targets, as they are here."""
+        places = self.places[first : first + count]
+        return dataclasses.replace(self, places=places, first=self.first + first)
+
+    def at(self, time: FloatArray | float) -> FloatArray:
+        """Return where they are, (N, 3) [m], at a time of each or of all [s]."""
+        key, count = (self.seed, self.first), len(self.places)
+        passed = np.broadcast_to(np.asarray(time, dtype=float), (count,))[:, None]
+        drift, _ = _directions(study_noise.DRIFT, *key, count)
+        breath, phase = _directions(study_noise.BREATH, *key, count)
+        share = passed * INSERTION_SPEED / FARTHEST
+        swing = np.sin(2.0 * np.pi * (BREATHING_RATE * passed + phase))
+        return np.asarray(self.places + self.drift * share * drift + self.breath * swing * breath)
+
+
+def _directions(purpose: int, seed: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return unit vectors that point anywhere, (N, 3), and numbers in [0, 1), (N, 1)."""
+    share = study_noise.uniform(seed, purpose, 0, first, count).astype(np.float64)
+    height, around = 2.0 * share[:, 0] - 1.0, 2.0 * np.pi * share[:, 1]
+    across = np.sqrt(1.0 - height**2)
+    vectors = np.stack([across * np.cos(around), across * np.sin(around), height], axis=-1)
+    return vectors, share[:, 2:3]
 
 
 def random_targets(starts: FloatArray, curvature: float, seed: int) -> FloatArray:

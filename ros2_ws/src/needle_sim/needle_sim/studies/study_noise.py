@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET = range(8)
+START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
 """Purposes of random numbers."""
 PER_NEEDLE = 4
 """Numbers for each needle and draw: two needles share one block of the generator."""
@@ -22,7 +22,7 @@ def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> NDArr
     seed : int
         Of the study, >= 0.
     purpose : int
-        One of `START` ... `TARGET`.
+        One of `START` ... `BREATH`.
     step : int
         Number of the exposure, or of whatever the purpose counts.
     first, count : int

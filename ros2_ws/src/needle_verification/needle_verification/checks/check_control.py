@@ -32,6 +32,7 @@ from needle_verification.studies.control_studies import (
     BEST,
     FIGURE_3,
     PAPER,
+    POINTS,
     SPEED,
     TOLD_WRONG,
     TROUBLE,
@@ -60,12 +61,15 @@ class Size:
         Runs of each study from each of its 1000 starts.
     trouble : tuple of Study
         Which troubles.
+    points : tuple of Study
+        Which studies of points.
     insertions : int
         Pure insertions that the curvature is found from.
     """
 
     draws: int = 10
     trouble: tuple[Study, ...] = TROUBLE + TOLD_WRONG
+    points: tuple[Study, ...] = POINTS
     insertions: int = 3000
 
 
@@ -92,6 +96,14 @@ def trouble(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
     """Study preset best under each trouble, of which it is told nothing."""
     for study in size.trouble:
         yield from _findings(study, bench, size)
+
+
+def points(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
+    """Steer needles to points, at rest and moving, under troubles it is told nothing of."""
+    targets = ("--targets", str(control_studies.RUNS_A_DRAW * size.draws))
+    for study in size.points:
+        asked = dataclasses.replace(study, options=(*targets, *study.options))
+        yield from _findings(asked, bench, size)
 
 
 def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
@@ -225,7 +237,7 @@ def node_update(_: Workbench) -> Iterator[Finding]:
 
 
 CHECKS: tuple[Check, ...] = (
-    paper, figure_3, best, trouble, curvature, bad_parameters, study_speed, study_memory,
+    paper, figure_3, best, trouble, points, curvature, bad_parameters, study_speed, study_memory,
     node_update,
 )  # fmt: skip
 

@@ -131,6 +131,44 @@ TOLD_WRONG = tuple(
     )
 )
 """What is claimed to `best` stays +-1 mm, or the standard deviation that such noise has."""
+REACHED = "within_1_mm_point"
+POINTS = (
+    Study(
+        "points",
+        "best",
+        (),
+        {REACHED: 0.999},
+        {"rms_point_mm": 0.20, "rotation_mean_deg": 1300.0},
+    ),
+    Study(
+        "points_seen_well",
+        "best",
+        ("--noise-mm", "0.05", "--claimed-mm", "0.05"),
+        {REACHED: 0.999},
+        {"rms_point_mm": 0.10},
+    ),
+    Study(
+        "points_moving",
+        "best",
+        ("--target-drift-mm", "2", "--target-breath-mm", "3"),
+        {REACHED: 0.97},
+        {"rms_point_mm": 0.40},
+    ),
+    *(
+        Study(f"points_{key}", "best", options, {REACHED: 0.97})
+        for key, options in (
+            ("normal_noise", NORMAL),
+            ("noise_13", ("--noise-mm", "1.3")),
+            ("outliers_near", ("--outliers", "0.05", "--outlier-mm", "2,3.5")),
+            ("slip_5", ("--slip", "0.05")),
+            ("sigma_2", (*NORMAL, "--sigma-scale", "2")),
+            ("play_40", ("--play-deg", "40")),
+            ("lag_8", ("--lag-mm", "8")),
+            ("bump", ("--bump-mm", "2")),
+        )
+    ),
+)
+"""Needles to points, each to one of its own."""
 SPEED = (
     Study("speed_paper", "paper", (), {}, {"cpu_s": 0.2}),
     Study("speed_best", "best", (), {}, {"cpu_s": 10.0}),

@@ -55,6 +55,7 @@ examples:
   ros2 run needle_sim monte_carlo --controller paper --kappa-scale 0.8 --csv runs.csv
   ros2 run needle_sim monte_carlo --noise-mm 0.58 --noise-shape normal
   ros2 run needle_sim monte_carlo --targets 2000 --csv points.csv
+  ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm 2 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
@@ -78,6 +79,8 @@ class MonteCarloOptions:
     sigma_scale: float
     flips: int
     targets: int
+    target_drift: float
+    target_breath: float
     seed: int
     json: Path | None
     csv: Path | None
@@ -127,6 +130,8 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         sigma_scale=number("--sigma-scale", given.sigma_scale, 0.01, 100.0, "-"),
         flips=whole_number("--flips", given.flips, 0, 100),
         targets=whole_number("--targets", given.targets, 0, 1_000_000),
+        target_drift=number("--target-drift-mm", given.target_drift_mm, 0.0, 100.0, "mm") * 1e-3,
+        target_breath=number("--target-breath-mm", given.target_breath_mm, 0.0, 100.0, "mm") * 1e-3,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         json=output_file("--json", given.json),
         csv=output_file("--csv", given.csv),
@@ -187,6 +192,19 @@ def _parser() -> CommandParser:
             "N",
             "steer N needles to points in place of the plane: each from a random start within the "
             "bounds to a random point of its own, 60 to 120 mm ahead",
+        ),
+        (
+            "--target-drift-mm",
+            "0",
+            "D",
+            "how far each point drifts in a direction of its own while the needle goes in by 120 "
+            "mm, at 2 mm/s",
+        ),
+        (
+            "--target-breath-mm",
+            "0",
+            "A",
+            "how far each point moves to and fro, 0.2 times a second, in another direction",
         ),
         ("--seed", "1", "N", "seed of all randomness: same seed, same figures"),
     )

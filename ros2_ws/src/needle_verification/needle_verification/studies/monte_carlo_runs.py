@@ -12,7 +12,7 @@ from needle_common.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.figures_of_merit import figures
 from needle_sim.studies.point_study import point_figures, run_point_study
-from needle_sim.studies.point_targets import random_targets
+from needle_sim.studies.point_targets import MovingTargets, random_targets
 from needle_sim.studies.start_grids import GRIDS, POINTS
 from needle_sim.studies.study import StudySettings, run_study
 from needle_verification.studies.monte_carlo_options import MonteCarloOptions
@@ -116,14 +116,17 @@ class PointRuns:
     def __init__(self, options: MonteCarloOptions) -> None:
         self.settings = _settings(options)
         self.starts = _starts(options, options.targets)
-        self._targets = random_targets(self.starts, CURVATURE, options.seed)
+        places = random_targets(self.starts, CURVATURE, options.seed)
+        self._targets = MovingTargets(
+            places, options.target_drift, options.target_breath, options.seed
+        )
         self._new_controller = point_controller_factory(
             options.controller, options.claimed_bound, sigma_scale=options.sigma_scale
         )
 
     def compile(self) -> None:
         """Run two needles; see `Runs.compile`."""
-        ahead = np.tile([0.0, 0.0, 0.01], (2, 1))
+        ahead = MovingTargets(np.tile([0.0, 0.0, 0.01], (2, 1)))
         run_point_study(np.zeros((2, 3)), ahead, self._new_controller, self.settings)
 
     def run(self, on_progress: Callable[[int], None]) -> Results:
@@ -135,7 +138,7 @@ class PointRuns:
             self.settings,
             on_progress=on_progress,
         )
-        x, y, z = self._targets.T * 1e3
+        x, y, z = self._targets.places.T * 1e3
         return Results(
             {
                 "runs": len(self.starts),

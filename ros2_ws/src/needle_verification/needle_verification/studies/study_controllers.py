@@ -11,12 +11,13 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from needle_common.errors import UserError
-from needle_controller.laws.law import StepLaw
+from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.arrays import Array
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.presets.point_steering import point_law
+from needle_controller.model.target_motion import TargetMotion
+from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import (
     ONE_SIDED_PRESETS,
@@ -25,6 +26,7 @@ from needle_controller.presets.steering_settings import (
 )
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
+from needle_sim.studies.point_targets import INSERTION_SPEED
 from needle_sim.studies.study import CHUNK
 
 CURVATURE = SteeringSettings.curvature
@@ -52,9 +54,8 @@ class SteeredNeedles:
         self._estimator = estimator
         self._law = law
         self._covariance = covariance
-        self._insertion = 0.0
+        self._insertion: FloatArray = np.zeros(())
         self._estimate: Estimate | None = None
-        self._left: FloatArray | None = None
 
     def start(self, tips: FloatArray) -> FloatArray:
         """Take the first measured tips; see `study.Controller.start`."""
@@ -69,7 +70,7 @@ class SteeredNeedles:
         age: float | FloatArray,
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
-        self._insertion += float(np.max(d_insertion))
+        self._insertion = self._insertion + d_insertion
         self._estimator.advance(d_insertion, d_rotation)
         self._estimator.correct(tips, self._covariance, age)
         return self._rate()
@@ -92,23 +93,46 @@ class SteeredNeedles:
             doubtful=estimate.doubtful,
         )
 
-    def insertion_left(self) -> FloatArray:
-        """Return how far each needle has to go; see `point_study.PointController`.
-
-        Raises
-        ------
-        RuntimeError
-            The law does not say.
-        """
-        if self._left is None:
-            raise RuntimeError("a law for planes does not say how far a needle has to go")
-        return self._left
-
     def _rate(self) -> FloatArray:
         self._estimate = self._estimator.estimate()
-        command = self._law(self._estimate, self._insertion)
+        return self._law(self._estimate, float(np.max(self._insertion))).rotation_rate
+
+
+class NeedlesToPoints(SteeredNeedles):
+    """An estimator, and the law for points: what `point_study.PointController` describes.
+
+    Parameters
+    ----------
+    estimator : Estimator
+        See `SteeredNeedles`, likewise `covariance`.
+    settings : SteeringSettings
+        Of the law.
+    covariance : ndarray, shape (3, 3), optional
+        See above.
+    """
+
+    def __init__(
+        self, estimator: Estimator, settings: SteeringSettings, covariance: Array | None = None
+    ) -> None:
+        self._motion = TargetMotion()
+        self._points = PointSteering(settings, self._motion)
+        self._left: FloatArray = np.full((), np.nan)
+        super().__init__(estimator, self._command, covariance)
+
+    def see_targets(self, time: float, targets: FloatArray) -> None:
+        """Take where the targets are; see `point_study.PointController`."""
+        self._motion.see(time, targets)
+
+    def insertion_left(self) -> FloatArray:
+        """Return how far each needle has to go; see `point_study.PointController`."""
+        return self._left
+
+    def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
+        time = self._insertion / INSERTION_SPEED
+        command = self._points.command(estimate, time, self._insertion)
+        assert command.insertion_left is not None
         self._left = command.insertion_left
-        return command.rotation_rate
+        return command
 
 
 def needles_at_a_time(name: str) -> int:
@@ -149,8 +173,8 @@ def controller_factory(
 
 def point_controller_factory(
     name: str, claimed: float, *, sigma_scale: float = 1.0
-) -> Callable[[FloatArray], SteeredNeedles]:
-    """Return what makes the controller of some needles from their points, (N, 3) [m].
+) -> Callable[[], NeedlesToPoints]:
+    """Return what makes the controller of some needles that are steered to points.
 
     Parameters, and what is raised, as of `controller_factory`; a preset that does not estimate the
     whole pose is refused.
@@ -158,13 +182,7 @@ def point_controller_factory(
     settings = _settings(name, claimed, sigma_scale)
     settings.check_steers_to_points()
     covariance = _told_covariance(settings, sigma_scale)
-    law = point_law(settings)
-
-    def make(targets: FloatArray) -> SteeredNeedles:
-        estimator, _ = make_controller(settings, np.eye(3))
-        return SteeredNeedles(estimator, lambda estimate, _: law(estimate, targets), covariance)
-
-    return make
+    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3))[0], settings, covariance)
 
 
 def _settings(

@@ -15,12 +15,13 @@ from needle_verification.checking import Finding, Workbench
 from needle_verification.checks import check_control
 from needle_verification.checks.check_control import Size
 from needle_verification.studies import control_studies, monte_carlo
-from needle_verification.studies.control_studies import TROUBLE, Measured, Study, judge
+from needle_verification.studies.control_studies import POINTS, TROUBLE, Measured, Study, judge
 
 # The other troubles are steered on a plant of its own by needle_controller's tests.
 SAMPLE = Size(
     draws=1,
     trouble=tuple(s for s in TROUBLE if s.key in {"all_troubles", "roll_160"}),
+    points=tuple(s for s in POINTS if s.key == "points_moving"),
     insertions=300,
 )
 
@@ -46,6 +47,7 @@ def bench(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workbench:
         check_control.figure_3,
         check_control.best,
         check_control.trouble,
+        check_control.points,
         check_control.curvature,
     ],
     ids=lambda check: str(check.__name__),
