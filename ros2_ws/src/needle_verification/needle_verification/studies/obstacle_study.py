@@ -17,7 +17,7 @@ import numpy as np
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, number, output_file, whole_number
 from needle_controller.model.target_plane import offset_plane
-from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
@@ -28,8 +28,6 @@ from needle_verification.studies.path_judge import way_after
 
 NEEDLE_RADIUS = 0.00035
 CURVATURE = SteeringSettings.curvature
-NOISE = 0.001
-"""Largest error of a measured coordinate [m]."""
 SAMPLES = 4000
 """Points of the search that judges a scene."""
 DEPTH = 0.2
@@ -109,7 +107,7 @@ def steer(
     scene, judged : ObstacleScene, SceneOutcome
         The scene, and what is known of it.
     settings : SteeringSettings
-        The controller's.
+        The controller's; its `tip_noise_bound` is the largest error of a measured coordinate, too.
     rng : numpy.random.Generator
         Of the tips' noise.
     times : list of float
@@ -123,9 +121,10 @@ def steer(
     if control.path_obstacle(0.0):
         return judged
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
+    noise = settings.tip_noise_bound
     joints, least = JointSample(0, 0.0, 0.0), math.inf
     for k in itertools.count(1):
-        tip = _tip(plant) + rng.uniform(-NOISE, NOISE, 3)
+        tip = _tip(plant) + rng.uniform(-noise, noise, 3)
         begin = time.perf_counter()
         update = control.update(tip, joints)
         times.append(time.perf_counter() - begin)
@@ -150,6 +149,7 @@ def study(
     pitch_bound: float,
     roll_bound: float,
     entry_angle_std: float,
+    noise: float,
     on_progress: Callable[[int], None] = lambda _: None,
 ) -> dict[str, float | None]:
     """Return the figures of some scenes, by the names of `LABELS`.
@@ -162,10 +162,18 @@ def study(
         Of the needles at their entries [rad].
     entry_angle_std : float
         What the controller is told of that [rad].
+    noise : float
+        Largest error of a measured coordinate, as it is told [m].
     on_progress : callable
         Told after each scene how many are done.
     """
-    settings = SteeringSettings(depth=DEPTH, entry_angle_std=entry_angle_std, **PAPER_NOISE)
+    settings = SteeringSettings(
+        depth=DEPTH,
+        entry_angle_std=entry_angle_std,
+        tip_noise="bounded",
+        tip_noise_bound=noise,
+        measurement_std=noise / math.sqrt(3.0),
+    )
     outcomes: list[SceneOutcome] = []
     times: list[float] = []
     for n in range(scenes):
@@ -222,6 +230,7 @@ def _run(words: Sequence[str]) -> int:
         ("--pitch-deg", "1", "P", "bound of the needles' pitch at their entries"),
         ("--roll-deg", "10", "R", "bound of their roll"),
         ("--told-deg", "2", "S", "standard deviation of the pitch that the controller is told"),
+        ("--noise-mm", "1", "A", "largest error of each coordinate of a measured tip, as is told"),
     ):
         parser.add_argument(
             option, default=default, metavar=metavar, help=f"{text} (default: {default})"
@@ -235,6 +244,7 @@ def _run(words: Sequence[str]) -> int:
         pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
         roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),
+        noise=number("--noise-mm", given.noise_mm, 0.01, 10.0, "mm") * 1e-3,
     )
     for name, label in LABELS.items():
         value = seen[name]

@@ -94,6 +94,7 @@ def test_some_scenes_have_no_contact() -> None:
         pitch_bound=math.radians(1.0),
         roll_bound=math.radians(10.0),
         entry_angle_std=math.radians(2.0),
+        noise=0.001,
     )
     assert seen["contacts"] == 0
     assert seen["unsolvable_refused"] == 1.0
