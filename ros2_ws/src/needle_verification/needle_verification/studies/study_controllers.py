@@ -27,8 +27,11 @@ from needle_controller.presets.steering_settings import (
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.point_targets import INSERTION_SPEED
+from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
 
+SLIDING_MODE = "sliding_mode"
+"""Name of the reference law for points."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
 # What the linear observer knows of a needle is a twentieth of what the bank does.
@@ -135,6 +138,29 @@ class NeedlesToPoints(SteeredNeedles):
         return command
 
 
+class SlidingNeedles(NeedlesToPoints):
+    """The same estimator with the published reference law; see `sliding_mode`.
+
+    Parameters
+    ----------
+    estimator, settings, covariance :
+        See `NeedlesToPoints`.
+    """
+
+    def __init__(
+        self, estimator: Estimator, settings: SteeringSettings, covariance: Array | None = None
+    ) -> None:
+        super().__init__(estimator, settings, covariance)
+        self._largest_rate = settings.max_rotation_per_length
+
+    def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
+        off = (self._motion.last - estimate.position)[..., None]
+        target = (estimate.rotation.swapaxes(-1, -2) @ off)[..., 0]
+        rate = sliding_mode_rate(target, self._largest_rate)
+        self._left = target[..., 2]
+        return SteeringCommand(np.zeros_like(rate), rate, self._left)
+
+
 def needles_at_a_time(name: str) -> int:
     """Return how many needles of a preset to steer at a time: so many fit into a cache."""
     return _LINEAR_CHUNK if name in ONE_SIDED_PRESETS else CHUNK
@@ -177,12 +203,14 @@ def point_controller_factory(
     """Return what makes the controller of some needles that are steered to points.
 
     Parameters, and what is raised, as of `controller_factory`; a preset that does not estimate the
-    whole pose is refused.
+    whole pose is refused, and `SLIDING_MODE` has the estimator of `best`.
     """
-    settings = _settings(name, claimed, sigma_scale)
+    is_sliding = name == SLIDING_MODE
+    kind = SlidingNeedles if is_sliding else NeedlesToPoints
+    settings = _settings("best" if is_sliding else name, claimed, sigma_scale)
     settings.check_steers_to_points()
     covariance = _told_covariance(settings, sigma_scale)
-    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3))[0], settings, covariance)
+    return lambda: kind(make_controller(settings, np.eye(3))[0], settings, covariance)
 
 
 def _settings(
