@@ -14,10 +14,10 @@ import numpy.typing as npt
 from needle_controller.model.arrays import Array
 
 WINDOWS = (20.0, 10.0)
-"""What is asked was seen in the last so many seconds: in the shorter where the longer is not of one
-piece, as after a jump [s]."""
+"""So far back is asked what was seen: the shorter where the longer is not of one piece, as after a
+jump [s]."""
 SHORTEST = 5.0
-"""So long a target must have been seen, or for one period: less tells no drift from a breath [s]."""
+"""So long a target must have been seen: less tells no drift from a breath [s]."""
 SLOWEST, FASTEST = 0.08, 0.7
 """Rates of breathing that are thought of [Hz]."""
 EXPLAINED = 0.9
@@ -25,10 +25,10 @@ EXPLAINED = 0.9
 _BETTER = 0.25
 """Share of the variance that a drift leaves, at which a period explains better."""
 _RECENT = 2.0
-"""Where an explained target is, is the mean of so long: a jump is over soon, and noise small [s]."""
+"""So long is averaged for where an explained target is: jumps pass soon, and noise is small [s]."""
 _RATE_STEP = 0.004
 _OF_SAMPLING = 0.2
-"""Fastest breathing in terms of the sampling's rate: its overtone must be told from a slower one."""
+"""Fastest breathing as a share of the sampling's rate: its overtone is told from a slower one."""
 _MOST_SAMPLES = 80
 _TERMS = 6
 _DRIFT = 2  # the first terms

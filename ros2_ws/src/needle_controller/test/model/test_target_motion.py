@@ -90,7 +90,8 @@ def test_after_a_jump_it_is_where_it_was_seen_and_breathes_on() -> None:
 
 def test_what_nothing_explains_stays_where_it_was_seen() -> None:
     walk = np.cumsum(np.random.default_rng(4).normal(0.0, 1e-3, (200, 3)), axis=0)
-    motion = seen(lambda t: PLACE + walk[round(t / 0.25)], 25.0)
+    path: Path = lambda t: np.asarray(PLACE + walk[round(t / 0.25)])  # noqa: E731
+    motion = seen(path, 25.0)
     np.testing.assert_array_equal(motion.at(30.0), motion.last)
 
 
@@ -106,7 +107,7 @@ def test_time_that_goes_back_begins_anew() -> None:
 
 
 def test_many_targets_are_each_as_alone() -> None:
-    paths = [sine(0.2), chest(0.3), lambda _: PLACE, lambda t: PLACE + DRIFT * t]
+    paths: list[Path] = [sine(0.2), chest(0.3), lambda _: PLACE, lambda t: PLACE + DRIFT * t]
     both = seen(lambda t: np.stack([path(t) for path in paths]), 25.0)
     times = np.array([26.0, 27.0, 28.0, 29.0])
     alone = [seen(path, 25.0).at(time) for path, time in zip(paths, times, strict=True)]

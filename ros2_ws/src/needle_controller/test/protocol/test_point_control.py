@@ -86,7 +86,8 @@ def test_a_point_that_moves_on_the_way_is_followed() -> None:
 
 
 def breathing(time: float) -> Array:
-    return np.array(TARGET) + [0.0, 0.003 * np.sin(2.0 * np.pi * 0.2 * time), 2e-5 * time]
+    y = 0.003 * np.sin(2.0 * np.pi * 0.2 * time)
+    return np.asarray(np.array(TARGET) + np.array([0.0, y, 2e-5 * time]))
 
 
 def test_a_point_that_breathes_is_met_where_it_will_be() -> None:

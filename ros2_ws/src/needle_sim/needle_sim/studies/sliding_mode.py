@@ -1,4 +1,4 @@
-"""The published law that laws for points are held against: sliding mode control of steerable needles.
+"""The published law that laws for points are held against: sliding mode control.
 
 D. C. Rucker et al., "Sliding Mode Control of Steerable Needles", IEEE Trans. Robotics 29(5), 2013:
 the base always turns at its greatest rate, towards the side on which the target lies of where the

@@ -14,9 +14,9 @@ from needle_common.errors import UserError
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.arrays import Array
+from needle_controller.model.target_motion import TargetMotion
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.model.target_motion import TargetMotion
 from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import (
