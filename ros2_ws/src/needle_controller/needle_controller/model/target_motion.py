@@ -26,6 +26,9 @@ _BETTER = 0.25
 """Share of the variance that a drift leaves, at which a period explains better."""
 _RECENT = 2.0
 """So long is averaged for where an explained target is: jumps pass soon, and noise is small [s]."""
+_GOES_ON = 2.0
+"""A drift goes on for so many times as long as it was seen, and a target no farther beyond where it
+was seen, in each direction, than so many times as far as it was seen to move."""
 _RATE_STEP = 0.004
 _OF_SAMPLING = 0.2
 """Fastest breathing as a share of the sampling's rate: its overtone is told from a slower one."""
@@ -96,7 +99,7 @@ class TargetMotion:
         Parameters
         ----------
         time : array_like, shape (...)
-            When, for each target [s]. A drift goes on for as long as it was seen, no longer.
+            When, for each target [s].
         """
         if self._motion is None:
             self._motion = _Motion(np.array(self._times), np.array(self._points))
@@ -113,6 +116,9 @@ class _Motion:
         since, samples = times - self._end, points.reshape(len(times), -1, 3)
         self._rates = np.zeros(samples.shape[1])
         self._coefficients = np.zeros((samples.shape[1], _TERMS, 3))
+        least, most = samples.min(axis=0), samples.max(axis=0)
+        beyond = _GOES_ON * (most - least)
+        self._bounds = least - beyond, most + beyond
         self._place = samples[-1].copy()
         unexplained = np.arange(samples.shape[1])
         for window in WINDOWS:
@@ -133,12 +139,13 @@ class _Motion:
     def at(self, time: Array) -> Array:
         """Return where the targets are expected [m]."""
         ahead = np.broadcast_to(time - self._end, self._shape).reshape(-1)
-        return np.asarray((self._place + self._moved(ahead)).reshape(*self._shape, 3))
+        place = np.clip(self._place + self._moved(ahead), *self._bounds)
+        return np.asarray(place.reshape(*self._shape, 3))
 
     def _moved(self, ahead: Array) -> Array:
         """Return how far the targets move from the last sample until some time after it [m]."""
         terms = _terms(ahead, self._rates) - _terms(np.zeros_like(ahead), self._rates)
-        terms[:, 1] = np.clip(terms[:, 1], -2.0 * self._span, 2.0 * self._span)
+        terms[:, 1] = np.clip(terms[:, 1], -_GOES_ON * self._span, _GOES_ON * self._span)
         return np.asarray(np.einsum("nt,ntc->nc", terms, self._coefficients))
 
 

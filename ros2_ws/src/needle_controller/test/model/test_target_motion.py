@@ -88,6 +88,21 @@ def test_after_a_jump_it_is_where_it_was_seen_and_breathes_on() -> None:
     np.testing.assert_allclose(settled.at(36.0), path(36.0), atol=1e-4)
 
 
+def test_nothing_is_foretold_far_from_where_it_was_seen() -> None:
+    """Samples at odd times can leave a period nearly free: what it says of later is then noise."""
+    rng = np.random.default_rng(6)
+    for _ in range(300):
+        times = np.sort(rng.uniform(0.0, 8.0, rng.integers(7, 12)))
+        motion, points = TargetMotion(), []
+        for time in times:
+            points.append(PLACE + rng.normal(0.0, 1e-3, 3))
+            motion.see(float(time), points[-1])
+        extent = np.ptp(points, axis=0)
+        ahead = np.array([motion.at(float(times[-1]) + t) for t in (0.5, 3.0, 30.0)])
+        assert np.all(ahead <= np.max(points, axis=0) + 2.0 * extent + 1e-12)
+        assert np.all(ahead >= np.min(points, axis=0) - 2.0 * extent - 1e-12)
+
+
 def test_what_nothing_explains_stays_where_it_was_seen() -> None:
     walk = np.cumsum(np.random.default_rng(4).normal(0.0, 1e-3, (200, 3)), axis=0)
     path: Path = lambda t: np.asarray(PLACE + walk[round(t / 0.25)])  # noqa: E731
