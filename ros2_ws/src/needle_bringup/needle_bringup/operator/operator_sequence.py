@@ -40,13 +40,6 @@ ASK_AGAIN = 1.0
 HOMING = "homing"
 # Any other refusal may rest on news that are still under way (joints, the answer before this one).
 REFUSAL_PATIENCE = 2.0
-# A press that the device has not taken, or has forgotten because messages came late, counts again
-# only after a release: so long it is waited for the press, and so long it is then released [s].
-PRESS_PATIENCE = 2.0
-RELEASE_TIME = 0.25
-# A stand-in that did not run for a while has not waited: what came meanwhile is not heard yet, and
-# a release on the strength of old news would abort a step [s].
-LONGEST_LOOK = 0.2
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,6 +76,8 @@ class OperatorSequence:
     ----------
     now : float
         Time of the start.
+    name : str
+        Whose hold it is, as the device knows it.
     wait_timeout : float
         How long the rig may take to get ready (partners, each service call's answer) [s].
     stall_timeout : float
@@ -92,8 +87,15 @@ class OperatorSequence:
     """
 
     def __init__(
-        self, now: float, *, wait_timeout: float, stall_timeout: float, look_around: float = 0.0
+        self,
+        now: float,
+        name: str,
+        *,
+        wait_timeout: float,
+        stall_timeout: float,
+        look_around: float = 0.0,
     ) -> None:
+        self._name = name
         self._wait_timeout = wait_timeout
         self._stall_timeout = stall_timeout
         self._deadline = now + wait_timeout
@@ -115,10 +117,7 @@ class OperatorSequence:
         self._starts_before = 0
         self._progress: tuple[str, ...] = ()
         self._progress_at = now
-        self._hold_counts = False
-        self._looked_at = now
-        self._pressed_in_vain = 0.0
-        self._released_until = now
+        self._must_release = False
         self.presses_again = 0
         self.insertion = 0.0
         self.depth: float | None = None
@@ -130,9 +129,9 @@ class OperatorSequence:
         """Tell whether the preparation is over and the run is not."""
         return self._prepared == len(PREPARATION) and self.outcome is None
 
-    def hold(self, now: float) -> bool:
+    def hold(self) -> bool:
         """Return whether the hold is pressed."""
-        return self.steering and now >= self._released_until and self._may_act
+        return self.steering and not self._must_release and self._may_act
 
     @property
     def touched(self) -> bool:
@@ -192,7 +191,6 @@ class OperatorSequence:
         self._refused_since = None
         self._deadline = now + self._wait_timeout
         self._progress_at = now
-        self._pressed_in_vain = 0.0
 
     def see_devices(self, names: Sequence[str]) -> None:
         """Take who publishes device/status: with more than one, nobody knows what would move."""
@@ -216,7 +214,10 @@ class OperatorSequence:
         self._homing_seen = self._homing_seen or self._moving
         if self._called(HOME) and self._homed and self._homing_seen:
             self._go_on(now)
-        self._hold_counts = bool(values.get("hold_owner"))
+        # A press that the device does not take, or no longer, counts again only after a release.
+        must_release = self.steering and values.get("press_again") == self._name
+        self.presses_again += self._must_release and not must_release
+        self._must_release = must_release
         if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
             self._end(f"device {values['state']}: {_why(values)}")
 
@@ -258,17 +259,9 @@ class OperatorSequence:
             self.outcome = Outcome(False, "interrupted", interrupted=True)
 
     def check_time(self, now: float) -> None:
-        """Press again where the hold does not count; end the run where the rig took too long."""
-        looked_for = min(now - self._looked_at, LONGEST_LOOK)
-        self._looked_at = now
+        """End the run where the rig took too long."""
         if self.outcome is not None:
             return
-        in_vain = self.hold(now) and not self._hold_counts
-        self._pressed_in_vain = self._pressed_in_vain + looked_for if in_vain else 0.0
-        if self._pressed_in_vain >= PRESS_PATIENCE:
-            self.presses_again += 1
-            self._pressed_in_vain = 0.0
-            self._released_until = now + RELEASE_TIME
         if self._prepared < len(PREPARATION):
             if now >= self._deadline:
                 self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")

@@ -66,6 +66,7 @@ class OperatorNode(WholeNode):
         values = self._settings.values
         self._sequence = OperatorSequence(
             time.monotonic(),
+            self.get_name(),
             wait_timeout=values.wait_timeout,
             stall_timeout=values.stall_timeout,
             look_around=DISCOVERY if is_open() else 0.0,
@@ -139,7 +140,7 @@ class OperatorNode(WholeNode):
     def _on_timer(self) -> None:
         self._sequence.see_devices(publishers_of(self, "device/status"))
         if self._sequence.steering:
-            self._send_hold(pressed=self._sequence.hold(time.monotonic()))
+            self._send_hold(pressed=self._sequence.hold())
         else:
             self._sequence.see_missing(self._missing())
         self._sequence.check_time(time.monotonic())

@@ -18,6 +18,7 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.process.watched_time import WatchedTime
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.conversions import LATCHED, RELIABLE, to_diagnostic_status
 from needle_common.ros.discovery import (
@@ -106,6 +107,7 @@ class PlaneControllerNode(WholeNode):
         self._partners = AnsweringNodes(self)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
+        self._watched = WatchedTime()
         self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
         self._life = LifeSigns(
             self,
@@ -183,7 +185,7 @@ class PlaneControllerNode(WholeNode):
         self._do([Log("info", "parameters changed")])
 
     def _on_timer(self) -> None:
-        self._do(self._steering.on_time(time.monotonic()))
+        self._do(self._steering.on_time(self._watched.read(time.monotonic())))
 
     def _do(self, actions: Iterable[Action]) -> None:
         for action in actions:

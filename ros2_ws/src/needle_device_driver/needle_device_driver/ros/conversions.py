@@ -78,6 +78,7 @@ def to_diagnostic(status: DeviceStatus) -> Diagnostic:
             "activity": status.activity.value,
             "homed": "true" if status.homed else "false",
             "hold_owner": status.hold_owner,
+            "press_again": status.press_again,
             "speed_scale": f"{status.speed_scale:.3g}",
             "insertion_m": "" if status.insertion is None else repr(status.insertion),
             "rotation_rad": "" if status.rotation is None else repr(status.rotation),

@@ -100,7 +100,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             insertion,
             rotation,
             values.limits,
-            pause_on_lapse=values.lock_step,
+            lock_step=values.lock_step,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
         )

@@ -72,6 +72,12 @@ class Hold:
         """Name of the holder; None without a press that counts."""
         return self._owner
 
+    def unheeded(self, now: float) -> str | None:
+        """Return who presses while nobody's press counts, and must release first; None: nobody."""
+        if self._owner is not None:
+            return None
+        return next((name for name, s in self._senders.items() if self._presses(s, now)), None)
+
     @property
     def speed_scale(self) -> float:
         """The owner's share of the nominal speed, 0 without owner."""
@@ -87,10 +93,7 @@ class Hold:
 
     def is_off(self, now: float) -> bool:
         """Return whether nobody who was heard within the time-out presses."""
-        return not any(
-            sender.pressed and now - sender.arrival <= self._timeout
-            for sender in self._senders.values()
-        )
+        return not any(self._presses(sender, now) for sender in self._senders.values())
 
     def receive(  # noqa: PLR0911 - each return is a rule
         self, message: HoldMessage, now: float, *, counting: bool
@@ -184,6 +187,9 @@ class Hold:
                 del self._senders[name]
                 # One that was cut off while it pressed may come back, still pressing.
                 self._strangers_armed = self._strangers_armed and sender.armed
+
+    def _presses(self, sender: _Sender, now: float) -> bool:
+        return sender.pressed and now - sender.arrival <= self._timeout
 
     def _is_spent(self, stamp_ns: int) -> bool:
         """Return whether a stamp is none above all that were heard before the last reset."""

@@ -83,6 +83,8 @@ class DeviceStatus:
         Whether both axes are homed.
     hold_owner : str
         Whose hold counts; empty: nobody's.
+    press_again : str
+        Who presses without that it counts, and has to release first; empty: nobody.
     speed_scale : float
         The owner's share of the nominal speed.
     insertion, rotation : float or None
@@ -107,6 +109,7 @@ class DeviceStatus:
     activity: Activity
     homed: bool
     hold_owner: str
+    press_again: str
     speed_scale: float
     insertion: float | None
     rotation: float | None

@@ -23,9 +23,8 @@ _SWITCHING = "waiting for the axes to switch off"
 class MotionSupervisor:
     """The only way to the axes. `now` is everywhere the steady clock [s].
 
-    A cycle is `drive(period, now)`, which orders the next set-points, and `observe(now)`, which
-    reads the axes, watches over them and ends what has ended. `take_events` has what there is to
-    tell.
+    A cycle is `drive(period, now)`, which orders set-points, and `observe(now)`, which reads the
+    axes, watches over them and ends what has ended. `take_events` has what there is to tell.
 
     Parameters
     ----------
@@ -33,9 +32,9 @@ class MotionSupervisor:
         The two axes.
     limits : SafetyLimits
         The bounds of the rules.
-    pause_on_lapse : bool
-        A hold that falls silent pauses instead of aborting: only for a simulation in lock step,
-        where the axes' own time stands still meanwhile. A release always aborts.
+    lock_step : bool
+        Simulated time stands still while somebody is silent: a hold that lapses pauses instead of
+        aborting (a release always aborts), and tips age in that time.
     feedback_delay : int
         How many cycles after its order a set-point shows in the axes' snapshots.
     switching : callable, optional
@@ -48,17 +47,17 @@ class MotionSupervisor:
         rotation: Axis,
         limits: SafetyLimits,
         *,
-        pause_on_lapse: bool = False,
+        lock_step: bool = False,
         feedback_delay: int = 0,
         switching: Callable[[], bool] = lambda: False,
     ) -> None:
         self._switching = switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
-        self._pause_on_lapse = pause_on_lapse
+        self._lock_step = lock_step
         self._hold = Hold(limits.hold_timeout)
         self._hold_refusals = HoldRefusals()
-        self._stamps = CommandStamps(2.0 * limits.tip_age_limit)
+        self._stamps = CommandStamps(2.0 * limits.tip_age_limit, lock_step=lock_step)
         self._estop_pressed = False
         self._needle_out = False
         self._others = ""
@@ -116,6 +115,7 @@ class MotionSupervisor:
             activity=self._core.activity,
             homed=self._core.snapshot is not None and self._core.snapshot.homed,
             hold_owner=plain(self._hold.owner or ""),
+            press_again=plain(self._hold.unheeded(now) or ""),
             speed_scale=self._hold.speed_scale,
             insertion=None if joints is None else joints.insertion,
             rotation=None if joints is None else joints.rotation,
@@ -349,7 +349,7 @@ class MotionSupervisor:
         moving = core.moves_with_hold
         text = f"no hold message for {age:.3f} s, limit {self._limits.hold_timeout:g} s"
         core.notice(text, Rule.HOLD_AGE)
-        if self._pause_on_lapse:
+        if self._lock_step:
             # Simulated time waits too: the same motion goes on later.
             core.explain(text + ": paused")
             return

@@ -102,12 +102,12 @@ class Bench:
 
     period = PERIOD
 
-    def __init__(self, *, pause_on_lapse: bool = False, **limits: float) -> None:
+    def __init__(self, *, lock_step: bool = False, **limits: float) -> None:
         self.insertion = FakeAxis("insertion")
         self.rotation = FakeAxis("rotation")
         self.limits = SafetyLimits(**limits)
         self.supervisor = MotionSupervisor(
-            self.insertion, self.rotation, self.limits, pause_on_lapse=pause_on_lapse
+            self.insertion, self.rotation, self.limits, lock_step=lock_step
         )
         self.now = 100.0
         self.ros_ns = 1_000_000_000

@@ -146,7 +146,7 @@ def _run(bench: Bench, events: list[Event]) -> None:
 def test_never_without_hold_never_beyond_limits_from_the_start(
     make_bench: type[Bench], events: list[Event], pause: bool
 ) -> None:
-    bench = make_bench(pause_on_lapse=pause, **_LIMITS)
+    bench = make_bench(lock_step=pause, **_LIMITS)
     bench.supervisor.configure(bench.now)
     _run(bench, events)
 
@@ -156,7 +156,7 @@ def test_never_without_hold_never_beyond_limits_from_the_start(
 def test_never_without_hold_never_beyond_limits_once_ready(
     make_bench: type[Bench], events: list[Event], pause: bool
 ) -> None:
-    bench = make_bench(pause_on_lapse=pause, **_LIMITS)
+    bench = make_bench(lock_step=pause, **_LIMITS)
     bench.ready(holding=False)
     _run(bench, [lambda b: b.hold(), lambda b: b.command(), *events])
 

@@ -16,6 +16,7 @@ from rosgraph_msgs.msg import Clock
 from needle_common.commands.cli import EXIT_DONE
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.process.end_request import EndRequest
+from needle_common.process.watched_time import WatchedTime
 from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.ros.conversions import (
     LATCHED,
@@ -86,6 +87,7 @@ class SimRigNode(WholeNode):
             seed=values.seed,
         )
         self._lock_step: LockStep | None = None
+        self._watched = WatchedTime()
         self._pace: Pace | None = None
         if values.real_time_factor > 0.0:
             self._pace = Pace(TICK, values.real_time_factor)
@@ -175,7 +177,7 @@ class SimRigNode(WholeNode):
             under_way=self._device.under_way(),
             may_move=self._device.may_move(now),
             held=self._device.held(now),
-            now=now,
+            now=self._watched_now(),
         )
         if self._lock_step.watchdog_trips > trips:
             self._device.count_watchdog_trip()
@@ -216,6 +218,9 @@ class SimRigNode(WholeNode):
             )
         self._tick(Action.EXPOSE if due else Action.TICK, now)
         return pace.wait(time.monotonic())
+
+    def _watched_now(self) -> float:
+        return self._watched.read(time.monotonic())
 
     def _idle(self, now: float) -> None:
         self._device.observe(now)
@@ -260,7 +265,7 @@ class SimRigNode(WholeNode):
         self._truth.publish(to_truth(self._bench.plant.T_rig_tip, stamp))
         self._sensors.expose(number, stamp)
         if self._lock_step is not None:
-            self._lock_step.exposed(self._time_ns, now)
+            self._lock_step.exposed(self._time_ns, self._watched_now())
         self._tell_health()
 
     def _tell_health(self) -> None:
@@ -338,7 +343,7 @@ class SimRigNode(WholeNode):
 
     def _on_step_end(self) -> None:
         if self._lock_step is not None:
-            self._lock_step.step_ended(time.monotonic())
+            self._lock_step.step_ended(self._watched_now())
 
     def _on_controller_status(self, message: DiagnosticStatus) -> None:
         if self._lock_step is None:
@@ -349,7 +354,7 @@ class SimRigNode(WholeNode):
         except ValueError:
             tip_after_ns = -1
         self._lock_step.take_controller_status(
-            values.get("state", ""), values.get("awaiting", ""), tip_after_ns, time.monotonic()
+            values.get("state", ""), values.get("awaiting", ""), tip_after_ns, self._watched_now()
         )
 
     def _on_answer(self, message: PoseWithCovarianceStamped) -> None:
@@ -357,7 +362,7 @@ class SimRigNode(WholeNode):
             self._lock_step.take_answer(
                 to_nanoseconds(message.header.stamp),
                 math.isfinite(message.pose.covariance[0]),
-                time.monotonic(),
+                self._watched_now(),
             )
             if self._lock_step.why_stuck:
                 self._end_run(self._lock_step.why_stuck)

@@ -59,7 +59,7 @@ class SimulatedDevice:
         self._insertion = SimulatedAxis("insertion")
         self._rotation = SimulatedAxis("rotation")
         self._supervisor = MotionSupervisor(
-            self._insertion, self._rotation, limits, pause_on_lapse=in_lock_step
+            self._insertion, self._rotation, limits, lock_step=in_lock_step
         )
         self._supervisor.configure(now)
 

@@ -97,8 +97,20 @@ def test_hold_age_a_gap_that_no_cycle_saw_counts_all_the_same(bench: Bench) -> N
     assert "no hold message" in bench.results[-1].outcome
 
 
+def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_owner(
+    bench: Bench,
+) -> None:
+    bench.ready()
+    bench.hold(sender="b")
+    assert (bench.status.hold_owner, bench.status.press_again) == ("a", "")
+    bench.hold(False)
+    assert bench.status.press_again == "b"
+    bench.now += bench.limits.hold_timeout + 0.1
+    assert bench.status.press_again == ""
+
+
 def test_hold_age_pauses_a_lock_step_simulation_and_goes_on(make_bench: type[Bench]) -> None:
-    bench = make_bench(pause_on_lapse=True)
+    bench = make_bench(lock_step=True)
     bench.ready()
     bench.command()
     bench.cycle(5, holding=True)
@@ -135,10 +147,13 @@ def test_hold_new_press_one_from_before_does_not_count(bench: Bench, press_befor
             bench.supervisor.stop()
     bench.cycle(5, holding=True)
     assert bench.status.hold_owner == ""
+    assert bench.status.press_again == "a"
     assert bench.status.speed_scale == 0.0
     bench.hold(False)
+    assert bench.status.press_again == ""
     bench.hold()
     assert bench.status.hold_owner == "a"
+    assert bench.status.press_again == ""
 
 
 @pytest.mark.parametrize("how", ["fault", "disable"])
