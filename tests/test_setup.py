@@ -244,7 +244,10 @@ def test_a_renewed_lock_is_installed_into_the_environment(
     assert commands.names == ["pip", "pip", "import", *BUILD]
 
 
-@pytest.mark.parametrize("path", ["setup.py", "config/new.yaml", "launch/rig.launch.py"])
+@pytest.mark.parametrize(
+    "path",
+    ["setup.py", "needle_one/executables.py", "config/new.yaml", "launch/rig.launch.py"],
+)
 def test_a_new_executable_or_file_is_only_built(
     workspace: Workspace, commands: Commands, path: str
 ) -> None:

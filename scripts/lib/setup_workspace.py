@@ -145,11 +145,12 @@ def build_key(mode: str) -> str:
     """Return what the built workspace depends on.
 
     Python modules, configuration and launch files are linked, not copied: their content does not
-    count, but a new file does.
+    count, but a new file does, and a new executable.
     """
     parts: list[str | bytes] = [environment_key(mode)]
     for package in packages():
-        for name in ("package.xml", "setup.py", "setup.cfg"):
+        executables = f"{package.name}/executables.py"
+        for name in ("package.xml", "setup.py", "package_setup.py", "setup.cfg", executables):
             path = package / name
             parts += [str(path), path.read_bytes() if path.exists() else b""]
         for path in sorted(package.rglob("*")):

@@ -1,31 +1,10 @@
 """Install script of needle_analysis; colcon calls it."""
 
-from glob import glob
+import sys
+from pathlib import Path
 
-from setuptools import find_packages, setup
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "needle_common"))
 
-PACKAGE = "needle_analysis"
+from package_setup import set_up
 
-setup(
-    name=PACKAGE,
-    version="0.1.0",
-    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed"]},
-    data_files=[
-        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
-        (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/config", glob("config/*")),
-        (f"share/{PACKAGE}/launch", glob("launch/*.py")),
-    ],
-    zip_safe=False,
-    maintainer="Needle steering maintainers",
-    maintainer_email="maintainers@needle-steering.invalid",
-    description="What a bag tells: rerun, report, and the figures of a run.",
-    license="Apache-2.0",
-    entry_points={
-        "console_scripts": [
-            "rerun = needle_analysis.executables:rerun",
-            "report = needle_analysis.executables:report",
-        ]
-    },
-)
+set_up(__file__)

@@ -1,32 +1,10 @@
 """Install script of needle_bags; colcon calls it."""
 
-from glob import glob
+import sys
+from pathlib import Path
 
-from setuptools import find_packages, setup
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "needle_common"))
 
-PACKAGE = "needle_bags"
+from package_setup import set_up
 
-setup(
-    name=PACKAGE,
-    version="0.1.0",
-    packages=find_packages(include=[PACKAGE, f"{PACKAGE}.*"]),
-    package_data={PACKAGE: ["py.typed"]},
-    data_files=[
-        ("share/ament_index/resource_index/packages", [f"resource/{PACKAGE}"]),
-        (f"share/{PACKAGE}", ["package.xml"]),
-        (f"share/{PACKAGE}/config", glob("config/*")),
-        (f"share/{PACKAGE}/launch", glob("launch/*.py")),
-    ],
-    zip_safe=False,
-    maintainer="Needle steering maintainers",
-    maintainer_email="maintainers@needle-steering.invalid",
-    description="Bags of the rig: recorder, player, recovery, and reading.",
-    license="Apache-2.0",
-    entry_points={
-        "console_scripts": [
-            "recorder = needle_bags.executables:recorder",
-            "player = needle_bags.executables:player",
-            "recover = needle_bags.executables:recover",
-        ]
-    },
-)
+set_up(__file__)
