@@ -191,7 +191,7 @@ class BagWriter:
         path = self.data_file
         taken = self._files[-1].counts
         try:
-            ending = McapEnding(path)
+            ending = McapEnding(self._mcap, path)
             while True:
                 ending.write()
                 self._files[-1] = DataFile(path.name, ending.counts, *ending.times)

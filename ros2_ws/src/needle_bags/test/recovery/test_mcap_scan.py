@@ -321,9 +321,14 @@ def test_a_disk_that_fills_within_a_chunk_leaves_a_whole_bag(tmp_path: Path, lim
 
 
 def test_a_lost_index_comes_back_as_the_library_writes_it(tmp_path: Path) -> None:
-    file = write(tmp_path / "bag", whole=True)
-    whole = file.read_bytes()
+    bag = BagWriter(tmp_path / "bag", chunk_size=4096)
+    topic = bag.add_topic(BagTopic("/one", TYPE, DEFINITION, HASH))
+    for number in range(COUNT):
+        bag.write(topic, payload(number), 1000 + number, 1000, number + 1)
+    bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", 1)
+    bag.close()
+    whole = bag.data_file.read_bytes()
     for length in (1, 8, 30, 300):
-        file.write_bytes(whole[:-length])
-        McapEnding(file).write()
-        assert file.read_bytes() == whole
+        bag.data_file.write_bytes(whole[:-length])
+        McapEnding(bag._mcap, bag.data_file).write()
+        assert bag.data_file.read_bytes() == whole
