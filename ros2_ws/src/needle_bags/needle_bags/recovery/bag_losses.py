@@ -101,13 +101,10 @@ def _told(
     old: Mapping[str, Any], files: Mapping[str, McapScan], missing: Sequence[str]
 ) -> Counter[str] | None:
     """Return how many messages were recorded, by topic; None if nothing reliable tells."""
-    summaries = [found.summary for found in files.values()]
-    by_index: Counter[str] = Counter()
-    for summary in summaries:
-        if summary is not None and summary.is_checked:
-            by_index.update(summary.counts())
-    if not missing and all(s is not None and s.is_checked for s in summaries):
-        return by_index
+    indexes = [found.index for found in files.values()]
+    checked = [index for index in indexes if index is not None and index.is_checked]
+    if not missing and len(checked) == len(indexes):
+        return sum((Counter(index.counts()) for index in checked), Counter[str]())
     try:
         told = Counter(
             {

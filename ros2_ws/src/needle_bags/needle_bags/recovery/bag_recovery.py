@@ -217,11 +217,11 @@ def _content(path: Path, found: McapScan, name: str = "") -> DataFile | None:
         content = DataFile(name or path.name)
         summary = file.summary
         try:
-            for channel, message in file.messages([c.topic for c in summary.channels.values()]):
-                content.add(channel.topic, message.log_time)
+            for topic, log_time, _, _ in file.read([c.topic for c in summary.channels.values()]):
+                content.add(topic, log_time)
         except BrokenMcapError:
             return None
-        indexed = len(summary.metadata) in (0, file.statistics.metadata_count)
+        indexed = len(summary.metadata_indexes) in (0, file.statistics.metadata_count)
         return content if indexed and content.counts == +found.topic_counts else None
 
 

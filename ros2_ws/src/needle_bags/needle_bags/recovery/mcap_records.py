@@ -17,7 +17,7 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from needle_bags.format.message_loss import DamageGaps
 from needle_bags.recovery.mcap_chunk import StoredChunk
 from needle_bags.recovery.message_fit import MessageFit
-from needle_common.files.mcap_file import RECORD_HEADER, Summary
+from needle_common.files.mcap_file import RECORD_HEADER, Index
 
 MESSAGE: Final = struct.Struct("<HIQQ")
 RECORDS: Final[dict[Opcode, Any]] = {
@@ -49,7 +49,7 @@ class McapScan:
         Bytes of the file.
     finished : bool
         Whether its data end as they should.
-    summary : Summary or None
+    index : Index or None
         Its index, if that is whole.
     schemas, channels : dict
         By number.
@@ -69,7 +69,7 @@ class McapScan:
 
     size: int
     finished: bool = False
-    summary: Summary | None = None
+    index: Index | None = None
     schemas: dict[int, Schema] = dataclasses.field(default_factory=dict)
     channels: dict[int, Channel] = dataclasses.field(default_factory=dict)
     parts: list[StoredChunk | Loose] = dataclasses.field(default_factory=list)

@@ -38,7 +38,7 @@ from needle_common.files.mcap_file import (
     TIME_LIMIT,
     UNREADABLE,
     BrokenMcapError,
-    read_summary,
+    read_index,
 )
 
 # Opcodes from here on are an application's own; every reader passes over them.
@@ -105,19 +105,16 @@ class _Scanner:
         found = self.found
         try:
             begin = max(0, self._end - SUMMARY_LIMIT)
-            summary = read_summary(bytes(self._data[begin:]), self._end)
+            found.index = read_index(bytes(self._data[begin:]), self._end)
         except BrokenMcapError:
-            summary = None
-        if summary is not None:
-            found.summary = summary
-            self._end = summary.start
-            self._chunks = {chunk.chunk_start_offset: chunk for chunk in summary.chunks}
-            if summary.is_checked:
-                found.schemas.update(summary.schemas)
-                found.channels.update(summary.channels)
-        else:
             # A power cut leaves zeros where the file was made longer and nothing was written.
             self._zeros = _end_of_data(self._data)
+        else:
+            self._end, records = found.index.start, found.index.records
+            self._chunks = {chunk.chunk_start_offset: chunk for chunk in records.chunk_indexes}
+            if found.index.is_checked:
+                found.schemas.update(records.schemas)
+                found.channels.update(records.channels)
         position = self._begin()
         while position < self._end and not found.finished:
             following = self._take(position)
@@ -220,7 +217,7 @@ class _Scanner:
             self._data, position + RECORD_HEADER.size
         )
         is_known = self._fit.knows(channel)
-        is_closed = self.found.summary is not None and self.found.summary.is_checked
+        is_closed = self.found.index is not None and self.found.index.is_checked
         if (
             not self._is_time(log_time)
             or publish_time >= TIME_LIMIT
@@ -329,9 +326,9 @@ class _Scanner:
         return end is not None and (opcode in _KNOWN or opcode >= PRIVATE)
 
     def _is_time(self, time: int) -> bool:
-        summary = self.found.summary
-        if summary is not None and summary.is_checked and summary.statistics is not None:
-            told = summary.statistics
+        index = self.found.index
+        if index is not None and index.is_checked and index.records.statistics is not None:
+            told = index.records.statistics
             return bool(told.message_start_time <= time <= told.message_end_time)
         return time < TIME_LIMIT
 

@@ -1,74 +1,26 @@
-"""A bag's data files: MCAP, SQLite, and what rosbag2 compressed as a whole or by message."""
+"""A bag's data beside plain MCAP: SQLite, and what was compressed as a whole or by message."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final
 
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from needle_common.files.file_access import open_regular
-from needle_common.files.mcap_file import CHUNK_LIMIT, TIME_LIMIT, McapFile
+from needle_common.files.mcap_file import CHUNK_LIMIT, TIME_LIMIT
 
 # A data file that is compressed as a whole may be so large when it is not [B].
 FILE_LIMIT: Final = 2**33
 _BLOCK: Final = 2**20
 
 
-class BagData(Protocol):
-    """One data file, open for reading."""
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """Log times of the first and the last message [ns]; None in an empty file."""
-
-    def counts(self) -> Mapping[str, int]:
-        """Return messages by topic."""
-
-    def definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of each type's definition."""
-
-    def read(
-        self, topics: Collection[str], start: int, stop: int
-    ) -> Iterator[tuple[str, int, int, bytes]]:
-        """Yield topic, log time, publish time [ns] and data, in order of log time."""
-
-
-class McapData:
-    """An MCAP file."""
-
-    def __init__(self, file: McapFile) -> None:
-        self._file = file
-
-    @property
-    def span(self) -> tuple[int, int] | None:
-        """Log times of the first and the last message [ns]; None in an empty file."""
-        told = self._file.statistics
-        return (told.message_start_time, told.message_end_time) if told.message_count else None
-
-    def counts(self) -> Mapping[str, int]:
-        """Return messages by topic."""
-        return self._file.summary.counts()
-
-    def definitions(self) -> dict[str, tuple[str, str]]:
-        """Return encoding and text of each type's definition."""
-        schemas = self._file.summary.schemas.values()
-        return {schema.name: (schema.encoding, schema.data.decode()) for schema in schemas}
-
-    def read(
-        self, topics: Collection[str], start: int, stop: int
-    ) -> Iterator[tuple[str, int, int, bytes]]:
-        """Yield topic, log time, publish time [ns] and data, in order of log time."""
-        for channel, message in self._file.messages(topics, start, stop):
-            yield channel.topic, message.log_time, message.publish_time, message.data
-
-
 class SqliteData:
-    """An SQLite file; it does not tell when messages were sent."""
+    """An SQLite file, read as `McapFile` reads; it does not tell when messages were sent."""
 
     def __init__(self, reader: Reader) -> None:
         self._reader = reader

@@ -18,7 +18,7 @@ from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_
 from rosbags.typesys.store import Typestore
 
 from needle_common.errors import UserError
-from needle_common.files.bag_data import BagData, McapData, SqliteData, unpack, unpack_file
+from needle_common.files.bag_data import SqliteData, unpack, unpack_file
 from needle_common.files.file_access import open_regular
 from needle_common.files.mcap_file import TIME_LIMIT, McapFile
 from needle_common.files.plain_yaml import load_plain
@@ -257,7 +257,7 @@ class BagDirectory:
     def _mode(self) -> str:
         return str(self.information.get("compression_mode") or "none").lower()
 
-    def _open(self, name: str) -> BagData:
+    def _open(self, name: str) -> McapFile | SqliteData:
         path = self.path / name
         if self._mode() == "file":
             folder = self._stack.enter_context(tempfile.TemporaryDirectory())
@@ -266,7 +266,7 @@ class BagDirectory:
         if kind == "mcap":
             file = McapFile(path)
             self._stack.callback(file.close)
-            return McapData(file)
+            return file
         if kind == "sqlite3":
             open_regular(path).close()
             return SqliteData(self._stack.enter_context(Reader(path)))

@@ -22,19 +22,10 @@ import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    McapRecord,
-    Message,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.reader import NonSeekingReader
+from mcap.records import Chunk, ChunkIndex, Footer, McapRecord, Message, Statistics
+from mcap.stream_reader import breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
 from needle_common.files.file_access import open_regular
@@ -64,38 +55,35 @@ class BrokenMcapError(Exception):
     """A file is not what its index says, or has none; the message says how."""
 
 
-class LooseMessage(NamedTuple):
-    """A message outside of chunks: its log time [ns], and where its record is."""
+class _Part(NamedTuple):
+    """A chunk, or a message outside of chunks (without an index): times [ns], and where it is."""
 
-    log_time: int
+    first: int
     offset: int
+    last: int
     length: int
+    size: int
+    chunk: ChunkIndex | None
 
 
-@dataclasses.dataclass
-class Summary:
-    """Contents of a file, as its end tells them."""
+class Index(NamedTuple):
+    """What a file's end says is in it, where that begins, and whether a checksum vouches for it."""
 
-    statistics: Statistics | None = None
-    schemas: dict[int, Schema] = dataclasses.field(default_factory=dict)
-    channels: dict[int, Channel] = dataclasses.field(default_factory=dict)
-    chunks: list[ChunkIndex] = dataclasses.field(default_factory=list)
-    attachments: list[AttachmentIndex] = dataclasses.field(default_factory=list)
-    metadata: list[MetadataIndex] = dataclasses.field(default_factory=list)
-    start: int = 0
-    is_checked: bool = False
+    records: Summary
+    start: int
+    is_checked: bool
 
     def counts(self) -> dict[str, int]:
         """Return messages by topic."""
         found: Counter[str] = Counter()
-        if self.statistics is not None:
-            for number, count in self.statistics.channel_message_counts.items():
-                found[self.channels[number].topic] += count
+        if self.records.statistics is not None:
+            for number, count in self.records.statistics.channel_message_counts.items():
+                found[self.records.channels[number].topic] += count
         return dict(found)
 
 
-def read_summary(data: bytes, size: int) -> Summary:
-    """Return the summary that ends a file.
+def read_index(data: bytes, size: int) -> Index:
+    """Return the index that ends a file.
 
     Parameters
     ----------
@@ -123,29 +111,13 @@ def read_summary(data: bytes, size: int) -> Summary:
     section = data[begin : len(data) - len(MCAP0_MAGIC) - 4]
     if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
         raise BrokenMcapError("the checksum of its index is wrong")
-    summary = Summary(start=footer.summary_start, is_checked=bool(footer.summary_crc))
     try:
-        for record in StreamReader(BytesIO(data[begin:]), skip_magic=True).records:
-            _take(record, summary)
-        summary.counts()
+        records = NonSeekingReader(BytesIO(MCAP0_MAGIC + data[begin:])).get_summary()
+        index = Index(records or Summary(), footer.summary_start, bool(footer.summary_crc))
+        index.counts()
     except UNREADABLE as error:
         raise BrokenMcapError("its index is damaged") from error
-    return summary
-
-
-def _take(record: McapRecord, summary: Summary) -> None:
-    if isinstance(record, Statistics):
-        summary.statistics = record
-    elif isinstance(record, Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, ChunkIndex):
-        summary.chunks.append(record)
-    elif isinstance(record, AttachmentIndex):
-        summary.attachments.append(record)
-    elif isinstance(record, MetadataIndex):
-        summary.metadata.append(record)
+    return index
 
 
 def decompressed(data: bytes, compression: str, size: int) -> bytes:
@@ -205,14 +177,27 @@ class McapFile:
     ----------
     summary : Summary
         What it says is in it.
+    statistics : Statistics
+        Its counts and times.
     """
 
     def __init__(self, path: Path) -> None:
         self._stream = open_regular(path)
         try:
             self._size = os.fstat(self._stream.fileno()).st_size
-            self.summary = self._open()
-            self._loose = [] if self.summary.chunks else self._find_messages()
+            self._index = self._open()
+            self.summary = self._index.records
+            self._parts = [
+                _Part(
+                    c.message_start_time,
+                    c.chunk_start_offset,
+                    c.message_end_time,
+                    c.chunk_length,
+                    c.uncompressed_size,
+                    c,
+                )
+                for c in self.summary.chunk_indexes
+            ] or self._find_messages()
         except BaseException:
             self._stream.close()
             raise
@@ -222,64 +207,73 @@ class McapFile:
         self._stream.close()
 
     @property
-    def statistics(self) -> Statistics:
-        """Counts and times."""
-        assert self.summary.statistics is not None
-        return self.summary.statistics
+    def span(self) -> tuple[int, int] | None:
+        """Log times of the first and the last message [ns]; None in an empty file."""
+        told = self.statistics
+        return (told.message_start_time, told.message_end_time) if told.message_count else None
 
-    def messages(
+    def counts(self) -> dict[str, int]:
+        """Return messages by topic."""
+        return self._index.counts()
+
+    def definitions(self) -> dict[str, tuple[str, str]]:
+        """Return encoding and text of each type's definition."""
+        schemas = self.summary.schemas.values()
+        return {schema.name: (schema.encoding, schema.data.decode()) for schema in schemas}
+
+    def read(
         self, topics: Collection[str], start: int = 0, stop: int = TIME_LIMIT
-    ) -> Iterator[tuple[Channel, Message]]:
-        """Yield messages with start <= log time < stop [ns] in order of log time.
+    ) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield topic, log time, publish time [ns] and data: start <= log time < stop, in order.
 
         Raises
         ------
         BrokenMcapError
             If the file has other messages than its index says.
         """
-        wanted = {n for n, channel in self.summary.channels.items() if channel.topic in topics}
-        if self._loose:
-            yield from self._loose_messages(wanted, start, stop)
-            return
+        names = {number: channel.topic for number, channel in self.summary.channels.items()}
         waiting = sorted(
-            (c for c in self.summary.chunks if c.message_end_time >= start),
-            key=lambda c: (c.message_start_time, c.chunk_start_offset),
+            (part for part in self._parts if part.last >= start),
+            key=lambda part: (part.first, part.offset),
             reverse=True,
         )
-        is_complete = len(waiting) == len(self.summary.chunks)
+        is_complete = len(waiting) == len(self._parts)
         seen: Counter[int] = Counter()
         heap: list[tuple[int, int, Message]] = []
         number = held = 0
         while heap or waiting:
-            while waiting and (not heap or waiting[-1].message_start_time <= heap[0][0]):
-                if waiting[-1].message_start_time >= stop:
+            while waiting and (not heap or waiting[-1].first <= heap[0][0]):
+                if waiting[-1].first >= stop:
                     is_complete = False
                     waiting.clear()
                     break
-                index = waiting.pop()
-                held = (held if heap else 0) + index.uncompressed_size
+                part = waiting.pop()
+                held = (held if heap else 0) + part.size
                 if held > OVERLAP_LIMIT:
                     raise BrokenMcapError("too many of its chunks are of the same time")
-                for message in self._chunk(index):
+                for message in self._messages(part):
                     seen[message.channel_id] += 1
-                    if message.channel_id in wanted and start <= message.log_time < stop:
+                    wanted = names[message.channel_id] in topics
+                    if wanted and start <= message.log_time < stop:
                         number += 1
                         heapq.heappush(heap, (message.log_time, number, message))
             if heap:
                 message = heapq.heappop(heap)[2]
-                yield self.summary.channels[message.channel_id], message
+                name = names[message.channel_id]
+                yield name, message.log_time, message.publish_time, message.data
         if is_complete:
             self._compare(seen)
 
-    def _open(self) -> Summary:
+    def _open(self) -> Index:
         if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise BrokenMcapError("it does not begin as an MCAP file")
         begin = max(0, self._size - SUMMARY_LIMIT)
         self._stream.seek(max(begin, self._size - 2**16))
-        summary = _peek(self._stream.read(), self._size)
-        if summary is None:
-            summary = read_summary(self._read(begin, self._size - begin), self._size)
-        told = summary.statistics
+        try:
+            index = read_index(self._stream.read(), self._size)
+        except BrokenMcapError:  # or longer than that
+            index = read_index(self._read(begin, self._size - begin), self._size)
+        summary, told = index.records, index.records.statistics
         if told is None:
             raise BrokenMcapError("its index does not say how many messages there are")
         if told.message_count != sum(told.channel_message_counts.values()):
@@ -289,18 +283,23 @@ class McapFile:
         for channel in summary.channels.values():
             if channel.schema_id and channel.schema_id not in summary.schemas:
                 raise BrokenMcapError(f"it does not define the type of {channel.topic}")
-        return summary
+        self.statistics: Statistics = told
+        return index
 
     def _read(self, offset: int, size: int) -> bytes:
         self._stream.seek(offset)
         return self._stream.read(size)
 
-    def _chunk(self, index: ChunkIndex) -> Iterator[Message]:
-        """Yield the messages of a chunk, in the order they have in it."""
-        start, length = index.chunk_start_offset, index.chunk_length
+    def _messages(self, part: _Part) -> Iterator[Message]:
+        """Yield the messages of a part, in the order they have in it."""
+        start, length, index = part.offset, part.length, part.chunk
         if start + length > self._size:
             raise BrokenMcapError("a chunk is not where its index says")
         data = self._read(start, length)
+        if index is None:
+            stream = ReadDataStream(BytesIO(data[RECORD_HEADER.size :]))
+            yield Message.read(stream, length - RECORD_HEADER.size)
+            return
         try:
             if RECORD_HEADER.unpack_from(data) != (Opcode.CHUNK, length - RECORD_HEADER.size):
                 raise BrokenMcapError(f"there is no chunk at byte {start}")
@@ -330,12 +329,12 @@ class McapFile:
         if publish_time >= TIME_LIMIT:
             raise BrokenMcapError("its times lie beyond the year 2262")
 
-    def _find_messages(self) -> list[LooseMessage]:
-        """Return the messages of a file without chunks in order of their log time."""
-        found: list[LooseMessage] = []
+    def _find_messages(self) -> list[_Part]:
+        """Return the messages of a file without chunks."""
+        found: list[_Part] = []
         seen: Counter[int] = Counter()
         position = len(MCAP0_MAGIC)
-        while position < self.summary.start:
+        while position < self._index.start:
             head = self._read(position, RECORD_HEADER.size + _MESSAGE.size)
             if len(head) < RECORD_HEADER.size:
                 break
@@ -346,28 +345,15 @@ class McapFile:
                     raise BrokenMcapError("a message's length is wrong")
                 channel, _, log_time, publish_time = _MESSAGE.unpack_from(head, RECORD_HEADER.size)
                 self._check(log_time, publish_time)
-                found.append(LooseMessage(log_time, position, length))
+                found.append(_Part(log_time, position, log_time, length, length, None))
                 seen[channel] += 1
             elif opcode == Opcode.CHUNK:
                 raise BrokenMcapError("its index does not know its chunks")
             position += length
-        if position != self.summary.start:
+        if position != self._index.start:
             raise BrokenMcapError("a record's length is wrong")
         self._compare(seen)
-        found.sort(key=lambda message: message.log_time)
         return found
-
-    def _loose_messages(
-        self, wanted: Collection[int], start: int, stop: int
-    ) -> Iterator[tuple[Channel, Message]]:
-        for log_time, offset, length in self._loose:
-            if start <= log_time < stop:
-                record = self._read(offset, length)
-                (number,) = struct.unpack_from("<H", record, RECORD_HEADER.size)
-                if number in wanted:
-                    stream = ReadDataStream(BytesIO(record[RECORD_HEADER.size :]))
-                    message = Message.read(stream, length - RECORD_HEADER.size)
-                    yield self.summary.channels[number], message
 
     def _compare(self, seen: Counter[int]) -> None:
         told = Counter(self.statistics.channel_message_counts)
@@ -376,14 +362,3 @@ class McapFile:
                 f"it holds {sum(seen.values())} messages, its index tells of "
                 f"{sum(told.values())}, or of others"
             )
-
-
-def _peek(tail: bytes, size: int) -> Summary | None:
-    """Return the summary if the file's last bytes hold all of it; None if it is longer."""
-    try:
-        return read_summary(tail, size)
-    except BrokenMcapError:
-        return None
-
-
-__all__ = ["BrokenMcapError", "McapFile", "Summary", "read_summary", "records_of"]
