@@ -19,17 +19,11 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import (
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSPresetProfiles,
-    QoSReliabilityPolicy,
-)
 from rclpy.topic_or_service_is_hidden import topic_or_service_is_hidden
 
 from ros2_messages import BadMessageError, fill, find_type, parse
 from ros2_spinning import ANSWER, PATIENCE, SPIN_TIME, GraphError, spin_until
-from ros2_topics import KEEP_ALIVE, TRUNCATE, WINDOW, echo, hz, pub
+from ros2_topics import echo, hz, pub
 
 HIDDEN = "_"
 LABELS = {
@@ -47,24 +41,19 @@ LABELS = {
 
 def list_topics(node: Node, options: argparse.Namespace) -> None:
     """Print the topics' names."""
-    _print_names(node, node.get_topic_names_and_types, options, options.include_hidden_topics)
+    _print_names(node, node.get_topic_names_and_types, options)
 
 
 def list_services(node: Node, options: argparse.Namespace) -> None:
     """Print the services' names."""
-    _print_names(node, node.get_service_names_and_types, options, options.include_hidden_services)
+    _print_names(node, node.get_service_names_and_types, options)
 
 
-def _print_names(
-    node: Node, ask: Callable[[], Any], options: argparse.Namespace, hidden: bool
-) -> None:
+def _print_names(node: Node, ask: Callable[[], Any], options: argparse.Namespace) -> None:
     spin_until(node, lambda: False, options.spin_time)
-    names = [(n, t) for n, t in ask() if hidden or not topic_or_service_is_hidden(n)]
-    if options.count:
-        print(len(names))
-        return
-    for name, types in names:
-        print(f"{name} [{', '.join(types)}]" if options.show_types else name)
+    for name, types in ask():
+        if not topic_or_service_is_hidden(name):
+            print(f"{name} [{', '.join(types)}]" if options.show_types else name)
 
 
 # ---- services and parameters ------------------------------------------------------------------
@@ -95,10 +84,7 @@ def _node_names(node: Node, hidden: bool) -> list[str]:
 def list_nodes(node: Node, options: argparse.Namespace) -> None:
     """Print the nodes' names."""
     spin_until(node, lambda: False, options.spin_time)
-    names = _node_names(node, options.all)
-    if options.count:
-        print(len(names))
-        return
+    names = _node_names(node, False)
     if len(set(names)) < len(names):
         print(
             "WARNING: Be aware that there are nodes in the graph that share an exact name, which "
@@ -191,28 +177,19 @@ def _command(verbs: Any, name: str, action: Callable[..., None]) -> argparse.Arg
     parser: argparse.ArgumentParser = verbs.add_parser(name, help=text, description=text)
     parser.set_defaults(action=action)
     parser.add_argument("--spin-time", type=float, default=SPIN_TIME, help="for discovery [s]")
-    parser.add_argument("-s", "--use-sim-time", action="store_true")
     return parser
 
 
 def _add_topic_commands(verbs: Any) -> None:
     command = _command(verbs, "list", list_topics)
     command.add_argument("-t", "--show-types", action="store_true")
-    command.add_argument("-c", "--count-topics", dest="count", action="store_true")
-    command.add_argument("--include-hidden-topics", action="store_true")
     command = _command(verbs, "echo", echo)
     command.add_argument("topic_name")
-    command.add_argument("message_type", nargs="?")
     command.add_argument("--filter", metavar="EXPR", help="in Python, of the message m")
     command.add_argument("--field", help="of the message; sub-fields after a dot")
-    command.add_argument("-f", "--full-length", action="store_true")
-    command.add_argument("-l", "--truncate-length", type=int, default=TRUNCATE, metavar="N")
     command.add_argument("--once", action="store_true", help="print one message and end")
     command.add_argument("--timeout", type=_positive, metavar="N", help="end after N seconds")
-    _add_qos(command, "sensor_data")
-    command = _command(verbs, "hz", hz)
-    command.add_argument("topic_name")
-    command.add_argument("-w", "--window", type=int, default=WINDOW, metavar="N")
+    _command(verbs, "hz", hz).add_argument("topic_name")
     command = _command(verbs, "pub", pub)
     command.add_argument("topic_name")
     command.add_argument("message_type")
@@ -222,36 +199,18 @@ def _add_topic_commands(verbs: Any) -> None:
     count = command.add_mutually_exclusive_group()
     count.add_argument("-1", "--once", action="store_true")
     count.add_argument("-t", "--times", type=int, default=0, metavar="N")
-    command.add_argument("-w", "--wait-matching-subscriptions", type=int, metavar="N")
-    command.add_argument("--max-wait-time-secs", type=_positive, metavar="N")
-    command.add_argument("--keep-alive", type=_positive, default=KEEP_ALIVE, metavar="N")
-    command.add_argument("-n", "--node-name")
-    _add_qos(command, "default")
-
-
-def _add_qos(command: argparse.ArgumentParser, preset: str) -> None:
-    keys = QoSPresetProfiles.short_keys()
-    command.add_argument("--qos-profile", choices=keys, default=preset)
-    command.add_argument("--qos-depth", type=int, metavar="N")
-    command.add_argument("--qos-history", choices=QoSHistoryPolicy.short_keys())
-    command.add_argument("--qos-reliability", choices=QoSReliabilityPolicy.short_keys())
-    command.add_argument("--qos-durability", choices=QoSDurabilityPolicy.short_keys())
 
 
 def _add_other_commands(groups: Any) -> None:
     verbs = _verbs(groups, "service")
     command = _command(verbs, "list", list_services)
     command.add_argument("-t", "--show-types", action="store_true")
-    command.add_argument("-c", "--count-services", dest="count", action="store_true")
-    command.add_argument("--include-hidden-services", action="store_true")
     command = _command(verbs, "call", call)
     command.add_argument("service_name")
     command.add_argument("service_type")
     command.add_argument("values", nargs="?", default="{}", help="the request as YAML")
     verbs = _verbs(groups, "node")
-    command = _command(verbs, "list", list_nodes)
-    command.add_argument("-a", "--all", action="store_true", help="hidden ones too")
-    command.add_argument("-c", "--count-nodes", dest="count", action="store_true")
+    _command(verbs, "list", list_nodes)
     verbs = _verbs(groups, "param")
     command = _command(verbs, "list", list_parameters)
     command.add_argument("node_name", nargs="?")
@@ -274,15 +233,10 @@ def _positive(text: str) -> float:
 
 
 @contextlib.contextmanager
-def own_node(options: argparse.Namespace) -> Iterator[Node]:
+def own_node() -> Iterator[Node]:
     """Make a node whose name is hidden, for as long as the context lasts."""
     rclpy.init(args=[])
-    name = getattr(options, "node_name", None) if options.action is pub else None
-    node = Node(
-        name or f"_ros2cli_{os.getpid()}",
-        start_parameter_services=False,
-        parameter_overrides=[Parameter("use_sim_time", value=options.use_sim_time)],
-    )
+    node = Node(f"_ros2cli_{os.getpid()}", start_parameter_services=False)
     try:
         yield node
     finally:
@@ -294,7 +248,7 @@ def main(arguments: list[str]) -> int:
     """Do what the command line says; returns the exit code of the real `ros2`."""
     options = command_parser().parse_args(arguments)
     try:
-        with own_node(options) as node:
+        with own_node() as node:
             options.action(node, options)
     except KeyboardInterrupt:
         return int(signal.SIGINT)

@@ -12,6 +12,8 @@ import numpy as np
 import yaml
 
 TRUNCATED = "..."
+# How many elements of an array, and characters of a text, are written.
+LONGEST = 128
 # of `sequence<geometry_msgs/Point, 4>` and `geometry_msgs/Point[4]`
 ELEMENT = re.compile(r"\w+/\w+")
 # Sets one time field, or one header's stamp, to the time that it is given.
@@ -51,37 +53,24 @@ def find_type(name: str, kind: str) -> Any:
     return found
 
 
-def to_yaml(value: Any, *, truncate: int | None = None) -> str:
-    """Return a message, or a field of one, as YAML.
-
-    Parameters
-    ----------
-    value : message or field
-        What to write.
-    truncate : int, optional
-        How many elements of an array, and characters of a text, are written.
-    """
-    return str(
-        yaml.safe_dump(_plain(value, truncate), allow_unicode=True, width=1 << 30, sort_keys=False)
-    )
+def to_yaml(value: Any) -> str:
+    """Return a message, or a field of one, as YAML; what is long is shortened."""
+    return str(yaml.safe_dump(_plain(value), allow_unicode=True, width=1 << 30, sort_keys=False))
 
 
-def _plain(value: Any, truncate: int | None) -> Any:
+def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         value = value.decode("latin-1")
     if isinstance(value, str):
-        cut = truncate is not None and len(value) > truncate
-        return value[:truncate] + TRUNCATED if cut else value
+        return value if len(value) <= LONGEST else value[:LONGEST] + TRUNCATED
     if isinstance(value, (bool, int, float)):
         return value
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, (list, tuple, array.array, np.ndarray)):
-        items = [_plain(item, truncate) for item in value[:truncate]]
+        items = [_plain(item) for item in value[:LONGEST]]
         return items + [TRUNCATED] * (len(value) > len(items))
-    return {
-        name: _plain(getattr(value, name), truncate) for name in value.get_fields_and_field_types()
-    }
+    return {name: _plain(getattr(value, name)) for name in value.get_fields_and_field_types()}
 
 
 def parse(text: str) -> Mapping[str, Any]:

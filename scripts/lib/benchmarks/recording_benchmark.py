@@ -14,9 +14,9 @@ import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import BagTopic
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.allocator import keep_freed_memory
+from needle_common.files.bag_topic import BagTopic
 
 EXPOSURES = 150
 SMALL_EACH = 10
