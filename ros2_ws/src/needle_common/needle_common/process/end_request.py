@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any, ClassVar
 
-from needle_common.process.exit_timer import ExitTimer
-from needle_common.process.signal_exit import SignalExit
+from needle_common.process.late_exit import LateExit
 
 ENDING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 # From the signal to the end [s]: a node that is still busy then ends there.
@@ -48,9 +47,11 @@ class EndRequest:
 
     def __init__(self, grace: float | None = GRACE, code: int = 0) -> None:
         self.wanted = False
-        self._timer = ExitTimer()
         self._before = _handle(self._take)
-        self._exit = SignalExit(grace, code) if LeaveAtOnce.began and grace is not None else None
+        self._exit: LateExit | None = None
+        if LeaveAtOnce.began and grace is not None:
+            self._exit = LateExit(grace, code)
+            self._exit.start_with_signal()
 
     def __enter__(self) -> EndRequest:
         return self
@@ -67,7 +68,7 @@ class EndRequest:
         if self._exit is not None:
             self._exit.set_code(code)
         if LeaveAtOnce.began:
-            self._timer.start(TAKE_APART, code)
+            LateExit(TAKE_APART, code).start()
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
         self.wanted = True

@@ -10,7 +10,7 @@ import types
 
 import pytest
 
-from needle_common.process import exit_timer
+from needle_common.process import late_exit
 
 SIGNALS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
@@ -204,12 +204,12 @@ executables.{kind}("made_up")()
     assert run(code) == (4, "last words\n")
 
 
-def test_timers_of_an_older_c_library_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    libc, librt = types.SimpleNamespace(), types.SimpleNamespace(timer_create=None)
+def test_the_reading_of_an_older_c_library_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    libc, librt = types.SimpleNamespace(), types.SimpleNamespace(aio_read=None)
     libraries = {None: libc, "librt.so.1": librt}
     monkeypatch.setattr(ctypes, "CDLL", lambda name, **_: libraries[name])
-    assert vars(exit_timer.system_library()) == {"timer_create": None}
+    assert vars(late_exit.system_library()) == {"aio_read": None}
     assert not vars(libc)
-    libc.timer_create = None
-    del librt.timer_create
-    assert vars(exit_timer.system_library()) == {"timer_create": None}
+    libc.aio_read = None
+    del librt.aio_read
+    assert vars(late_exit.system_library()) == {"aio_read": None}
