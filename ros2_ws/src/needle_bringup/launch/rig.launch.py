@@ -8,8 +8,6 @@ moves a needle by itself. A file that is missing ends the launch before a node s
 that ends ends the others.
 """
 
-from launch.actions import DeclareLaunchArgument
-
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
 from needle_bringup.simulation.installed import find_shared
@@ -19,18 +17,10 @@ from needle_bringup.simulation.launch_nodes import nodes_beside_rig
 def generate_launch_description() -> LaunchDescription:
     """Return the graph beside a rig."""
     calibration = str(find_shared("needle_tracker", "config/calibration.yaml"))
-    return describe(
-        [
-            DeclareLaunchArgument(
-                "calibration", default_value=calibration, description="the stereo calibration"
-            ),
-            DeclareLaunchArgument(
-                "drives", default_value="", description="the drives' parameter file; empty: none"
-            ),
-            DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
-            DeclareLaunchArgument(
-                "params", default_value="", description="parameter file for any node; empty: none"
-            ),
-        ],
-        nodes_beside_rig,
-    )
+    arguments = {
+        "calibration": (calibration, "the stereo calibration"),
+        "drives": ("", "the drives' parameter file; empty: none"),
+        "bag": ("", "new bag; empty: none"),
+        "params": ("", "parameter file for any node; empty: none"),
+    }
+    return describe(arguments, nodes_beside_rig)

@@ -6,8 +6,6 @@
 when somebody else sends device/hold. The launch ends with the operator, and with any other node.
 """
 
-from launch.actions import DeclareLaunchArgument
-
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
 from needle_bringup.simulation.launch_nodes import simulated_nodes
@@ -16,36 +14,15 @@ from needle_bringup.simulation.simulate_options import CONTROLLERS, LEVELS
 
 def generate_launch_description() -> LaunchDescription:
     """Return the graph of a simulated run."""
-    return describe(
-        [
-            DeclareLaunchArgument(
-                "level", default_value="camera", choices=LEVELS, description="what is simulated"
-            ),
-            DeclareLaunchArgument("seed", default_value="1", description="seed of all noise"),
-            DeclareLaunchArgument(
-                "real_time_factor", default_value="1.0", description="0.0: lock step"
-            ),
-            DeclareLaunchArgument(
-                "controller",
-                default_value="best",
-                choices=CONTROLLERS,
-                description="how the needle is turned",
-            ),
-            DeclareLaunchArgument(
-                "operator",
-                default_value="false",
-                choices=("true", "false"),
-                description="let the stand-in keep the hold",
-            ),
-            DeclareLaunchArgument("bag", default_value="", description="new bag; empty: none"),
-            DeclareLaunchArgument(
-                "can",
-                default_value="/tmp/needle_can",
-                description="level drive: where the emulated CAN adapter appears",
-            ),
-            DeclareLaunchArgument(
-                "params", default_value="", description="parameter file for any node; empty: none"
-            ),
-        ],
-        simulated_nodes,
-    )
+    arguments = {
+        "level": ("camera", "what is simulated"),
+        "seed": ("1", "seed of all noise"),
+        "real_time_factor": ("1.0", "0.0: lock step"),
+        "controller": ("best", "how the needle is turned"),
+        "operator": ("false", "let the stand-in keep the hold"),
+        "bag": ("", "new bag; empty: none"),
+        "can": ("/tmp/needle_can", "level drive: where the emulated CAN adapter appears"),
+        "params": ("", "parameter file for any node; empty: none"),
+    }
+    choices = {"level": LEVELS, "controller": CONTROLLERS, "operator": ("true", "false")}
+    return describe(arguments, simulated_nodes, choices)

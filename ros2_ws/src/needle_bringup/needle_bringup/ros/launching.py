@@ -18,31 +18,38 @@ from needle_common.settings.parameter_files import Parameters
 
 
 def describe(
-    arguments: Sequence[DeclareLaunchArgument],
+    arguments: Mapping[str, tuple[str, str]],
     nodes: Callable[[Mapping[str, str]], Parameters],
+    choices: Mapping[str, Sequence[str]] = {},
 ) -> LaunchDescription:
     """Return a graph that ends as soon as one of its nodes does.
 
     Parameters
     ----------
-    arguments : sequence of DeclareLaunchArgument
-        What the user can say, beside `namespace`; misspelt, it ends the launch likewise.
+    arguments : mapping
+        What the user can say, beside `namespace`, to its default and what it is; misspelt, it ends
+        the launch likewise.
     nodes : callable
         Takes launch argument -> text, returns node -> parameter -> value; what it raises ends the
         launch before a node is started.
+    choices : mapping
+        Argument to all that it may be, where not anything.
     """
+    every = {**arguments, "namespace": ("", "namespace of all nodes")}
 
     def start(context: Any) -> list[Node]:
-        declared = [*(one.name for one in arguments), "namespace"]
-        refuse_misspelt(context.launch_configurations, declared)
-        given = {one.name: LaunchConfiguration(one.name).perform(context) for one in arguments}
-        namespace = LaunchConfiguration("namespace").perform(context)
+        refuse_misspelt(context.launch_configurations, list(every))
+        given = {name: LaunchConfiguration(name).perform(context) for name in every}
+        namespace = given.pop("namespace")
         return [_node(name, values, namespace) for name, values in nodes(given).items()]
 
-    namespace = DeclareLaunchArgument(
-        "namespace", default_value="", description="namespace of all nodes"
-    )
-    return LaunchDescription([*arguments, namespace, OpaqueFunction(function=start)])
+    declared = [
+        DeclareLaunchArgument(
+            name, default_value=default, description=text, choices=choices.get(name)
+        )
+        for name, (default, text) in every.items()
+    ]
+    return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
 def _node(name: str, values: Mapping[str, Any], namespace: str) -> Node:

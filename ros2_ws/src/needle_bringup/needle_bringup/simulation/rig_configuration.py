@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -185,21 +186,10 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
 
 def run_info(options: SimulateOptions) -> dict[str, Any]:
     """Return what the bag says about how it was made."""
-    return {
-        "level": options.level,
-        "controller": options.controller,
-        "seed": options.seed,
-        "initial_x_mm": options.initial_x_mm,
-        "initial_pitch_deg": options.initial_pitch_deg,
-        "initial_roll_deg": options.initial_roll_deg,
-        "noise_mm": options.noise_mm,
-        "depth_mm": options.depth_mm,
-        "target_mm": options.target_mm,
-        "obstacles": None if options.obstacles is None else options.obstacles.name,
-        "play_deg": options.play_deg,
-        "lag_mm": options.lag_mm,
-        "real_time_factor": options.real_time_factor,
-    }
+    told = dataclasses.asdict(options)
+    for name in ("bag", "params", "json"):
+        del told[name]
+    return {**told, "obstacles": None if options.obstacles is None else options.obstacles.name}
 
 
 def write_parameters(path: Path, parameters: Parameters) -> None:

@@ -10,9 +10,9 @@ import shutil
 import signal
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import ModuleType
 
 from needle_bringup.operator.progress import PROGRESS_FD
 from needle_bringup.simulation.installed import find_executable
@@ -36,6 +36,7 @@ from needle_common.commands.cli import (
     write_json,
 )
 from needle_common.errors import UserError
+from needle_common.process.end_request import EndRequest
 from needle_common.process.ros_domain import own_domain
 from needle_common.settings.parameter_files import Parameters, read_parameters
 
@@ -70,58 +71,21 @@ class NodeFailedError(UserError):
         super().__init__(node.describe_end() + where)
 
 
-class Interruption:
-    """SIGINT, SIGTERM and SIGHUP as a flag that is looked at between steps."""
-
-    def __init__(self) -> None:
-        self._seen = False
-        self._at_once = False
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            # nohup's wish is to outlive the terminal
-            if number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN:
-                continue
-            signal.signal(number, self._take)
-
-    @contextlib.contextmanager
-    def at_once(self) -> Iterator[None]:
-        """Let a signal raise KeyboardInterrupt wherever the context is, not only in `check`."""
-        self._at_once = True
-        try:
-            self.check()
-            yield
-        finally:
-            self._at_once = False
-
-    def check(self) -> None:
-        """Raise KeyboardInterrupt if a signal has come."""
-        if self._seen:
-            raise KeyboardInterrupt
-
-    def _take(self, _number: int, _frame: FrameType | None) -> None:
-        first = not self._seen
-        self._seen = True
-        if first and self._at_once:
-            raise KeyboardInterrupt
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run `simulate`; returns its exit code."""
-    interruption = Interruption()
     if STARTED_AT in os.environ:
         _end_with_parent()
     words = sys.argv[1:] if arguments is None else arguments
-    return run_command(lambda: simulate(parse(words), interruption))
+    return run_command(lambda: simulate(parse(words)))
 
 
-def simulate(options: SimulateOptions, interruption: Interruption) -> int:
+def simulate(options: SimulateOptions) -> int:
     """Run one simulation as asked.
 
     Parameters
     ----------
     options : SimulateOptions
         What to run.
-    interruption : Interruption
-        Tells when to give up.
 
     Returns
     -------
@@ -141,14 +105,16 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
         given = read_parameters(options.params, NODES)
         refuse_reserved(options.params, given, options)
     executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
+    # A signal is looked at between steps from here on; in the report it raises wherever it comes.
+    end = EndRequest(None)
     bag = _make_folder(options)
-    parameters = merge(command_line_parameters(options, bag), given)
-    interruption.check()
     try:
-        with own_domain() as domain:
+        parameters = merge(command_line_parameters(options, bag), given)
+        with end, own_domain() as domain:
             write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
-            done = _run_nodes(executables, bag, domain, interruption)
-        return _report(options, bag, started_at, interruption, done=done)
+            _run_nodes(executables, bag, domain, end)
+        _check(end)
+        return _report(options, bag, started_at)
     except NodeFailedError as error:
         # Bad input leaves nothing behind; what broke leaves its logs.
         if error.is_bad_input:
@@ -160,10 +126,13 @@ def simulate(options: SimulateOptions, interruption: Interruption) -> int:
         raise
 
 
-def _run_nodes(
-    executables: dict[str, str], bag: Path, domain: int, interruption: Interruption
-) -> bool:
-    """Run the graph until the operator ends; whether the needle reached its depth."""
+def _check(end: EndRequest) -> None:
+    if end.wanted:
+        raise KeyboardInterrupt
+
+
+def _run_nodes(executables: dict[str, str], bag: Path, domain: int, end: EndRequest) -> None:
+    """Run the graph until the operator ends."""
     logs = bag / LOGS
     logs.mkdir()
     progress = os.dup(sys.stderr.fileno())
@@ -182,7 +151,7 @@ def _run_nodes(
     failure: NodeProcess | None = None
     try:
         for name, executable in executables.items():
-            interruption.check()
+            _check(end)
             nodes[name] = NodeProcess(
                 name,
                 [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
@@ -193,7 +162,7 @@ def _run_nodes(
         operator = nodes["operator"]
         begin = time.monotonic()
         while operator.exit_code is None and failure is None:
-            interruption.check()
+            _check(end)
             if time.monotonic() - begin > QUIET_AFTER:
                 _import_report()
             failure = _first_dead(nodes)
@@ -203,7 +172,6 @@ def _run_nodes(
             failure = operator
         if failure is not None:
             raise NodeFailedError(failure)
-        return operator.exit_code == EXIT_DONE
     finally:
         os.close(progress)
         _stop_nodes(nodes)
@@ -236,24 +204,16 @@ def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
         print(f"warning: {warning}", file=sys.stderr)
 
 
-def _report(
-    options: SimulateOptions,
-    bag: Path,
-    started_at: float,
-    interruption: Interruption,
-    *,
-    done: bool,
-) -> int:
+def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:
     """Make summary and report from the bag; the exit code."""
-    with interruption.at_once():
-        report, bag_reader, run_summary = _import_report()
-        run = bag_reader.read_run(bag)
-        summary = run_summary.summarize(run)
-        report.write_report(run, summary)
-        summary["wall_s"] = time.time() - started_at
-        for path in (bag / SUMMARY, options.json):
-            if path is not None:
-                write_json(path, summary)
+    report, bag_reader, run_summary = _import_report()
+    run = bag_reader.read_run(bag)
+    summary = run_summary.summarize(run)
+    report.write_report(run, summary)
+    summary["wall_s"] = time.time() - started_at
+    for path in (bag / SUMMARY, options.json):
+        if path is not None:
+            write_json(path, summary)
     print(describe(summary, bag))
     return EXIT_DONE if summary["converged"] else EXIT_MISSED
 

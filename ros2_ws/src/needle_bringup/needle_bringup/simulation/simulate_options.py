@@ -66,6 +66,7 @@ class SimulateOptions:
 
     level: str = "camera"
     controller: str = "best"
+    seed: int = 1
     initial_x_mm: float = -3.0
     initial_pitch_deg: float = 2.0
     initial_roll_deg: float = 15.0
@@ -76,7 +77,6 @@ class SimulateOptions:
     play_deg: float = 0.0
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
-    seed: int = 1
     bag: Path | None = None
     params: Path | None = None
     json: Path | None = None
