@@ -13,8 +13,9 @@ import yaml
 from rosbags.interfaces import QosDurability
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
+from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
+from needle_common.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120

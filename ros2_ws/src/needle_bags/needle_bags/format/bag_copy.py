@@ -8,9 +8,10 @@ from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
-from needle_bags.format.bag_writer import BagWriteError, BagWriter
+from needle_bags.format.bag_metadata import USUAL_QOS
+from needle_bags.format.bag_writer import BagWriter
 from needle_common.errors import UserError
+from needle_common.files.bag_topic import BagTopic
 
 _STAMP_END = 12
 _STORE = get_typestore(Stores.ROS2_JAZZY)
@@ -75,16 +76,10 @@ class BagCopy:
         UserError
             If the disk refuses the data.
         """
-        try:
-            if topic.name not in self._topics:
-                self._topics[topic.name] = self._writer.add_topic(topic)
-            self._writer.write(self._topics[topic.name], data, log_time, sent)
-        except BagWriteError as error:
-            raise UserError(str(error)) from error
+        if topic.name not in self._topics:
+            self._topics[topic.name] = self._writer.add_topic(topic)
+        self._writer.write(self._topics[topic.name], data, log_time, sent)
 
     def close(self) -> None:
         """Complete the bag; raises UserError if the disk refuses the data."""
-        try:
-            self._writer.close()
-        except BagWriteError as error:
-            raise UserError(str(error)) from error
+        self._writer.close()

@@ -16,11 +16,11 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
-from rosbags.rosbag2.metadata import dump_qos_v9, parse_qos
+from rosbags.rosbag2.metadata import dump_qos_v9
 
 from needle_common.files.bag_directory import METADATA_FILE
+from needle_common.files.bag_topic import BagTopic
 from needle_common.files.file_access import replace_file
-from needle_common.files.plain_yaml import load_plain
 
 METADATA_VERSION: Final = 9
 # Name of the MCAP metadata records that rosbag2 writes.
@@ -38,67 +38,6 @@ USUAL_QOS: Final = Qos(
     _NO_LIMIT,
     False,
 )
-
-
-def offered_profiles(profiles: Sequence[Mapping[str, Any]] | str) -> tuple[Qos, ...]:
-    """Return the profiles that metadata.yaml or an MCAP channel has; none if it has other things.
-
-    Parameters
-    ----------
-    profiles : sequence of mapping or str
-        As they are from version 9 on, or as YAML text.
-    """
-    try:
-        found: Any = load_plain(profiles) or [] if isinstance(profiles, str) else profiles
-        return tuple(
-            qos._replace(
-                depth=int(qos.depth),
-                deadline=QosTime(*map(int, qos.deadline)),
-                lifespan=QosTime(*map(int, qos.lifespan)),
-                liveliness_lease_duration=QosTime(*map(int, qos.liveliness_lease_duration)),
-            )
-            for qos in parse_qos(found)
-        )
-    except (ValueError, TypeError, KeyError, AttributeError):
-        return ()
-
-
-@dataclasses.dataclass(frozen=True)
-class BagTopic:
-    """A topic of a bag, beside its messages.
-
-    Attributes
-    ----------
-    name : str
-        Absolute name.
-    type_name : str
-        `package/msg/Name`.
-    definition : str
-        Full definition text (`message_definitions.full_definition`).
-    type_hash : str
-        `RIHS01_...` as the publishers announce it, or an empty text.
-    offered_qos : tuple of Qos
-        One for each publisher.
-    """
-
-    name: str
-    type_name: str
-    definition: str
-    type_hash: str = ""
-    offered_qos: tuple[Qos, ...] = ()
-
-    @property
-    def is_latched(self) -> bool:
-        """Tell whether late joiners get a publisher's last messages."""
-        return any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in self.offered_qos)
-
-    def channel_metadata(self) -> dict[str, str]:
-        """Return what an MCAP channel says about the topic."""
-        profiles = dump_qos_v9(list(self.offered_qos))
-        return {
-            "offered_qos_profiles": to_yaml(profiles).strip() if profiles else "",
-            "topic_type_hash": self.type_hash,
-        }
 
 
 @dataclasses.dataclass
@@ -183,6 +122,15 @@ def write_metadata(directory: Path, information: Mapping[str, Any]) -> None:
     """
     text = to_yaml({"rosbag2_bagfile_information": dict(information)})
     replace_file(directory / METADATA_FILE, text.encode())
+
+
+def channel_metadata(topic: BagTopic) -> dict[str, str]:
+    """Return what an MCAP channel says about a topic."""
+    profiles = dump_qos_v9(list(topic.offered_qos))
+    return {
+        "offered_qos_profiles": to_yaml(profiles).strip() if profiles else "",
+        "topic_type_hash": topic.type_hash,
+    }
 
 
 def to_yaml(value: Mapping[str, Any] | Sequence[Any]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Final
 
@@ -13,15 +13,16 @@ from mcap.writer import CompressionType, Writer
 
 from needle_bags.format.bag_metadata import (
     METADATA_RECORD,
-    BagTopic,
     DataFile,
     bag_information,
+    channel_metadata,
     to_yaml,
     write_metadata,
 )
 from needle_bags.format.mcap_ending import NO_ROOM, McapEnding
 from needle_common.errors import UserError
 from needle_common.files.bag_directory import METADATA_FILE
+from needle_common.files.bag_topic import BagTopic
 
 LIBRARY: Final = "needle_bags"
 COMPRESSIONS: Final = ("none", "zstd")
@@ -30,7 +31,7 @@ DISTRO_KEY: Final = "ROS_DISTRO"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 
-class BagWriteError(Exception):
+class BagWriteError(UserError):
     """The disk refused the bag's data; the message says why and where."""
 
 
@@ -117,30 +118,24 @@ class BagWriter:
         BagWriteError
             If the disk refuses the data.
         """
-        try:
+        with self._writing():
             if self._max_file_size and self._file_bytes + len(data) > self._max_file_size:
                 self._split()
             self._mcap.add_message(
                 self._channels[topic], log_time, data, publish_time, sequence & _SEQUENCE_MASK
             )
-        except OSError as error:
-            raise self._failure(error) from error
         self._file_bytes += len(data)
         self._files[-1].add(self._topics[topic].name, log_time)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Append a named MCAP metadata record."""
-        try:
+        with self._writing():
             self._mcap.add_metadata(name, dict(values))
-        except OSError as error:
-            raise self._failure(error) from error
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time: int) -> None:
         """Append a file as an MCAP attachment; `time` is the system clock's [ns]."""
-        try:
+        with self._writing():
             self._mcap.add_attachment(time, time, name, media_type, data)
-        except OSError as error:
-            raise self._failure(error) from error
 
     def set_custom_data(self, key: str, value: str) -> None:
         """Set one text of the `custom_data` in metadata.yaml, which every bag reader shows."""
@@ -148,10 +143,8 @@ class BagWriter:
 
     def flush(self) -> None:
         """Close the chunk in progress, so that a crash loses nothing written before."""
-        try:
+        with self._writing():
             self._mcap.flush()  # type: ignore[no-untyped-call]
-        except OSError as error:
-            raise self._failure(error) from error
 
     def close(self) -> None:
         """Write the index and metadata.yaml; the bag is whole after this.
@@ -162,12 +155,10 @@ class BagWriter:
             If the disk refuses the data.
         """
         information = self._information()
-        try:
+        with self._writing():
             self._mcap.add_metadata(METADATA_RECORD, {"serialized_metadata": to_yaml(information)})
             self._end_file()
             write_metadata(self.directory, information)
-        except OSError as error:
-            raise self._failure(error) from error
 
     def end_early(self) -> dict[str, int]:
         """Complete the bag after a `BagWriteError`, as far as what is written is whole.
@@ -190,7 +181,7 @@ class BagWriter:
             self._stream.close()
         path = self.data_file
         taken = self._files[-1].counts
-        try:
+        with self._writing():
             ending = McapEnding(self._mcap, path)
             while True:
                 ending.write()
@@ -203,8 +194,6 @@ class BagWriter:
                     ending.give_back()
                 else:
                     break
-        except OSError as error:
-            raise self._failure(error) from error
         kept = self._files[-1].counts
         missing = {topic: count - kept.get(topic, 0) for topic, count in taken.items()}
         return {topic: count for topic, count in missing.items() if count}
@@ -217,10 +206,8 @@ class BagWriter:
         BagWriteError
             If the disk refuses it; the file that is there stays as it is.
         """
-        try:
+        with self._writing():
             write_metadata(self.directory, self._information())
-        except OSError as error:
-            raise self._failure(error) from error
 
     def _begin_file(self) -> None:
         name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
@@ -253,16 +240,20 @@ class BagWriter:
         key = (topic.type_name, topic.definition)
         if key not in self._schemas:
             self._schemas[key] = self._mcap.register_schema(
-                topic.type_name, "ros2msg", topic.definition.encode()
+                topic.type_name, topic.encoding, topic.definition.encode()
             )
         self._channels.append(
             self._mcap.register_channel(
-                topic.name, "cdr", self._schemas[key], topic.channel_metadata()
+                topic.name, "cdr", self._schemas[key], channel_metadata(topic)
             )
         )
 
-    def _failure(self, error: OSError) -> BagWriteError:
-        return BagWriteError(f"cannot write {self.data_file}: {error.strerror}")
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise BagWriteError(f"cannot write {self.data_file}: {error.strerror}") from error
 
     def _information(self) -> dict[str, object]:
         return bag_information(self._files, self._topics, self._custom_data, self._distribution)

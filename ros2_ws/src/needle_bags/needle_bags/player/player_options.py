@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from needle_bags.format.topic_choice import TopicChoice
-from needle_bags.reading.bag_files import BagContents
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
+from needle_common.files.bag_directory import BagDirectory
 from needle_common.settings.bounds import check_bounds
 
 _DESCRIPTION = """\
@@ -136,7 +136,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     )
 
 
-def require_fits(options: PlayerOptions, contents: BagContents) -> None:
+def require_fits(options: PlayerOptions, contents: BagDirectory) -> None:
     """Raise a `UserError` if the options ask for what the bag does not have."""
     known = contents.topics
     for name in (*options.topics.names, *options.remaps):

@@ -2,46 +2,15 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from needle_bags.format.bag_metadata import BagTopic, offered_profiles
 from needle_common.files.bag_directory import BagDirectory
 
 
-@dataclasses.dataclass(frozen=True)
-class BagContents:
-    """Contents of a bag, as it tells them itself.
-
-    Attributes
-    ----------
-    path : Path
-        The bag's directory.
-    topics : dict of str to BagTopic
-        By name.
-    counts : dict of str to int
-        Messages for each topic.
-    start, end : int
-        Log times of the first and the last message, system clock [ns]; 0 in an empty bag.
-    custom_data : dict of str to str
-        What the recorder left in metadata.yaml.
-    distribution : str
-        ROS distribution it was recorded with; empty where not known.
-    """
-
-    path: Path
-    topics: dict[str, BagTopic]
-    counts: dict[str, int]
-    start: int
-    end: int
-    custom_data: dict[str, str]
-    distribution: str
-
-
-def read_contents(path: Path) -> BagContents:
-    """Return what a bag says about itself.
+def read_contents(path: Path) -> BagDirectory:
+    """Return what a bag says about itself: the bag, closed.
 
     Parameters
     ----------
@@ -54,25 +23,7 @@ def read_contents(path: Path) -> BagContents:
         If there is no bag, or it is not whole.
     """
     with BagDirectory(path) as bag:
-        custom = bag.information.get("custom_data") or {}
-        return BagContents(
-            path,
-            {
-                name: BagTopic(
-                    name,
-                    topic.type_name,
-                    topic.definition,
-                    topic.type_hash,
-                    offered_profiles(topic.offered_qos),
-                )
-                for name, topic in bag.topics.items()
-            },
-            {name: topic.count for name, topic in bag.topics.items()},
-            bag.start,
-            bag.end,
-            {str(key): str(value) for key, value in custom.items()},
-            str(bag.information.get("ros_distro") or ""),
-        )
+        return bag
 
 
 def read_messages(path: Path, wanted: Callable[[str], bool]) -> Iterator[tuple[str, int, Any]]:

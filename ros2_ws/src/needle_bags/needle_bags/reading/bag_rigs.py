@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from needle_bags.reading.bag_files import BagContents
 from needle_common.errors import UserError
+from needle_common.files.bag_directory import BagDirectory
 
 CALIBRATION = "stereo_tracker/calibration"
 _LANDMARK = "needle/controller_status"
@@ -24,19 +24,19 @@ _TYPES = {
 }
 
 
-def namespaces(contents: BagContents) -> list[str]:
+def namespaces(contents: BagDirectory) -> list[str]:
     """Return the namespaces of a bag's rigs, each `/` or with one at its end."""
     return sorted(
         name.removesuffix(_LANDMARK) for name in contents.topics if name.endswith(f"/{_LANDMARK}")
     )
 
 
-def namespace_of(contents: BagContents, wanted: str | None = None) -> str:
+def namespace_of(contents: BagDirectory, wanted: str | None = None) -> str:
     """Return the namespace of the rig whose run is read, `/` or with one at its end.
 
     Parameters
     ----------
-    contents : BagContents
+    contents : BagDirectory
         The bag.
     wanted : str, optional
         The rig's namespace as a user writes it; needed where the bag holds several.
@@ -65,7 +65,7 @@ def namespace_of(contents: BagContents, wanted: str | None = None) -> str:
     return found[0]
 
 
-def require_types(contents: BagContents, namespace: str) -> None:
+def require_types(contents: BagDirectory, namespace: str) -> None:
     """Raise a `UserError` if a topic of the rig has another type than the rig's."""
     types = {namespace + name: type_name for name, type_name in _TYPES.items()}
     types["/diagnostics"] = "diagnostic_msgs/msg/DiagnosticArray"

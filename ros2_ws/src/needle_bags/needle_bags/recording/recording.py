@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
-from needle_bags.format.bag_metadata import BagTopic
 from needle_bags.format.bag_writer import (
     CHUNK_SIZE,
     BagWriteError,
@@ -20,6 +19,7 @@ from needle_bags.format.bag_writer import (
 )
 from needle_bags.recording.free_space import FreeSpace, megabytes
 from needle_common.errors import UserError
+from needle_common.files.bag_topic import BagTopic
 
 FLUSH_PERIOD: Final = 0.1
 # What waits for a slow disk at most, in bytes; more is dropped, and counted. Nearly three seconds

@@ -15,19 +15,18 @@ import re
 import shutil
 import tempfile
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata
+from tqdm import tqdm
 
 from needle_bags.format.bag_metadata import (
     METADATA_RECORD,
-    BagTopic,
     DataFile,
     bag_information,
-    offered_profiles,
     to_yaml,
     write_metadata,
 )
@@ -44,6 +43,7 @@ from needle_common.files.bag_directory import (
     is_being_recorded,
     read_information,
 )
+from needle_common.files.bag_topic import BagTopic, offered_profiles
 from needle_common.files.file_access import open_regular, sync_directory
 from needle_common.files.mcap_file import BrokenMcapError, McapFile
 from needle_common.files.plain_yaml import load_plain
@@ -56,8 +56,6 @@ PARAMETER_CHANGE: Final = "parameter_change"
 PARAMETER_CHANGES: Final = "parameter_changes"
 DAMAGED: Final = ".damaged"
 _NUMBER: Final = re.compile(r"_(\d+)\.mcap$")
-
-Progress = Callable[[Path, int], None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,15 +104,13 @@ class _File:
     new: Path | None = None
 
 
-def recover_bag(path: Path, progress: Progress | None = None) -> BagRecovery:
-    """Make a bag whole.
+def recover_bag(path: Path) -> BagRecovery:
+    """Make a bag whole; on a terminal, a bar shows how far a file is that takes a while.
 
     Parameters
     ----------
     path : Path
         The bag's directory.
-    progress : callable, optional
-        Called with the file and the bytes of it that were read, now and then.
 
     Raises
     ------
@@ -125,23 +121,21 @@ def recover_bag(path: Path, progress: Progress | None = None) -> BagRecovery:
     names = _data_files(path)
     with contextlib.ExitStack() as stack:
         try:
-            return _recover(path, names, progress, stack)
+            return _recover(path, names, stack)
         except (NotMcapError, BrokenMcapError) as error:
             raise UserError(f"{path} cannot be recovered: {error}") from error
         except OSError as error:
             raise UserError(_refused(path, error)) from error
 
 
-def _recover(
-    path: Path, names: Sequence[Path], progress: Progress | None, stack: contextlib.ExitStack
-) -> BagRecovery:
+def _recover(path: Path, names: Sequence[Path], stack: contextlib.ExitStack) -> BagRecovery:
     old, is_readable = _old_information(path)
     files: list[_File] = []
     foreign: list[Path] = []
     reasons: list[NotMcapError] = []
     for name in names:
         try:
-            files.append(_look_at(name, progress, stack))
+            files.append(_look_at(name, stack))
         except NotMcapError as error:
             reasons.append(error)
             foreign.append(name)
@@ -180,11 +174,12 @@ def _recover(
     return BagRecovery(False, content, len(topics), losses, kept)
 
 
-def _look_at(path: Path, progress: Progress | None, stack: contextlib.ExitStack) -> _File:
+def _look_at(path: Path, stack: contextlib.ExitStack) -> _File:
     """Read a file, and write it anew beside itself if it is not whole."""
     with open_regular(path) as stream, _mapped(stream.fileno()) as data:
         try:
-            found = scan(data, None if progress is None else lambda done: progress(path, done))
+            with _bar(path.name, len(data)) as bar:
+                found = scan(data, lambda done: bar.update(done - bar.n))
         except NotMcapError as error:
             raise NotMcapError(f"{path.name}: {error}") from error
         records = [
@@ -205,6 +200,13 @@ def _look_at(path: Path, progress: Progress | None, stack: contextlib.ExitStack)
                 raise BrokenMcapError(f"{path.name}: what was written anew is not what was read")
             file.new = new
     return file
+
+
+def _bar(name: str, size: int) -> tqdm[NoReturn]:
+    tqdm.monitor_interval = 0  # its thread would outlive the bar
+    return tqdm(
+        total=size, desc=name, unit="B", unit_scale=True, delay=1.0, leave=False, disable=None
+    )
 
 
 def _content(path: Path, found: McapScan, name: str = "") -> DataFile | None:

@@ -61,14 +61,14 @@ _BLOCK: Final = 2**20
 _PADDING: Final = (0, -1, -2, -3, 1, 2, 3)
 
 
-def scan(data: Any, progress: Callable[[int], None] | None = None) -> McapScan:
+def scan(data: Any, progress: Callable[[int], object]) -> McapScan:
     """Read a file's records.
 
     Parameters
     ----------
     data : mmap or bytes
         The file.
-    progress : callable, optional
+    progress : callable
         Called with the offset reached, now and then.
 
     Raises
@@ -87,7 +87,7 @@ class _Scanner:
     def __init__(
         self,
         data: Any,
-        progress: Callable[[int], None] | None,
+        progress: Callable[[int], object],
         distrusted: Collection[int] = (),
     ) -> None:
         self._data = data
@@ -377,7 +377,7 @@ class _Scanner:
             found.mended += found.schemas[schema.id] != schema
 
     def _report(self, position: int) -> None:
-        if self._progress is not None and position - self._reported >= _REPORT_EVERY:
+        if position - self._reported >= _REPORT_EVERY:
             self._reported = position
             self._progress(position)
 

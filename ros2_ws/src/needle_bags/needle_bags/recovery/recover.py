@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from tqdm import tqdm
-
 from needle_bags.recovery.bag_recovery import BagRecovery, recover_bag
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, output_file
@@ -39,8 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def command() -> int:
         options = parser.parse_args(arguments)
         file = output_file("--json", options.json)
-        with _Bar() as bar:
-            recovery = recover_bag(options.bag, bar.show)
+        recovery = recover_bag(options.bag)
         for line in _lines(options.bag, recovery):
             print(line)
         if file is not None:
@@ -48,39 +45,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return EXIT_DONE
 
     return run_command(command)
-
-
-class _Bar:
-    """Share of the bag that has been read; shown only where it takes a while, on a terminal."""
-
-    def __init__(self) -> None:
-        self._bar: tqdm[None] | None = None
-        self._file: Path | None = None
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def show(self, file: Path, done: int) -> None:
-        """Show that so many bytes of a file have been read."""
-        if file != self._file:
-            if self._bar is not None:
-                self._bar.close()
-            tqdm.monitor_interval = 0  # its thread would outlive the bar
-            self._bar = tqdm(
-                total=file.stat().st_size,
-                desc=file.name,
-                unit="B",
-                unit_scale=True,
-                leave=False,
-                disable=None,
-            )
-            self._file = file
-        assert self._bar is not None
-        self._bar.update(done - self._bar.n)
 
 
 def _lines(bag: Path, recovery: BagRecovery) -> list[str]:

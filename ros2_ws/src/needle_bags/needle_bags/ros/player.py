@@ -18,7 +18,6 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool
 from tqdm import tqdm
 
-from needle_bags.format.bag_metadata import BagTopic
 from needle_bags.format.message_definitions import message_class
 from needle_bags.player.playable import unplayable
 from needle_bags.player.playback import PlaybackClock, ReadAhead
@@ -31,11 +30,13 @@ from needle_bags.player.player_options import (
 )
 from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, played_name
 from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
-from needle_bags.reading.bag_files import BagContents, raw_messages, read_contents
+from needle_bags.reading.bag_files import raw_messages, read_contents
 from needle_bags.ros.conversions import recorded_offer
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
+from needle_common.files.bag_directory import BagDirectory
+from needle_common.files.bag_topic import BagTopic
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
 from needle_common.ros.conversions import RELIABLE, to_stamp
@@ -82,7 +83,7 @@ class RigAppearedError(Exception):
 class Player(WholeNode):
     """Publishes a bag's messages when they are due."""
 
-    def __init__(self, options: PlayerOptions, contents: BagContents) -> None:
+    def __init__(self, options: PlayerOptions, contents: BagDirectory) -> None:
         super().__init__("player")
         self._options = options
         self._contents = contents

@@ -17,7 +17,6 @@ from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
 
-from needle_bags.format.bag_metadata import BagTopic
 from needle_bags.recording.allocator import keep_freed_memory
 from needle_bags.recording.not_understood import NotUnderstood
 from needle_bags.recording.provenance import commit, distribution, versions
@@ -30,6 +29,7 @@ from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.files.bag_directory import recover_hint
+from needle_common.files.bag_topic import BagTopic
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.discovery import PARAMETERS_OF

@@ -14,11 +14,12 @@ from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTim
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
+from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
 from needle_bags.recording.recording import WAITING_LIMIT, Received, Recording
 from needle_common.errors import UserError
+from needle_common.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"

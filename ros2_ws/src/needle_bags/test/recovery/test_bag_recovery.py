@@ -11,13 +11,14 @@ from rosbags.interfaces import QosDurability
 from rosbags.rosbag2 import Reader
 
 from needle_analysis.report import report
-from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
+from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.reading.bag_files import raw_messages, read_contents
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import recover
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_common.errors import UserError
+from needle_common.files.bag_topic import BagTopic
 
 MakeRun = Callable[..., Path]
 TYPE = "std_msgs/msg/String"

@@ -17,12 +17,18 @@ from mcap.writer import Writer
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.format.bag_metadata import BagTopic, DataFile, bag_information, write_metadata
+from needle_bags.format.bag_metadata import (
+    DataFile,
+    bag_information,
+    channel_metadata,
+    write_metadata,
+)
 from needle_bags.format.bag_writer import BagWriteError, BagWriter
 from needle_bags.format.mcap_ending import McapEnding
 from needle_bags.recovery.bag_recovery import BagRecovery, recover_bag
 from needle_common.errors import UserError
 from needle_common.files.bag_directory import BagDirectory
+from needle_common.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "std_msgs/msg/UInt8MultiArray"
@@ -71,7 +77,7 @@ def write_unchunked(directory: Path) -> Path:
         mcap.start("ros2")
         schema = mcap.register_schema(TYPE, "ros2msg", DEFINITION.encode())
         channels = [
-            mcap.register_channel(t.name, "cdr", schema, t.channel_metadata()) for t in topics
+            mcap.register_channel(t.name, "cdr", schema, channel_metadata(t)) for t in topics
         ]
         for number in range(COUNT):
             mcap.add_message(channels[number % 3], 1000 + number, payload(number), 1000)

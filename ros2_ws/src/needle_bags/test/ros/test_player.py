@@ -30,10 +30,11 @@ from std_msgs.msg import Bool, Int32, String
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_bags.format.bag_metadata import USUAL_QOS, BagTopic
+from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition, type_hash
 from needle_bags.ros import player as player_node
+from needle_common.files.bag_topic import BagTopic
 from needle_common.process.ros_domain import own_domain
 
 PATIENCE = 30.0

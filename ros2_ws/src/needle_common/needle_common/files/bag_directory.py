@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import fcntl
 import functools
 import os
@@ -19,6 +18,7 @@ from rosbags.typesys.store import Typestore
 
 from needle_common.errors import UserError
 from needle_common.files.bag_data import SqliteData, unpack, unpack_file
+from needle_common.files.bag_topic import BagTopic, offered_profiles
 from needle_common.files.file_access import open_regular
 from needle_common.files.mcap_file import TIME_LIMIT, McapFile
 from needle_common.files.plain_yaml import load_plain
@@ -48,33 +48,6 @@ class SentMessage(NamedTuple):
     topic: str
     type_name: str
     data: bytes
-
-
-@dataclasses.dataclass(frozen=True)
-class RecordedTopic:
-    """A topic as metadata.yaml has it, with the definition that the data have.
-
-    Attributes
-    ----------
-    name, type_name : str
-        As in the graph.
-    count : int
-        Messages.
-    type_hash : str
-        `RIHS01_...`, or an empty text.
-    offered_qos : list or str
-        The publishers' profiles as the bag's version writes them.
-    encoding, definition : str
-        `ros2msg` or `ros2idl`, and the text; both empty if the data do not define the type.
-    """
-
-    name: str
-    type_name: str
-    count: int
-    type_hash: str
-    offered_qos: list[Any] | str
-    encoding: str = ""
-    definition: str = ""
 
 
 def recover_hint(path: Path) -> str:
@@ -154,7 +127,7 @@ def read_information(path: Path) -> dict[str, Any]:
 
 
 class BagDirectory:
-    """A bag open for reading.
+    """A bag open for reading; what it says about itself stays known when it is closed.
 
     Parameters
     ----------
@@ -170,8 +143,14 @@ class BagDirectory:
     ----------
     information : dict
         metadata.yaml's content.
-    topics : dict of str to RecordedTopic
+    topics : dict of str to BagTopic
         By name.
+    counts : dict of str to int
+        Messages for each topic.
+    custom_data : dict of str to str
+        What the recorder left in metadata.yaml.
+    distribution : str
+        ROS distribution it was recorded with; empty where not known.
     start, end : int
         Log times of the first and the last message [ns]; 0 in an empty bag.
     """
@@ -184,6 +163,10 @@ class BagDirectory:
             with readable(path):
                 self.information = read_information(path)
                 self._files = [self._open(name) for name in self._file_names()]
+                custom = self.information.get("custom_data") or {}
+                self.custom_data = {str(key): str(value) for key, value in custom.items()}
+                self.distribution = str(self.information.get("ros_distro") or "")
+                self.counts: Counter[str] = Counter()
                 self.topics = self._read_topics()
                 self._compare()
                 spans = [file.span for file in self._files if file.span is not None]
@@ -272,43 +255,37 @@ class BagDirectory:
             return SqliteData(self._stack.enter_context(Reader(path)))
         raise ValueError(f"its storage is {kind!r}")
 
-    def _read_topics(self) -> dict[str, RecordedTopic]:
+    def _read_topics(self) -> dict[str, BagTopic]:
         definitions: dict[str, tuple[str, str]] = {}
         for file in self._files:
             for name, definition in file.definitions().items():
                 definitions.setdefault(name, definition)
-        topics: dict[str, RecordedTopic] = {}
+        topics: dict[str, BagTopic] = {}
         for entry in self.information["topics_with_message_count"]:
             told = entry["topic_metadata"]
             name, type_name = str(told["name"]), str(told["type"])
             if told.get("serialization_format", "cdr") != "cdr":
                 raise ValueError(f"{name} is not in CDR")
-            count = int(entry["message_count"])
-            known = topics.get(name)
-            if known is not None and known.type_name != type_name:
+            if name in topics and topics[name].type_name != type_name:
                 raise UserError(
-                    f"{self.path}: {name} has two types in this bag, {known.type_name} and "
+                    f"{self.path}: {name} has two types in this bag, {topics[name].type_name} and "
                     f"{type_name}: record them under two names"
                 )
-            topics[name] = RecordedTopic(
-                name,
-                type_name,
-                count + (known.count if known is not None else 0),
-                str(told.get("type_description_hash") or ""),
-                told.get("offered_qos_profiles") or [],
-                *definitions.get(type_name, ("", "")),
-            )
+            self.counts[name] += int(entry["message_count"])
+            type_hash = str(told.get("type_description_hash") or "")
+            qos = offered_profiles(told.get("offered_qos_profiles") or [])
+            encoding, text = definitions.get(type_name, ("ros2msg", ""))
+            topics[name] = BagTopic(name, type_name, text, type_hash, qos, encoding)
         return topics
 
     def _compare(self) -> None:
-        told = Counter({name: topic.count for name, topic in self.topics.items()})
         there: Counter[str] = Counter()
         for file in self._files:
             there.update(file.counts())
-        if +told != +there or self.information["message_count"] != there.total():
+        if +self.counts != +there or self.information["message_count"] != there.total():
             raise ValueError(
-                f"{METADATA_FILE} tells of {told.total()} messages, the data of {there.total()}, "
-                "or of others"
+                f"{METADATA_FILE} tells of {self.counts.total()} messages, the data of "
+                f"{there.total()}, or of others"
             )
 
 

@@ -12,35 +12,22 @@ NANOSECONDS = 1_000_000_000
 # A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
 _FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
 
-RELIABLE = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE
-)
+
+def _last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
+    return QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=depth, reliability=reliability)
+
+
+RELIABLE = _last(10, ReliabilityPolicy.RELIABLE)
 # A lock-step simulation sends the 25 joint states of a step at once: more than a depth of 10 keeps.
-JOINT_STATES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=200, reliability=ReliabilityPolicy.RELIABLE
-)
-LATCHED = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST,
-    depth=1,
-    reliability=ReliabilityPolicy.RELIABLE,
-    durability=DurabilityPolicy.TRANSIENT_LOCAL,
-)
-HOLD = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+JOINT_STATES = _last(200, ReliabilityPolicy.RELIABLE)
+LATCHED = _last(1, ReliabilityPolicy.RELIABLE)
+LATCHED.durability = DurabilityPolicy.TRANSIENT_LOCAL
+HOLD = _last(1, ReliabilityPolicy.BEST_EFFORT)
 # What a device hears while others flood the topic, from one look to the next: all of it counts.
-HOLDS_HEARD = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.BEST_EFFORT
-)
-ESTOPS_HEARD = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=1000, reliability=ReliabilityPolicy.RELIABLE
-)
-IMAGES = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.RELIABLE
-)
-IMAGES_BEST_EFFORT = QoSProfile(
-    history=HistoryPolicy.KEEP_LAST, depth=2, reliability=ReliabilityPolicy.BEST_EFFORT
-)
+HOLDS_HEARD = _last(100, ReliabilityPolicy.BEST_EFFORT)
+ESTOPS_HEARD = _last(1000, ReliabilityPolicy.RELIABLE)
+IMAGES = _last(5, ReliabilityPolicy.RELIABLE)
+IMAGES_BEST_EFFORT = _last(2, ReliabilityPolicy.BEST_EFFORT)
 
 
 def to_nanoseconds(stamp: Time) -> int:

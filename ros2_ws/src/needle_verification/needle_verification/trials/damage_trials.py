@@ -16,7 +16,12 @@ from mcap.writer import CompressionType, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_copy import standard_topic
-from needle_bags.format.bag_metadata import DataFile, bag_information, write_metadata
+from needle_bags.format.bag_metadata import (
+    DataFile,
+    bag_information,
+    channel_metadata,
+    write_metadata,
+)
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recovery.bag_recovery import DAMAGED, recover_bag
 from needle_common.errors import UserError
@@ -254,7 +259,7 @@ def _write(bag: Path, kind: str) -> list[Extent]:
                 text = topic.definition.encode()
                 schema = mcap.register_schema(topic.type_name, "ros2msg", text)
                 numbers[topic.name] = mcap.register_channel(
-                    topic.name, "cdr", schema, topic.channel_metadata()
+                    topic.name, "cdr", schema, channel_metadata(topic)
                 )
             for name, time, data in _messages():
                 mcap.add_message(numbers[name], time, data, time)
