@@ -134,11 +134,13 @@ def studies() -> Iterator[Row]:
         run_study(STARTS[:2], factory, STUDY)  # compiles
         chunk = needles_at_a_time(name)
         seconds = _least_time(partial(run_study, STARTS, factory, STUDY, chunk=chunk), times)
-        what = f"{name}, {NEEDLES:,} x {STEPS} steps"
-        yield Row(f"study_{name}", what, "s", seconds, "paper in plain Python", plain)
-        yield Row(f"study_{name}", what, "s", seconds, "paper in python-control", with_control)
-        alone = _study_one_by_one(name)
-        yield Row(f"study_{name}", what, "s", seconds, f"{name}, one needle at a time", alone)
+        for against, reference in (
+            ("paper in plain Python", plain),
+            ("paper in python-control", with_control),
+            (f"{name}, one needle at a time", _study_one_by_one(name)),
+        ):
+            what = f"{name}, {NEEDLES:,} x {STEPS} steps"
+            yield Row(f"study_{name}", what, "s", seconds, against, reference)
 
 
 def updates() -> Iterator[Row]:
@@ -168,76 +170,40 @@ def memory() -> Iterator[Row]:
     """Peak memory of a study: it must not grow with the steps."""
     for name in ("paper", "best"):
         short, long = (_peak_memory(name, depth) for depth in (0.030, 0.120))
-        yield Row(
-            f"memory_{name}",
-            f"{name}, memory of 1,000 x {STEPS}",
-            "MB",
-            long,
-            "1,000 x 30 steps",
-            short,
-        )
+        what = f"{name}, memory of 1,000 x {STEPS}"
+        yield Row(f"memory_{name}", what, "MB", long, "1,000 x 30 steps", short)
 
 
 def tracker() -> Iterator[Row]:
     """From a stereo pair to a tip: time and 95 % error beside the plain OpenCV ways."""
     ways = {way.key: way for way in tracker_benchmark.ways()}
-    for key in ("full", "region"):
-        way = ways[key]
-        for plain_key in ("plain", "plain_corrected"):
-            plain = ways[plain_key]
-            yield Row(
-                f"tracker_{way.key}_pair",
-                f"{way.what}, a pair ({way.pairs_per_s:.0f}/s)",
-                "ms",
-                1e3 / way.pairs_per_s,
-                plain.what,
-                1e3 / plain.pairs_per_s,
-            )
-            yield Row(
-                f"tracker_{way.key}_error",
-                f"{way.what}, 95 % error",
-                "mm",
-                way.distance_p95_mm,
-                plain.what,
-                plain.distance_p95_mm,
-            )
+    for way in (ways["full"], ways["region"]):
+        key, what = f"tracker_{way.key}", way.what
+        pair = f"{what}, a pair ({way.pairs_per_s:.0f}/s)"
+        for plain in (ways["plain"], ways["plain_corrected"]):
+            times = 1e3 / way.pairs_per_s, plain.what, 1e3 / plain.pairs_per_s
+            errors = way.distance_p95_mm, plain.what, plain.distance_p95_mm
+            yield Row(f"{key}_pair", pair, "ms", *times)
+            yield Row(f"{key}_error", f"{what}, 95 % error", "mm", *errors)
 
 
 def drives() -> Iterator[Row]:
     """Run the 50 Hz cycle of both drives over a serial adapter: delay and share of a core."""
     driver, *others = drive_benchmark.ways()
     for other in others:
-        yield Row(
-            "drives_delay_p99",
-            "50 Hz cycle, p99 until SYNC is out",
-            "ms",
-            driver.delay_p99_ms,
-            other.what,
-            other.delay_p99_ms,
-        )
-        yield Row(
-            "drives_cpu",
-            "50 Hz cycle, share of a core",
-            "%",
-            driver.cpu_percent,
-            other.what,
-            other.cpu_percent,
-        )
+        delays = driver.delay_p99_ms, other.what, other.delay_p99_ms
+        shares = driver.cpu_percent, other.what, other.cpu_percent
+        yield Row("drives_delay_p99", "50 Hz cycle, p99 until SYNC is out", "ms", *delays)
+        yield Row("drives_cpu", "50 Hz cycle, share of a core", "%", *shares)
 
 
 def recording() -> Iterator[Row]:
     """From messages to a bag on the disk."""
     speeds = recording_benchmark.measure()
-    what = f"recorder's writer, {speeds.megabytes:.0f} MB"
+    size = speeds.megabytes
     for against, speed in (("rosbags Writer", speeds.rosbags), ("the disk alone", speeds.disk)):
-        yield Row(
-            "recording",
-            what,
-            "s",
-            speeds.megabytes / speeds.recorder,
-            against,
-            speeds.megabytes / speed,
-        )
+        what = f"recorder's writer, {size:.0f} MB"
+        yield Row("recording", what, "s", size / speeds.recorder, against, size / speed)
 
 
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
