@@ -13,7 +13,7 @@ from needle_sim.studies.beliefs import BeliefTally
 from needle_sim.studies.disturbed_needles import DisturbedNeedles
 from needle_sim.studies.figures_of_merit import BAND, BoolArray, joined, mean_of_what_is_said
 from needle_sim.studies.point_targets import INSERTION_SPEED, NEAREST, MovingTargets
-from needle_sim.studies.study import CHUNK, Controller, StudySettings
+from needle_sim.studies.study import CHUNK, Controller, StudySettings, needle_chunks
 
 ARRIVED = 1e-4
 """Insertion left at which a needle stays where it is [m]."""
@@ -27,15 +27,6 @@ class PointController(Controller, Protocol):
 
     def see_targets(self, time: float, targets: FloatArray) -> None:
         """Take where the targets are, (N, 3) [m], at a time [s]."""
-
-    def step(
-        self,
-        d_insertion: float | FloatArray,
-        d_rotation: FloatArray,
-        tips: FloatArray,
-        age: float | FloatArray,
-    ) -> FloatArray:
-        """Take a step as `Controller.step`; insertion and age are each needle's own, (N,) [m]."""
 
     def insertion_left(self) -> FloatArray:
         """Return how far each needle has to go on after the last step, (N,) [m]."""
@@ -99,17 +90,8 @@ def run_point_study(
         In the order of the starts.
     """
     parts = []
-    for first in range(0, len(starts), chunk):
-        part = slice(first, first + chunk)
-        needles = DisturbedNeedles(
-            starts[part],
-            settings.disturbances,
-            curvature=settings.curvature,
-            bump_at=0.5 * NEAREST,
-            seed=settings.seed,
-            first=first,
-        )
-        some = targets.part(first, len(starts[part]))
+    for first, needles in needle_chunks(starts, settings, bump_at=0.5 * NEAREST, chunk=chunk):
+        some = targets.part(first, len(needles.true.x))
         parts.append(_steer(needles, some, new_controller(), settings, on_progress))
     return joined(parts)
 

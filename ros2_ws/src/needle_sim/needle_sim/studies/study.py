@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Protocol
 
 from needle_sim.needle.se3 import FloatArray
@@ -28,20 +28,24 @@ class Controller(Protocol):
         """Take the first measured tips, (N, 3) [m]; return the rotation rates, (N,) [rad/m]."""
 
     def step(
-        self, d_insertion: float, d_rotation: FloatArray, tips: FloatArray, age: float
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
     ) -> FloatArray:
         """Take what happened in a step and what was measured after it.
 
         Parameters
         ----------
-        d_insertion : float
-            Insertion of the step [m].
+        d_insertion : float, or ndarray, shape (N,)
+            Insertion of the step, of all or of each [m].
         d_rotation : ndarray, shape (N,)
             What the bases turned [rad].
         tips : ndarray, shape (N, 3)
             The measured tips [m]; NaN where missing.
-        age : float
-            Insertion since they were measured [m].
+        age : float, or ndarray, shape (N,)
+            Insertion since they were measured, likewise [m].
 
         Returns
         -------
@@ -111,30 +115,40 @@ def run_study(
     Outcomes
         In the order of the starts.
     """
-    parts = []
+    chunks = needle_chunks(starts, settings, bump_at=0.5 * settings.depth, chunk=chunk)
+    return joined(
+        [_steer(needles, new_controller(), settings, on_progress) for _, needles in chunks]
+    )
+
+
+def needle_chunks(
+    starts: FloatArray, settings: StudySettings, *, bump_at: float, chunk: int
+) -> Iterator[tuple[int, DisturbedNeedles]]:
+    """Yield the needles of a study, `chunk` at a time, each time after the number of the first.
+
+    Parameters, but for `bump_at` (see `DisturbedNeedles`), as of `run_study`.
+    """
     for first in range(0, len(starts), chunk):
-        part = starts[first : first + chunk]
-        parts.append(_steer(part, first, new_controller(), settings, on_progress))
-    return joined(parts)
+        yield (
+            first,
+            DisturbedNeedles(
+                starts[first : first + chunk],
+                settings.disturbances,
+                curvature=settings.curvature,
+                bump_at=bump_at,
+                seed=settings.seed,
+                first=first,
+            ),
+        )
 
 
 def _steer(
-    starts: FloatArray,
-    first: int,
+    needles: DisturbedNeedles,
     controller: Controller,
     settings: StudySettings,
     on_progress: Callable[[int], None],
 ) -> Outcomes:
-    steps = settings.steps
-    needles = DisturbedNeedles(
-        starts,
-        settings.disturbances,
-        curvature=settings.curvature,
-        bump_at=0.5 * settings.depth,
-        seed=settings.seed,
-        first=first,
-    )
-    true = needles.true
+    steps, true = settings.steps, needles.true
     tally = Tally(true.x, steps)
     rate = controller.start(needles.first_seen())
     insertion = 0.0
@@ -145,7 +159,7 @@ def _steer(
         needles.insert(insertion, reached, length, turned)
         insertion = reached
         tally.add(true.x, insertion, turned)
-        on_progress(len(starts))
+        on_progress(len(true.x))
         tips, age = needles.seen(insertion)
         rate = controller.step(length, turned, tips, age)
         if tally.in_last_steps:

@@ -52,11 +52,15 @@ class Watching:
         return np.zeros(len(tips))
 
     def step(
-        self, d_insertion: float, d_rotation: FloatArray, tips: FloatArray, age: float
+        self,
+        d_insertion: float | FloatArray,
+        d_rotation: FloatArray,
+        tips: FloatArray,
+        age: float | FloatArray,
     ) -> FloatArray:
-        self.lengths.append(d_insertion)
+        self.lengths.append(float(d_insertion))
         self.tips.append(tips)
-        self.ages.append(age)
+        self.ages.append(float(age))
         return np.zeros(len(tips))
 
     def belief(self) -> Belief | None:

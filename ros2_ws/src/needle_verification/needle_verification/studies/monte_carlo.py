@@ -15,7 +15,7 @@ from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_
 from needle_common.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_verification.studies.monte_carlo_options import MonteCarloOptions, parse
-from needle_verification.studies.monte_carlo_runs import PlaneRuns, PointRuns, Runs
+from needle_verification.studies.monte_carlo_runs import run, settings_of, starts_of
 
 LABELS = {
     "runs": "runs",
@@ -49,19 +49,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def monte_carlo(options: MonteCarloOptions) -> int:
     """Run a study as asked, print its figures and write its files."""
-    runs: Runs = PointRuns(options) if options.targets else PlaneRuns(options)
+    starts = starts_of(options)
     # What is compiled is compiled now, not in the time that is reported.
-    runs.compile()
+    run(options, starts[:2])
     begin, worked_before = time.perf_counter(), time.process_time()
     with tqdm(
-        total=len(runs.starts) * runs.settings.steps,
+        total=len(starts) * settings_of(options).steps,
         unit="step",
         unit_scale=True,
         delay=1.0,
         leave=False,
         disable=not sys.stderr.isatty(),
     ) as bar:
-        results = runs.run(bar.update)
+        results = run(options, starts, bar.update)
     worked, wall = time.process_time() - worked_before, time.perf_counter() - begin
     seen = {**results.figures, "cpu_s": worked, "wall_s": wall}
     print(describe(seen))

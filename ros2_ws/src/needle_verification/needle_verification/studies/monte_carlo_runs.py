@@ -1,10 +1,9 @@
-"""What `monte_carlo` runs: needles to the plane, or to points, and what became of them."""
+"""Runs of `monte_carlo`: needles to the plane, or to points, and what became of them."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
-from typing import Protocol
 
 import numpy as np
 
@@ -41,126 +40,14 @@ class Results:
     columns: Mapping[str, FloatArray]
 
 
-class Runs(Protocol):
-    """A study that is ready to run; `starts` are its needles', (N, 3)."""
-
-    starts: FloatArray
-    settings: StudySettings
-
-    def compile(self) -> None:
-        """Run a needle or two, so that what is compiled is compiled."""
-
-    def run(self, on_progress: Callable[[int], None]) -> Results:
-        """Run it; told after each step how many needles have made one."""
-
-
-class PlaneRuns:
-    """A study of needles that are steered to the plane x = 0.
-
-    Parameters
-    ----------
-    options : MonteCarloOptions
-        What is asked for.
-    """
-
-    def __init__(self, options: MonteCarloOptions) -> None:
-        self.settings = _settings(options)
-        self.starts = _starts(options, POINTS**3 * options.draws)
-        flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
-        self._new_controller = controller_factory(
-            options.controller, options.claimed_bound, flips, sigma_scale=options.sigma_scale
-        )
-        self._chunk = needles_at_a_time(options.controller)
-
-    def compile(self) -> None:
-        """Run two needles; see `Runs.compile`."""
-        run_study(np.zeros((2, 3)), self._new_controller, self.settings)
-
-    def run(self, on_progress: Callable[[int], None]) -> Results:
-        """Run the study; see `Runs.run`."""
-        outcomes = run_study(
-            self.starts,
-            self._new_controller,
-            self.settings,
-            on_progress=on_progress,
-            chunk=self._chunk,
-        )
-        last = np.abs(outcomes.x_last) * 1e3
-        return Results(
-            {
-                "runs": len(self.starts),
-                **figures(outcomes),
-                "missed_runs": int(np.sum(~outcomes.converged_at_end)),
-            },
-            {
-                **_columns_of_starts(self.starts),
-                "r1_final_mm": outcomes.x_end * 1e3,
-                "rms_last_20_mm": np.sqrt(np.mean(last**2, axis=1)),
-                "max_last_20_mm": np.max(last, axis=1),
-                "settle_mm": outcomes.settled * 1e3,
-                "rotation_deg": np.rad2deg(outcomes.rotation),
-                "diverged": outcomes.diverged.astype(float),
-            },
-        )
-
-
-class PointRuns:
-    """A study of needles that are steered to a point each.
-
-    Parameters
-    ----------
-    options : MonteCarloOptions
-        What is asked for.
-    """
-
-    def __init__(self, options: MonteCarloOptions) -> None:
-        self.settings = _settings(options)
-        self.starts = _starts(options, options.targets)
-        places = random_targets(self.starts, CURVATURE, options.seed)
-        self._targets = MovingTargets(
-            places, options.target_drift, options.target_breath, options.seed
-        )
-        self._new_controller = point_controller_factory(
-            options.controller, options.claimed_bound, sigma_scale=options.sigma_scale
-        )
-
-    def compile(self) -> None:
-        """Run two needles; see `Runs.compile`."""
-        ahead = MovingTargets(np.tile([0.0, 0.0, 0.01], (2, 1)))
-        run_point_study(np.zeros((2, 3)), ahead, self._new_controller, self.settings)
-
-    def run(self, on_progress: Callable[[int], None]) -> Results:
-        """Run the study; see `Runs.run`."""
-        outcomes = run_point_study(
-            self.starts,
-            self._targets,
-            self._new_controller,
-            self.settings,
-            on_progress=on_progress,
-        )
-        x, y, z = self._targets.places.T * 1e3
-        return Results(
-            {
-                "runs": len(self.starts),
-                **point_figures(outcomes),
-                "missed_runs": int(np.sum(~outcomes.reached)),
-            },
-            {
-                **_columns_of_starts(self.starts),
-                "target_x_mm": x,
-                "target_y_mm": y,
-                "target_z_mm": z,
-                "error_mm": outcomes.error * 1e3,
-                "rotation_deg": np.rad2deg(outcomes.rotation),
-            },
-        )
-
-
-def _settings(options: MonteCarloOptions) -> StudySettings:
+def settings_of(options: MonteCarloOptions) -> StudySettings:
+    """Return what the needles of a study have in common."""
     return StudySettings(CURVATURE, options.depth, STEP_LENGTH, options.disturbances, options.seed)
 
 
-def _starts(options: MonteCarloOptions, count: int) -> FloatArray:
+def starts_of(options: MonteCarloOptions) -> FloatArray:
+    """Return the starts of a study's needles, (N, 3), x [m], pitch, roll [rad]."""
+    count = options.targets or POINTS**3 * options.draws
     if options.initial is not None:
         return np.tile(np.asarray(options.initial), (count, 1))
     grid = "random" if options.targets else options.grid
@@ -168,9 +55,77 @@ def _starts(options: MonteCarloOptions, count: int) -> FloatArray:
     return GRIDS[grid](options.bounds, draws, options.seed)[:count]
 
 
-def _columns_of_starts(starts: FloatArray) -> dict[str, FloatArray]:
-    return {
-        "x_mm": starts[:, 0] * 1e3,
-        "pitch_deg": np.rad2deg(starts[:, 1]),
-        "roll_deg": np.rad2deg(starts[:, 2]),
-    }
+def run(
+    options: MonteCarloOptions,
+    starts: FloatArray,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> Results:
+    """Steer needles from their starts to the plane x = 0, or to a point each.
+
+    Parameters
+    ----------
+    options : MonteCarloOptions
+        What is asked for.
+    starts : ndarray, shape (N, 3)
+        Those of `starts_of`, or some of them.
+    on_progress : callable
+        Told after each step how many needles have made one.
+    """
+    steer = _to_points if options.targets else _to_plane
+    results = steer(options, starts, on_progress)
+    x, pitch, roll = starts.T
+    columns = {"x_mm": x * 1e3, "pitch_deg": np.rad2deg(pitch), "roll_deg": np.rad2deg(roll)}
+    return Results({"runs": len(starts), **results.figures}, {**columns, **results.columns})
+
+
+def _to_plane(
+    options: MonteCarloOptions, starts: FloatArray, on_progress: Callable[[int], None]
+) -> Results:
+    flips = np.linspace(0.0, options.depth, options.flips + 2)[1:-1].tolist()
+    outcomes = run_study(
+        starts,
+        controller_factory(
+            options.controller, options.claimed_bound, flips, sigma_scale=options.sigma_scale
+        ),
+        settings_of(options),
+        on_progress=on_progress,
+        chunk=needles_at_a_time(options.controller),
+    )
+    last = np.abs(outcomes.x_last) * 1e3
+    return Results(
+        {**figures(outcomes), "missed_runs": int(np.sum(~outcomes.converged_at_end))},
+        {
+            "r1_final_mm": outcomes.x_end * 1e3,
+            "rms_last_20_mm": np.sqrt(np.mean(last**2, axis=1)),
+            "max_last_20_mm": np.max(last, axis=1),
+            "settle_mm": outcomes.settled * 1e3,
+            "rotation_deg": np.rad2deg(outcomes.rotation),
+            "diverged": outcomes.diverged.astype(float),
+        },
+    )
+
+
+def _to_points(
+    options: MonteCarloOptions, starts: FloatArray, on_progress: Callable[[int], None]
+) -> Results:
+    places = random_targets(starts, CURVATURE, options.seed)
+    outcomes = run_point_study(
+        starts,
+        MovingTargets(places, options.target_drift, options.target_breath, options.seed),
+        point_controller_factory(
+            options.controller, options.claimed_bound, sigma_scale=options.sigma_scale
+        ),
+        settings_of(options),
+        on_progress=on_progress,
+    )
+    x, y, z = places.T * 1e3
+    return Results(
+        {**point_figures(outcomes), "missed_runs": int(np.sum(~outcomes.reached))},
+        {
+            "target_x_mm": x,
+            "target_y_mm": y,
+            "target_z_mm": z,
+            "error_mm": outcomes.error * 1e3,
+            "rotation_deg": np.rad2deg(outcomes.rotation),
+        },
+    )

@@ -1,6 +1,6 @@
 """The controllers a study can ask for: needle_controller's own estimators and laws, unchanged.
 
-This is the only module of needle_sim that knows the controller under test.
+needle_sim, whose studies these are for, does not know the controller under test.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.point_targets import INSERTION_SPEED
 from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
+
+TimedLaw = Callable[[Estimate, FloatArray, FloatArray], SteeringCommand]
 
 SLIDING_MODE = "sliding_mode"
 """Name of the reference law for points."""
@@ -102,23 +104,25 @@ class SteeredNeedles:
 
 
 class NeedlesToPoints(SteeredNeedles):
-    """An estimator, and the law for points: what `point_study.PointController` describes.
+    """An estimator, and a law for points: what `point_study.PointController` describes.
 
     Parameters
     ----------
-    estimator : Estimator
-        See `SteeredNeedles`, likewise `covariance`.
-    settings : SteeringSettings
-        Of the law.
-    covariance : ndarray, shape (3, 3), optional
-        See above.
+    estimator, covariance :
+        See `SteeredNeedles`.
+    new_law : callable
+        Returns the law for targets whose motion is told to a `TargetMotion`: it takes an estimate,
+        each needle's time [s] and its inserted length [m].
     """
 
     def __init__(
-        self, estimator: Estimator, settings: SteeringSettings, covariance: Array | None = None
+        self,
+        estimator: Estimator,
+        new_law: Callable[[TargetMotion], TimedLaw],
+        covariance: Array | None = None,
     ) -> None:
         self._motion = TargetMotion()
-        self._points = PointSteering(settings, self._motion)
+        self._point_law = new_law(self._motion)
         self._left: FloatArray = np.full((), np.nan)
         super().__init__(estimator, self._command, covariance)
 
@@ -131,34 +135,30 @@ class NeedlesToPoints(SteeredNeedles):
         return self._left
 
     def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
-        time = self._insertion / INSERTION_SPEED
-        command = self._points.command(estimate, time, self._insertion)
+        command = self._point_law(estimate, self._insertion / INSERTION_SPEED, self._insertion)
         assert command.insertion_left is not None
         self._left = command.insertion_left
         return command
 
 
-class SlidingNeedles(NeedlesToPoints):
-    """The same estimator with the published reference law; see `sliding_mode`.
+def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
+    """Return the published reference law, which goes to where the targets are; see `sliding_mode`.
 
     Parameters
     ----------
-    estimator, settings, covariance :
-        See `NeedlesToPoints`.
+    motion : TargetMotion
+        Of the targets.
+    largest_rate : float
+        Rotation per inserted length [rad/m].
     """
 
-    def __init__(
-        self, estimator: Estimator, settings: SteeringSettings, covariance: Array | None = None
-    ) -> None:
-        super().__init__(estimator, settings, covariance)
-        self._largest_rate = settings.max_rotation_per_length
-
-    def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
-        off = (self._motion.last - estimate.position)[..., None]
+    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
+        off = (motion.last - estimate.position)[..., None]
         target = (estimate.rotation.swapaxes(-1, -2) @ off)[..., 0]
-        rate = sliding_mode_rate(target, self._largest_rate)
-        self._left = target[..., 2]
-        return SteeringCommand(np.zeros_like(rate), rate, self._left)
+        rate = sliding_mode_rate(target, largest_rate)
+        return SteeringCommand(np.zeros_like(rate), rate, target[..., 2])
+
+    return command
 
 
 def needles_at_a_time(name: str) -> int:
@@ -192,8 +192,7 @@ def controller_factory(
     UserError
         If there is no such controller, or it cannot flip.
     """
-    settings = _settings(name, claimed, sigma_scale, flip_depths)
-    covariance = _told_covariance(settings, sigma_scale)
+    settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths)
     return lambda: SteeredNeedles(*make_controller(settings, np.eye(3)), covariance)
 
 
@@ -206,19 +205,24 @@ def point_controller_factory(
     whole pose is refused, and `SLIDING_MODE` has the estimator of `best`.
     """
     is_sliding = name == SLIDING_MODE
-    kind = SlidingNeedles if is_sliding else NeedlesToPoints
-    settings = _settings("best" if is_sliding else name, claimed, sigma_scale)
+    preset = "best" if is_sliding else name
+    settings, covariance = _what_is_told(preset, claimed, sigma_scale, ())
     settings.check_steers_to_points()
-    covariance = _told_covariance(settings, sigma_scale)
-    return lambda: kind(make_controller(settings, np.eye(3))[0], settings, covariance)
+
+    def new_law(motion: TargetMotion) -> TimedLaw:
+        if is_sliding:
+            return sliding_law(motion, settings.max_rotation_per_length)
+        return PointSteering(settings, motion).command
+
+    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3))[0], new_law, covariance)
 
 
-def _settings(
-    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float] = ()
-) -> SteeringSettings:
+def _what_is_told(
+    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float]
+) -> tuple[SteeringSettings, Array | None]:
     if name not in PRESETS:
         raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
-    return SteeringSettings(
+    settings = SteeringSettings(
         preset=name,
         tip_covariance="configured" if sigma_scale == 1.0 else "from_tip_pose",
         tip_noise="bounded",
@@ -227,9 +231,6 @@ def _settings(
         depth=_DEEPEST,
         flip_depths=tuple(flip_depths),
     )
-
-
-def _told_covariance(settings: SteeringSettings, sigma_scale: float) -> Array | None:
     if sigma_scale == 1.0:
-        return None
-    return np.asarray(np.eye(3) * (settings.measurement_std / sigma_scale) ** 2)
+        return settings, None
+    return settings, np.asarray(np.eye(3) * (settings.measurement_std / sigma_scale) ** 2)
