@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
 from tqdm import tqdm
@@ -16,11 +17,11 @@ from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_
 from needle_common.commands.options import CommandParser, number, output_file, whole_number
 from needle_common.errors import UserError
 from needle_sim.camera.image_folder import ImageFolder
-from needle_sim.camera.insertions import CURVATURE, render_insertion
+from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_insertion
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario
 from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, draw_appearance
-from needle_sim.path_traced.insertion import trace_insertion
+from needle_sim.path_traced.insertion import TracedPair, trace_insertion
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.path_traced.truth_columns import TRUTH_COLUMNS, truth_values
 
@@ -81,12 +82,8 @@ def render_images(options: RenderOptions) -> int:
         calibration = shared / "config" / "calibration.yaml"
     rig = load_stereo_rig(calibration)
     look = options.look
-    if isinstance(look, Scenario):
-        done = _quick(rig, look, options, calibration)
-    else:
-        done = _path_traced(rig, look, options, calibration)
     for _ in tqdm(
-        done,
+        _write(rig, look, options, calibration),
         total=options.frames,
         unit="pair",
         delay=1.0,
@@ -159,50 +156,26 @@ def _look(
     return look
 
 
-def _quick(
-    rig: StereoRig, scenario: Scenario, options: RenderOptions, calibration: Path
+def _write(
+    rig: StereoRig, look: Scenario | Appearance, options: RenderOptions, calibration: Path
 ) -> Iterator[None]:
-    """Write one quickly rendered pair after the other."""
-    pairs = render_insertion(
-        rig,
-        scenario,
-        seed=options.seed,
-        frames=options.frames,
-        depth=options.depth,
-        step=options.step,
-        curvature=options.curvature,
-        begin=options.begin,
-    )
-    with ImageFolder(options.output, calibration) as folder:
+    """Write one pair after the other."""
+    way: dict[str, Any] = {
+        name: getattr(options, name) for name in ("frames", "depth", "step", "curvature", "begin")
+    }
+    columns: tuple[str, ...] = ()
+    pairs: Iterator[RenderedPair | TracedPair]
+    if isinstance(look, Scenario):
+        pairs = render_insertion(rig, look, seed=options.seed, **way)
+    else:
+        columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **way)
+    with ImageFolder(options.output, calibration, columns) as folder:
         for pair in pairs:
-            folder.write(pair.number, pair.images, pair.insertion, pair.truth, pair.share_seen)
-            yield
-
-
-def _path_traced(
-    rig: StereoRig, look: Appearance, options: RenderOptions, calibration: Path
-) -> Iterator[None]:
-    """Write one path-traced pair after the other."""
-    pairs = trace_insertion(
-        load_mitsuba(),
-        rig,
-        look,
-        frames=options.frames,
-        depth=options.depth,
-        step=options.step,
-        curvature=options.curvature,
-        begin=options.begin,
-    )
-    with ImageFolder(options.output, calibration, TRUTH_COLUMNS) as folder:
-        for pair in pairs:
-            folder.write(
-                pair.number,
-                pair.images,
-                pair.insertion,
-                pair.truth,
-                pair.share_seen,
-                more=truth_values(look, pair),
-            )
+            more: Sequence[float | str] = ()
+            if isinstance(look, Appearance) and isinstance(pair, TracedPair):
+                more = truth_values(look, pair)
+            seen = pair.share_seen
+            folder.write(pair.number, pair.images, pair.insertion, pair.truth, seen, more=more)
             yield
 
 
