@@ -10,8 +10,7 @@ from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link.can_link import LINKS, LinkSettings
-from needle_device_driver.ros.limit_parameters import limit_parameter, limits_of
-from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.limits import SafetyLimits, limit_parameter
 
 # Beyond the supervisor's own limits, a drive's limits leave room for its following error.
 _LIMIT_MARGIN = 2.0
@@ -61,13 +60,7 @@ class _RigParameters:
         0.05,
         10.0,
     )
-    reply_age_limit: float = fixed_parameter(
-        SafetyLimits.reply_age_limit,
-        "s",
-        "A drive silent for longer has failed; over 0.5 s in lock step only.",
-        0.05,
-        10.0,
-    )
+    reply_age_limit: float = limit_parameter("reply_age_limit")
     hold_timeout: float = limit_parameter("hold_timeout")
     tip_age_limit: float = limit_parameter("tip_age_limit")
     max_depth: float = limit_parameter("max_depth")
@@ -118,7 +111,7 @@ class _RigParameters:
     @property
     def limits(self) -> SafetyLimits:
         """The motion supervisor's limits."""
-        return limits_of(self)
+        return SafetyLimits.of(self)
 
     def drive(self, axis: str) -> DriveSettings:
         """Return the settings of the `insertion` or `rotation` drive."""
@@ -148,7 +141,6 @@ def _axis(
     acceleration: float,
     quick_stop: float,
     homing_method: int,
-    following_error: float,
     tolerance: float,
 ) -> list[tuple[str, type, Any]]:
     ramp = f"{unit}/s^2"
@@ -163,9 +155,7 @@ def _axis(
         "homing_method": fixed_parameter(
             homing_method, "-", "CiA 402 method: 17, 18 limit switch; 37 where it stands.", 1, 37
         ),
-        "following_error": fixed_parameter(
-            following_error, unit, "Largest distance from the set-point.", 1e-6, 10.0
-        ),
+        "following_error": limit_parameter(f"{axis}_following_error"),
         "following_error_time": fixed_parameter(
             0.05, "s", "How long the drive itself lets that be exceeded.", 0.001, 10.0
         ),
@@ -192,7 +182,6 @@ DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
             acceleration=0.05,
             quick_stop=0.5,
             homing_method=17,
-            following_error=SafetyLimits.insertion_following_error,
             tolerance=5e-6,
         ),
         # An encoder of 16384 lines, four counts a line, on the needle's own shaft.
@@ -204,7 +193,6 @@ DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
             acceleration=20.0,
             quick_stop=100.0,
             homing_method=37,
-            following_error=SafetyLimits.rotation_following_error,
             tolerance=1e-3,
         ),
     ],

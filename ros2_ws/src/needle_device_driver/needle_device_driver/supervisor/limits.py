@@ -1,11 +1,13 @@
-"""The bounds of the safety rules, each once."""
+"""The bounds of the safety rules, each once: as limits, and as parameters of a node."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 from needle_common.settings.bounds import ABOVE_0, check_bounds
+from needle_common.settings.parameter_fields import fixed_parameter, specs
 
 # No configuration reaches beyond these: they are properties of the rig, not of a run.
 HARD_SPEED_CAP = 0.005
@@ -13,6 +15,9 @@ HARD_STEP_LENGTH_CAP = 0.005
 HARD_HOLD_TIMEOUT_CAP = 0.5
 # The longest step there is, at a hundredth of a millimetre a second, and some more [s].
 HARD_STEP_TIME_CAP = 600.0
+_SMALLEST = 1e-5
+_FOLLOWING = "Largest distance from the set-point."
+_TOLERANCE = "An axis so close has arrived."
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,23 +58,51 @@ class SafetyLimits:
         How long an axis may take for that after its last set-point [s].
     """
 
-    max_depth: float = 0.2
-    max_step_length: float = 0.002
-    max_speed: float = HARD_SPEED_CAP
-    max_rotation_step: float = 1.2
-    max_rotation_rate: float = math.pi
-    max_turns: float = 10.0
-    hold_timeout: float = 0.25
-    tip_age_limit: float = 2.0
-    reply_age_limit: float = 0.1
-    retraction_speed: float = 0.002
-    homing_speed: float = 0.002
-    homing_rotation_rate: float = 1.0
-    insertion_following_error: float = 0.0005
-    rotation_following_error: float = 0.1
-    insertion_tolerance: float = 1e-6
-    rotation_tolerance: float = 1e-4
-    settling_time: float = 1.0
+    max_depth: float = fixed_parameter(0.2, "m", "Deepest insertion.", 0.001, 0.5)
+    max_step_length: float = fixed_parameter(
+        0.002, "m", "Longest insertion of one command.", _SMALLEST, HARD_STEP_LENGTH_CAP
+    )
+    max_speed: float = fixed_parameter(
+        HARD_SPEED_CAP, "m/s", "Fastest insertion of a command.", _SMALLEST, HARD_SPEED_CAP
+    )
+    max_rotation_step: float = fixed_parameter(
+        1.2, "rad", "Largest rotation of one command.", 0.01, 2 * math.pi
+    )
+    max_rotation_rate: float = fixed_parameter(
+        math.pi, "rad/s", "Fastest rotation of a command.", 0.01, 20.0
+    )
+    max_turns: float = fixed_parameter(
+        10.0, "turns", "Largest rotation either way from home.", 0.1, 1000.0
+    )
+    hold_timeout: float = fixed_parameter(
+        0.25,
+        "s",
+        "A hold message counts so long after its arrival, steady clock.",
+        0.05,
+        HARD_HOLD_TIMEOUT_CAP,
+    )
+    tip_age_limit: float = fixed_parameter(
+        2.0, "s", "A command is refused if the tip behind it is older, steady clock.", 0.05, 60.0
+    )
+    reply_age_limit: float = fixed_parameter(
+        0.1, "s", "A drive silent for longer has failed; over 0.5 s in lock step only.", 0.05, 10.0
+    )
+    retraction_speed: float = fixed_parameter(
+        0.002, "m/s", "Speed at which the needle is drawn out.", _SMALLEST, HARD_SPEED_CAP
+    )
+    homing_speed: float = fixed_parameter(
+        0.002, "m/s", "Towards the insertion switch.", _SMALLEST, HARD_SPEED_CAP
+    )
+    homing_rotation_rate: float = fixed_parameter(
+        1.0, "rad/s", "Towards the rotation switch.", 0.01, 20.0
+    )
+    insertion_following_error: float = fixed_parameter(0.0005, "m", _FOLLOWING, 1e-6, 10.0)
+    rotation_following_error: float = fixed_parameter(0.1, "rad", _FOLLOWING, 1e-6, 10.0)
+    insertion_tolerance: float = fixed_parameter(1e-6, "m", _TOLERANCE, 1e-7, 1.0)
+    rotation_tolerance: float = fixed_parameter(1e-4, "rad", _TOLERANCE, 1e-7, 1.0)
+    settling_time: float = fixed_parameter(
+        1.0, "s", "To reach the target after the last set-point.", 0.1, 10.0
+    )
 
     def __post_init__(self) -> None:
         """Refuse bounds that bound nothing.
@@ -77,18 +110,23 @@ class SafetyLimits:
         Raises
         ------
         UserError
-            A limit that is not finite, not positive, or above its hard cap.
+            A limit that is not finite, not positive, or above the largest of its parameter.
         """
-        caps = {
-            "max_step_length": HARD_STEP_LENGTH_CAP,
-            "max_speed": HARD_SPEED_CAP,
-            "retraction_speed": HARD_SPEED_CAP,
-            "homing_speed": HARD_SPEED_CAP,
-            "hold_timeout": HARD_HOLD_TIMEOUT_CAP,
-        }
-        for field in dataclasses.fields(self):
-            value, upper = getattr(self, field.name), caps.get(field.name, math.inf)
-            check_bounds(field.name, value, ABOVE_0, upper, "SI")
+        for name, spec, _ in specs(self):
+            check_bounds(name, getattr(self, name), ABOVE_0, spec.upper, spec.unit)
+
+    @classmethod
+    def of(cls, parameters: Any) -> SafetyLimits:
+        """Return the limits that a parameter dataclass has; the others are the defaults.
+
+        Parameters
+        ----------
+        parameters : dataclass instance
+            Its fields that are called like limits are limits.
+        """
+        own = {field.name for field in dataclasses.fields(parameters)}
+        names = [field.name for field in dataclasses.fields(cls) if field.name in own]
+        return cls(**{name: getattr(parameters, name) for name in names})
 
     @property
     def max_rotation(self) -> float:
@@ -101,3 +139,9 @@ class SafetyLimits:
         return 1.5 * max(
             self.max_depth / self.homing_speed, self.max_rotation / self.homing_rotation_rate
         )
+
+
+def limit_parameter(name: str) -> Any:
+    """Declare the field `name` of `SafetyLimits` as a field of a parameter dataclass."""
+    (field,) = (field for field in dataclasses.fields(SafetyLimits) if field.name == name)
+    return dataclasses.field(default=field.default, metadata=field.metadata)

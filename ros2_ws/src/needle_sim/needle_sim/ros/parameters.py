@@ -7,8 +7,7 @@ import math
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
-from needle_device_driver.ros.limit_parameters import limit_parameter, limits_of
-from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.limits import SafetyLimits, limit_parameter
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS
 
 LEVELS = ("tip", "camera", "drive")
@@ -111,4 +110,4 @@ class SimRigParameters:
     @property
     def limits(self) -> SafetyLimits:
         """The motion supervisor's limits."""
-        return limits_of(self)
+        return SafetyLimits.of(self)
