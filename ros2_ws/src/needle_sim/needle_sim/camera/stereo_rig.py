@@ -11,10 +11,12 @@ import numpy as np
 import yaml
 
 from needle_common.errors import UserError
+from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 
 _LARGEST_SIDE_PX = 20_000
+_INDICES = (1.0, 3.0)  # refractive
 _HALF_HEIGHT = 0.0175  # of a phantom that no window ends above [m]
 _FACING = 0.75  # of a window's normal: the part along the axis that it faces
 _LEAST_ACROSS = 0.3  # of a window's normal: the part across the needle
@@ -109,148 +111,140 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
         reason = " ".join(str(error).split())
         raise UserError(f"calibration {path} is no YAML: {reason}") from error
     try:
-        return _stereo_rig(document)
-    except _BadEntryError as error:
+        return _stereo_rig(_Entries(document))
+    except UserError as error:
         raise UserError(f"calibration {path}: {error}") from error
 
 
-class _BadEntryError(Exception):
-    """A key of the file and what is wrong with it."""
+class _Entries:
+    """Entries of the file, or of a part of it, which complain by the name that they have there."""
+
+    def __init__(self, value: object, name: str = "") -> None:
+        if not isinstance(value, Mapping):
+            raise UserError(f"{name or 'the file'} has no keys")
+        self._values = value
+        self._prefix = f"{name}." if name else ""
+
+    def __contains__(self, key: str) -> bool:
+        return key in self._values
+
+    def name(self, key: str) -> str:
+        return self._prefix + key
+
+    def get(self, key: str) -> object:
+        if key not in self._values:
+            raise UserError(f"{self.name(key)} is missing")
+        return self._values[key]
+
+    def part(self, key: str) -> _Entries:
+        return _Entries(self.get(key), self.name(key))
+
+    def parts(self, key: str) -> list[_Entries]:
+        values, name = self.get(key), self.name(key)
+        if not isinstance(values, list):
+            raise UserError(f"{name} = {values!r} is no list")
+        return [_Entries(value, f"{name}[{number}]") for number, value in enumerate(values)]
+
+    def number(
+        self, key: str, lower: float = -math.inf, upper: float = math.inf, unit: str = "-"
+    ) -> float:
+        value = _number(self.get(key), self.name(key))
+        check_bounds(self.name(key), value, lower, upper, unit)
+        return value
+
+    def pixels(self, key: str) -> int:
+        value = self.number(key, 1, _LARGEST_SIDE_PX, "px")
+        if not value.is_integer():
+            raise UserError(f"{self.name(key)} = {value:g} px is no whole number")
+        return int(value)
+
+    def numbers(self, key: str, count: int) -> FloatArray:
+        values, name = self.get(key), self.name(key)
+        if not isinstance(values, list) or len(values) != count:
+            raise UserError(f"{name} = {values!r} is no list of {count} numbers")
+        return np.array([_number(value, name) for value in values])
+
+    def matrix(self, key: str, rows: int, columns: int) -> FloatArray:
+        own, name = self.part(key), self.name(key)
+        seen = own.get("rows"), own.get("cols")
+        if seen != (rows, columns):
+            raise UserError(f"{name} is {seen[0]!r} x {seen[1]!r}, not {rows} x {columns}")
+        return own.numbers("data", rows * columns).reshape(rows, columns)
 
 
-def _stereo_rig(document: object) -> StereoRig:
-    top = _mapping(document, "the file")
-    cameras = {}
+def _number(value: object, name: str) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise UserError(f"{name} = {value!r} is no finite number")
+    return float(value)
+
+
+def _stereo_rig(top: _Entries) -> StereoRig:
+    cameras = []
     for side in ("left", "right"):
-        values = _mapping(_entry(top, side, ""), side)
-        camera = _camera(values, side, _window_of(top, values, side))
+        own = top.part(side)
+        camera = _camera(own, _window_of(top, own))
         before = float(camera.window.height(camera.centre)) - camera.window.outer
         if before <= 0.0:
-            raise _BadEntryError(
+            raise UserError(
                 f"{side}.T_optical_rig puts the camera {-before:g} m behind the window's outer "
                 "face, not above the surface"
             )
-        cameras[side] = camera
-    return StereoRig(cameras["left"], cameras["right"])
+        cameras.append(camera)
+    return StereoRig(*cameras)
 
 
-def _window_of(
-    top: Mapping[object, object], values: Mapping[object, object], side: str
-) -> SimulatedWindow:
+def _window_of(top: _Entries, own: _Entries) -> SimulatedWindow:
     """Return what a camera looks through: its own window, or the phantom's surface."""
-    if ("phantom" in top) == ("window" in values):
+    if ("phantom" in top) == ("window" in own):
         what = "beside phantom" if "phantom" in top else "is missing, and so phantom is missing"
-        raise _BadEntryError(
-            f"{side}.window {what}: say either phantom, the surface of both, or a window for each"
+        raise UserError(
+            f"{own.name('window')} {what}: say either phantom, the surface of both, or a window "
+            "for each"
         )
     if "phantom" in top:
-        phantom = _mapping(top["phantom"], "phantom")
-        height = _number(_entry(phantom, "surface_height", "phantom."), "phantom.surface_height")
-        index = _refractive_index(phantom, "refractive_index", "phantom.")
+        phantom = top.part("phantom")
+        height = phantom.number("surface_height")
+        index = phantom.number("refractive_index", *_INDICES)
         return SimulatedWindow(np.array([1.0, 0.0, 0.0]), height, (), (index,))
-    prefix = f"{side}.window."
-    window = _mapping(values["window"], f"{side}.window")
-    point = _numbers(_entry(window, "point", prefix), prefix + "point", 3)
-    normal = _numbers(_entry(window, "normal", prefix), prefix + "normal", 3)
+    window = own.part("window")
+    point, normal = window.numbers("point", 3), window.numbers("normal", 3)
     length = float(np.linalg.norm(normal))
     if abs(length - 1.0) > 0.01:
-        raise _BadEntryError(f"{prefix}normal has length {length:g}, not 1")
+        raise UserError(f"{window.name('normal')} has length {length:g}, not 1")
     normal = normal / length
     if np.linalg.norm(normal[:2]) < _LEAST_ACROSS:
-        raise _BadEntryError(f"{prefix}normal = {normal.tolist()} lies along the needle")
-    layers = _entry(window, "layers", prefix)
-    if not isinstance(layers, list):
-        raise _BadEntryError(f"{prefix}layers = {layers!r} is no list")
-    thicknesses, indices = [], []
-    for number, layer in enumerate(layers):
-        name = f"{prefix}layers[{number}]"
-        values = _mapping(layer, name)
-        thickness = _number(_entry(values, "thickness", f"{name}."), f"{name}.thickness")
-        if thickness <= 0.0:
-            raise _BadEntryError(f"{name}.thickness = {thickness:g} m is not above 0")
-        thicknesses.append(thickness)
-        indices.append(_refractive_index(values, "refractive_index", f"{name}."))
-    inside = _refractive_index(window, "inside", prefix)
-    return SimulatedWindow(normal, float(normal @ point), tuple(thicknesses), (*indices, inside))
+        raise UserError(f"{window.name('normal')} = {normal.tolist()} lies along the needle")
+    layers = window.parts("layers")
+    thicknesses = tuple(layer.number("thickness", ABOVE_0, unit="m") for layer in layers)
+    indices = [layer.number("refractive_index", *_INDICES) for layer in layers]
+    inside = window.number("inside", *_INDICES)
+    return SimulatedWindow(normal, float(normal @ point), thicknesses, (*indices, inside))
 
 
-def _refractive_index(values: Mapping[object, object], key: str, prefix: str) -> float:
-    index = _number(_entry(values, key, prefix), prefix + key)
-    if not 1.0 <= index <= 3.0:
-        raise _BadEntryError(f"{prefix}{key} = {index:g} is outside [1, 3]")
-    return index
-
-
-def _camera(values: Mapping[object, object], side: str, window: SimulatedWindow) -> SimulatedCamera:
-    prefix = f"{side}."
-    width, height = (
-        _number(_entry(values, key, prefix), prefix + key)
-        for key in ("image_width", "image_height")
-    )
-    for key, size in (("image_width", width), ("image_height", height)):
-        if not (size.is_integer() and 1 <= size <= _LARGEST_SIDE_PX):
-            raise _BadEntryError(
-                f"{prefix}{key} = {size:g} px is outside [1, {_LARGEST_SIDE_PX}] px"
-            )
-    matrix = _matrix(_entry(values, "camera_matrix", prefix), prefix + "camera_matrix", (3, 3))
+def _camera(own: _Entries, window: SimulatedWindow) -> SimulatedCamera:
+    width, height = own.pixels("image_width"), own.pixels("image_height")
+    matrix = own.matrix("camera_matrix", 3, 3)
     if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0) or np.any(
         matrix[[1, 2, 2, 2], [0, 0, 1, 2]] != (0.0, 0.0, 0.0, 1.0)
     ):
-        raise _BadEntryError(
-            f"{prefix}camera_matrix = {matrix.ravel().tolist()} is no pinhole matrix"
-        )
-    model = _entry(values, "distortion_model", prefix)
+        name = own.name("camera_matrix")
+        raise UserError(f"{name} = {matrix.ravel().tolist()} is no pinhole matrix")
+    model = own.get("distortion_model")
     if model != "plumb_bob":
-        raise _BadEntryError(f"{prefix}distortion_model = {model!r} is not 'plumb_bob'")
-    key = "distortion_coefficients"
-    distortion = _matrix(_entry(values, key, prefix), prefix + key, (1, 5))[0]
-    transform = _mapping(_entry(values, "T_optical_rig", prefix), prefix + "T_optical_rig")
-    prefix += "T_optical_rig."
+        raise UserError(f"{own.name('distortion_model')} = {model!r} is not 'plumb_bob'")
+    distortion = own.matrix("distortion_coefficients", 1, 5)[0]
+    transform = own.part("T_optical_rig")
     pose = np.eye(4)
-    pose[:3, 3] = _numbers(_entry(transform, "translation", prefix), prefix + "translation", 3)
-    quaternion = _numbers(_entry(transform, "rotation", prefix), prefix + "rotation", 4)
-    pose[:3, :3] = _rotation_matrix(quaternion, prefix + "rotation")
-    return SimulatedCamera(int(width), int(height), matrix, distortion, pose, window)
+    pose[:3, 3] = transform.numbers("translation", 3)
+    pose[:3, :3] = _rotation_matrix(transform.numbers("rotation", 4), transform.name("rotation"))
+    return SimulatedCamera(width, height, matrix, distortion, pose, window)
 
 
 def _rotation_matrix(quaternion: FloatArray, name: str) -> FloatArray:
     """Return the matrix of a unit quaternion x, y, z, w."""
     norm = float(np.linalg.norm(quaternion))
     if abs(norm - 1.0) > 1e-3:
-        raise _BadEntryError(f"{name} has norm {norm:g}, not 1")
+        raise UserError(f"{name} has norm {norm:g}, not 1")
     vector, scalar = quaternion[:3] / norm, quaternion[3] / norm
     cross = np.cross(np.eye(3), vector)
     return np.asarray(np.eye(3) + 2.0 * (scalar * cross + cross @ cross))
-
-
-def _mapping(value: object, name: str) -> Mapping[object, object]:
-    if not isinstance(value, Mapping):
-        raise _BadEntryError(f"{name} has no keys")
-    return value
-
-
-def _entry(values: Mapping[object, object], key: str, prefix: str) -> object:
-    if key not in values:
-        raise _BadEntryError(f"{prefix}{key} is missing")
-    return values[key]
-
-
-def _number(value: object, name: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise _BadEntryError(f"{name} = {value!r} is no finite number")
-    return float(value)
-
-
-def _numbers(value: object, name: str, count: int) -> FloatArray:
-    if not isinstance(value, list) or len(value) != count:
-        raise _BadEntryError(f"{name} = {value!r} is no list of {count} numbers")
-    return np.array([_number(item, name) for item in value])
-
-
-def _matrix(value: object, name: str, shape: tuple[int, int]) -> FloatArray:
-    values = _mapping(value, name)
-    seen = (_entry(values, "rows", f"{name}."), _entry(values, "cols", f"{name}."))
-    if seen != shape:
-        raise _BadEntryError(f"{name} is {seen[0]!r} x {seen[1]!r}, not {shape[0]} x {shape[1]}")
-    data = _numbers(_entry(values, "data", f"{name}."), f"{name}.data", shape[0] * shape[1])
-    return data.reshape(shape)
