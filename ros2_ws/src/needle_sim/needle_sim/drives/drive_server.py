@@ -4,31 +4,10 @@ from __future__ import annotations
 
 import select
 import time
-from typing import Protocol
 
-from needle_sim.bus.can_frame import CanFrame
+from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.fault_commands import PlugOrder, obey
-
-
-class Port(Protocol):
-    """A way for a computer to the bus."""
-
-    @property
-    def filenos(self) -> list[int]:
-        """File descriptors to wait for input at."""
-
-    def plug_in(self) -> None:
-        """Appear."""
-
-    def unplug(self) -> None:
-        """Disappear."""
-
-    def receive(self) -> tuple[CanFrame, ...]:
-        """Return the frames that the computer has sent; waits for nothing."""
-
-    def send(self, frames: list[CanFrame]) -> None:
-        """Hand frames from the bus to the computer."""
 
 
 class DriveServer:
@@ -38,11 +17,11 @@ class DriveServer:
     ----------
     bus : EmulatedBus
         The drives.
-    port : Port
+    port : PtyPort
         Where the computer is.
     """
 
-    def __init__(self, bus: EmulatedBus, port: Port) -> None:
+    def __init__(self, bus: EmulatedBus, port: PtyPort) -> None:
         self.bus = bus
         self._port = port
         # Drives that booted before anybody could hear it are there at once.

@@ -23,8 +23,7 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_sim.bus.pty_port import PtyPort
-from needle_sim.bus.socketcand_port import SocketcandPort
-from needle_sim.drives.drive_server import DriveServer, Port
+from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.drives.fault_commands import COMMANDS
 from needle_sim.drives.power_state import PowerState
@@ -34,9 +33,9 @@ from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 HELP = f"""\
 drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
 
-Whatever drives them reaches the bus as through a serial adapter (slcan) at a pseudo-terminal, or by
-socketcand over TCP. The drives know profile position, homing (methods 17, 18, 35, 37) and cyclic
-synchronous position mode, software limits, following error, emergencies, heartbeats both ways.
+Whatever drives them reaches the bus as through a serial adapter (slcan) at a pseudo-terminal. The
+drives know profile position, homing (methods 17, 18, 35, 37) and cyclic synchronous position mode,
+software limits, following error, emergencies, heartbeats both ways.
 
 By hand, beside a driver:
     ros2 run needle_sim drive_emulator --ros-args -p pty:=/tmp/can
@@ -79,14 +78,8 @@ class DriveEmulatorNode(WholeNode):
         self._diagnostics = DiagnosticsPublisher(self)
         self._tell_health()
         # Last: what fails before leaves no link behind.
-        port: Port
-        if values.socketcand_port:
-            port = SocketcandPort(values.socketcand_port)
-            self.get_logger().info(f"socketcand on localhost:{values.socketcand_port}, bus can0")
-        else:
-            pty = PtyPort(Path(values.pty).expanduser() if values.pty else None)
-            port = pty
-            self.get_logger().info(f"slcan adapter at {pty.path}")
+        port = PtyPort(Path(values.pty).expanduser() if values.pty else None)
+        self.get_logger().info(f"slcan adapter at {port.path}")
         self._server = DriveServer(self._bus, port)
         self._life = LifeSigns(
             self,

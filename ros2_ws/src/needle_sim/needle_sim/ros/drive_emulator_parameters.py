@@ -25,13 +25,6 @@ class DriveEmulatorParameters:
     pty: str = fixed_parameter(
         "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
     )
-    socketcand_port: int = fixed_parameter(
-        0,
-        "-",
-        "Serve TCP clients of socketcand on this port of localhost, in place of a pty.",
-        0,
-        65535,
-    )
     motion_clock: str = fixed_parameter(
         MotionClock.STEADY.value,
         "-",
@@ -83,8 +76,6 @@ class DriveEmulatorParameters:
         check_fields(self)
         if self.insertion_node_id == self.rotation_node_id:
             raise UserError(f"both drives have node id {self.insertion_node_id}")
-        if self.pty and self.socketcand_port:
-            raise UserError("give pty or socketcand_port, not both")
         if self.insertion_start > self.insertion_travel:
             raise UserError(
                 f"insertion_start = {self.insertion_start:g} m is beyond insertion_travel = "
@@ -95,34 +86,19 @@ class DriveEmulatorParameters:
     def insertion(self) -> EmulatedDriveSettings:
         """The insertion axis: a stepper on a screw, with a limit switch at either end."""
         scale = self.insertion_counts_per_unit
-        return EmulatedDriveSettings(
-            "insertion",
-            self.insertion_node_id,
-            STEPPER,
-            MotorSettings(
-                counts_per_unit=scale,
-                max_speed=self.insertion_max_speed * scale,
-                lag=self.insertion_lag,
-                start=self.insertion_start * scale,
-                travel=self.insertion_travel * scale,
-            ),
-            LimitAction(self.limit_action),
-            self.boot_time,
-        )
+        ends = {"start": self.insertion_start * scale, "travel": self.insertion_travel * scale}
+        return self._drive("insertion", STEPPER, **ends)
 
     @property
     def rotation(self) -> EmulatedDriveSettings:
         """The rotation axis: a servo that turns without end."""
-        scale = self.rotation_counts_per_unit
-        return EmulatedDriveSettings(
-            "rotation",
-            self.rotation_node_id,
-            SERVO,
-            MotorSettings(
-                counts_per_unit=scale,
-                max_speed=self.rotation_max_speed * scale,
-                lag=self.rotation_lag,
-            ),
-            LimitAction(self.limit_action),
-            self.boot_time,
+        return self._drive("rotation", SERVO)
+
+    def _drive(self, axis: str, device_type: int, **ends: float) -> EmulatedDriveSettings:
+        scale, node_id, max_speed, lag = (
+            getattr(self, f"{axis}_{name}")
+            for name in ("counts_per_unit", "node_id", "max_speed", "lag")
         )
+        motor = MotorSettings(scale, max_speed * scale, lag, **ends)
+        action = LimitAction(self.limit_action)
+        return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time)

@@ -1,4 +1,4 @@
-"""The drives behind a pseudo-terminal and a socket, reached with python-can and canopen."""
+"""The drives behind a pseudo-terminal, reached with python-can and canopen."""
 
 from __future__ import annotations
 
@@ -15,9 +15,8 @@ import pytest
 from needle_common.errors import UserError
 from needle_sim.bus.can_frame import CanFrame
 from needle_sim.bus.pty_port import PtyPort
-from needle_sim.bus.socketcand_port import SocketcandPort
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.drive_server import DriveServer, Port
+from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.drives.fault_commands import PlugOrder, obey
 
@@ -38,7 +37,7 @@ def make_bus() -> EmulatedBus:
 class Served:
     """A server on a thread of its own."""
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, port: PtyPort) -> None:
         self.server = DriveServer(make_bus(), port)
         self._orders: list[str] = []
         self._end = threading.Event()
@@ -143,41 +142,16 @@ def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(tmp_p
         port.unplug()
 
 
-def test_socketcand_serves_the_same_bus() -> None:
-    port = SocketcandPort(0)
-    served = Served(port)
-    try:
-        network = canopen.Network()
-        network.connect(interface="socketcand", channel="can0", host="127.0.0.1", port=port.port)
-        try:
-            node = network.add_node(ROTATION, None)
-            assert node.sdo.upload(0x1008, 0) == b"Emulated rotation drive"
-        finally:
-            network.disconnect()
-    finally:
-        served.close()
-
-
-def test_socketcand_port_in_use_is_named() -> None:
-    port = SocketcandPort(0)
-    with pytest.raises(UserError, match=str(port.port)):
-        SocketcandPort(port.port)
-    port.unplug()
-
-
-class LatePort:
+class LatePort(PtyPort):
     """Has frames that came while nobody looked."""
 
     def __init__(self, frames: list[CanFrame]) -> None:
-        self.filenos: list[int] = []
         self.sent: list[CanFrame] = []
         self._frames = frames
 
-    def plug_in(self) -> None:
-        """Be there."""
-
-    def unplug(self) -> None:
-        """Be gone."""
+    @property
+    def filenos(self) -> list[int]:
+        return []
 
     def receive(self) -> tuple[CanFrame, ...]:
         frames, self._frames = self._frames, []
