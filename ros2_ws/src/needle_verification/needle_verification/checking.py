@@ -26,6 +26,7 @@ from needle_verification.descendants import processes_with
 
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
+_DOMAIN = r"ROS_DOMAIN_ID (\d+)"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,10 +95,8 @@ class SimulateRun:
     @property
     def left_in_memory(self) -> list[str]:
         """Shared-memory ports that the nodes left behind; a domain may have new users by now."""
-        domain = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
-        if domain is None:
-            return []
-        return dead_ports(ports_of(int(domain[1])))
+        domain = re.search(_DOMAIN, self.output)
+        return dead_ports(ports_of(int(domain[1]))) if domain else []
 
     @property
     def last_line(self) -> str:
@@ -143,7 +142,7 @@ class StartedRun:
         """Text that it has written so far."""
         return self._output.read_text("utf-8", errors="replace")
 
-    def domain(self, timeout: float = 60.0) -> int:
+    def domain(self) -> int:
         """Wait until the nodes start; return their ROS_DOMAIN_ID.
 
         Raises
@@ -151,14 +150,10 @@ class StartedRun:
         UserError
             If the run ends, or the time, before that.
         """
-        self.wait_until_said("ROS_DOMAIN_ID", timeout)
-        found = re.search(r"ROS_DOMAIN_ID (\d+)", self.output)
-        if found is None:
-            raise UserError(f"simulate did not start its nodes: {self.output.strip()}")
-        return int(found[1])
+        return int(self.wait_until_said(_DOMAIN)[1])
 
-    def wait_until_said(self, pattern: str, timeout: float = 60.0) -> None:
-        """Wait until the run has written something that this regular expression matches.
+    def wait_until_said(self, pattern: str, timeout: float = 60.0) -> re.Match[str]:
+        """Wait until the run has written what this regular expression matches; return the match.
 
         Raises
         ------
@@ -166,10 +161,12 @@ class StartedRun:
             If the run, or the time [s], ends before that.
         """
         deadline = time.monotonic() + timeout
-        while not re.search(pattern, self.output):
+        while True:
+            # What it wrote last may come between the two looks: first the process, then its words.
             ended = self.process.poll() is not None
-            # what it wrote last may have come between the two looks
-            if (ended or time.monotonic() >= deadline) and not re.search(pattern, self.output):
+            if found := re.search(pattern, self.output):
+                return found
+            if ended or time.monotonic() >= deadline:
                 how = "ended before it" if ended else f"has run {timeout:g} s and not yet"
                 raise UserError(f"{how} said {pattern!r}: {self.output.strip()[-500:]}")
             time.sleep(0.01)

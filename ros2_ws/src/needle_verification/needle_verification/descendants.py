@@ -5,10 +5,14 @@ from __future__ import annotations
 import contextlib
 import os
 import signal
+import subprocess
+import sys
 import time
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+
+from needle_common.errors import UserError
 
 _GRACE = 10.0
 _POLL = 0.05
@@ -28,6 +32,52 @@ def processes_with(name: str, value: str) -> list[tuple[int, str]]:
         except OSError:
             continue  # ended meanwhile, or another user's
     return found
+
+
+@contextlib.contextmanager
+def busy(count: int) -> Iterator[None]:
+    """Keep the processors busy with so many processes."""
+    idle = [sys.executable, "-c", "while True: pass"]
+    processes = [subprocess.Popen(idle) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for process in processes:
+            process.kill()
+            process.wait()
+
+
+def ran(
+    command: Sequence[str],
+    good: Sequence[int] = (0,),
+    *,
+    environment: Mapping[str, str] | None = None,
+    what: str = "",
+) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end; return its output and exit code.
+
+    Parameters
+    ----------
+    command : sequence of str
+        The command line.
+    good : sequence of int
+        Exit codes that are no error.
+    environment : mapping, optional
+        In place of this process' own.
+    what : str
+        Name of it all for an error.
+
+    Raises
+    ------
+    UserError
+        If the code is none of the good ones, with the last that it said.
+    """
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if done.returncode not in good:
+        last = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
+        name = f"{what}: {Path(command[0]).name}" if what else " ".join(command)
+        raise UserError(f"{name} ended with code {done.returncode}: {last}")
+    return done
 
 
 @contextlib.contextmanager

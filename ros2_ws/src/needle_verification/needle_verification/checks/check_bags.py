@@ -17,7 +17,6 @@ from rosbags.interfaces import ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_common.errors import UserError
 from needle_verification.checking import (
     Check,
     Finding,
@@ -27,6 +26,7 @@ from needle_verification.checking import (
     unreadable,
 )
 from needle_verification.checks import check_rerun, check_signals
+from needle_verification.descendants import ran
 from needle_verification.trials.damage_trials import damage_trials
 from needle_verification.trials.recording_trials import (
     FullRate,
@@ -250,10 +250,8 @@ def _wrong_types(bag: Path) -> Iterator[str]:
 def _small_disk(folder: Path) -> Iterator[str]:
     """Mount a small disk in memory."""
     folder.mkdir()
-    mount = ["mount", "-t", "tmpfs", "-o", f"size={SMALL_DISK}", "tmpfs", str(folder)]
-    done = subprocess.run(mount, capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise UserError(f"cannot mount a small disk (needs root): {done.stderr.strip()}")
+    # Needs root.
+    ran(["mount", "-t", "tmpfs", "-o", f"size={SMALL_DISK}", "tmpfs", str(folder)])
     try:
         yield "40 MB"
     finally:

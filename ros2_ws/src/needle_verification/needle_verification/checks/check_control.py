@@ -7,7 +7,6 @@ import dataclasses
 import json
 import math
 import os
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -27,6 +26,7 @@ from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSet
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
 from needle_verification.checking import Check, Finding, Workbench
+from needle_verification.descendants import ran
 from needle_verification.studies import control_studies
 from needle_verification.studies.control_studies import (
     BEST,
@@ -126,12 +126,8 @@ def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
         writer = csv.writer(stream)
         writer.writerow(["insertion_m", "x_m", "y_m", "z_m"])
         writer.writerows(np.column_stack([insertion, tips[0]]).tolist())
-    command = [find_executable("needle_controller", "identify_curvature"), str(file)]
-    done = subprocess.run(
-        [*command, "--json", str(result)], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        raise UserError(f"identify_curvature: {done.stderr.strip()}")
+    command = find_executable("needle_controller", "identify_curvature")
+    ran([command, str(file), "--json", str(result)])
     found = json.loads(result.read_text("utf-8"))
     low, high = found["radius_low_mm"], found["radius_high_mm"]
     yield Finding(
@@ -171,17 +167,12 @@ def bad_parameters(bench: Workbench) -> Iterator[Finding]:
             log=bench.folder / "plane_controller.log",
         )
         try:
-            asked = subprocess.run(
+            asked = ran(
                 [sys.executable, "-m", "needle_verification.ros.bad_parameters"],
-                env=environment,
-                capture_output=True,
-                text=True,
-                check=False,
+                environment=environment,
             )
         finally:
             stop([node])
-    if asked.returncode:
-        raise UserError(f"bad_parameters: {asked.stderr.strip()}; {node.last_line}")
     for case, answer in json.loads(asked.stdout.splitlines()[-1]).items():
         yield Finding(
             f"bad_{case.replace(' ', '_')}",

@@ -6,14 +6,13 @@ import dataclasses
 import itertools
 import json
 import math
-import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from needle_common.commands.cli import EXIT_DONE
-from needle_common.errors import UserError
 from needle_verification.checking import Check, Finding, SimulateRun, Workbench, payloads
+from needle_verification.descendants import ran
 
 STEPS = 10_000
 MOMENTS = 50
@@ -294,8 +293,4 @@ def _trials(*words: object) -> list[dict[str, Any]]:
         If they do not end well.
     """
     command = [sys.executable, "-m", "needle_verification.ros.drive_trials", *map(str, words)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode != EXIT_DONE:
-        lines = done.stderr.strip().splitlines() or ["no word"]
-        raise UserError(f"{' '.join(command[2:])}: {lines[-1]}")
-    return [json.loads(line) for line in done.stdout.splitlines()]
+    return [json.loads(line) for line in ran(command).stdout.splitlines()]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -13,8 +11,8 @@ from typing import Any
 import yaml
 
 from needle_bags.reading.bag_reader import read_run
-from needle_common.errors import UserError
 from needle_verification.checking import Check, Finding, Workbench
+from needle_verification.descendants import busy, ran
 
 REAL_TIME_BAGS = 30
 LOAD = 15
@@ -87,19 +85,6 @@ def rerun_real_time(bench: Workbench, bags: int = REAL_TIME_BAGS) -> Iterator[Fi
 CHECKS: tuple[Check, ...] = (rerun_untouched, rerun_changed, rerun_real_time)
 
 
-@contextlib.contextmanager
-def busy(count: int) -> Iterator[None]:
-    """Keep the processors busy with so many processes."""
-    idle = "while True: pass"
-    processes = [subprocess.Popen([sys.executable, "-c", idle]) for _ in range(count)]
-    try:
-        yield
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-
-
 def _red(bag: Path, key: str, what: str, node: str, values: Mapping[str, Any]) -> Finding:
     file = bag.with_name(f"{bag.name}_{key}.params.yaml")
     file.write_text(yaml.safe_dump({node: {"ros__parameters": dict(values)}}), encoding="utf-8")
@@ -116,14 +101,7 @@ def _red(bag: Path, key: str, what: str, node: str, values: Mapping[str, Any]) -
 
 def _rerun(bag: Path, *arguments: str) -> tuple[int, dict[str, Any]]:
     file = bag.with_name(f"{bag.name}.rerun.json")
-    done = subprocess.run(
-        [*_COMMAND, str(bag), "--json", str(file), *arguments],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if done.returncode not in {0, 1}:
-        raise UserError(f"rerun of {bag}: {done.stderr.strip()}")
+    done = ran([*_COMMAND, str(bag), "--json", str(file), *arguments], good=(0, 1))
     return done.returncode, dict(json.loads(file.read_text(encoding="utf-8")))
 
 

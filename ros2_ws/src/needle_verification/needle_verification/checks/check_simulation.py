@@ -9,7 +9,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from needle_bags.reading.bag_reader import read_run
@@ -190,7 +190,7 @@ def bad_tip(bench: Workbench) -> Iterator[Finding]:
     """NaN, a wrong frame, mm for m: all named; no command comes from them."""
     patterns = {"not_finite": "finite", "frame": "frame", "millimetres": "from the entry|jumped"}
     for kind, pattern in patterns.items():
-        run = _run_with(bench, f"bad_tip_{kind}", [kind], "--level", "tip", *SHORT)
+        run = _run_with(bench, f"bad_tip_{kind}", kind, "--level", "tip", *SHORT)
         yield _named(run, "plane_controller", kind, pattern)
         # A refused tip may cost a further exposure, and with it another noise: the run as a whole
         # may differ from one without. But each command bears the stamp of the tip behind it.
@@ -212,7 +212,7 @@ def bad_tip(bench: Workbench) -> Iterator[Finding]:
 def lonely_image(bench: Workbench) -> Iterator[Finding]:
     """Name a left image without its right; the needle moves as without it."""
     usual = bench.run("camera_short", *SHORT)
-    run = _run_with(bench, "lonely_image", ["left_image"], *SHORT)
+    run = _run_with(bench, "lonely_image", "left_image", *SHORT)
     yield _named(run, "stereo_tracker", "left_image", "without|partner|pair|match")
     yield _unmoved(run, usual, "lonely_image")
 
@@ -240,17 +240,17 @@ def _exit(run: SimulateRun, key: str, what: str, code: int) -> Finding:
     )
 
 
-def _differences(one: Path, other: Path) -> list[str]:
+def _differences(one: Path, other: Path, topics: Sequence[str] = SAME_TOPICS) -> list[str]:
     """Return the topics whose messages differ in any bit."""
-    ours, theirs = payloads(one, SAME_TOPICS), payloads(other, SAME_TOPICS)
-    return [topic for topic in SAME_TOPICS if ours[topic] != theirs[topic]]
+    ours, theirs = payloads(one, topics), payloads(other, topics)
+    return [topic for topic in topics if ours[topic] != theirs[topic]]
 
 
-def _run_with(bench: Workbench, name: str, kinds: list[str], *arguments: str) -> SimulateRun:
-    """SimulateRun `simulate` with a second publisher of bad data in its graph."""
+def _run_with(bench: Workbench, name: str, kind: str, *arguments: str) -> SimulateRun:
+    """Run `simulate` with a second publisher of bad data in its graph."""
     started = bench.start(name, *arguments)
     command = [sys.executable, "-m", "needle_verification.ros.bad_input", "--ros-args"]
-    command += ["-p", f"kinds:=[{', '.join(kinds)}]", "--disable-external-lib-logs"]
+    command += ["-p", f"kind:={kind}", "--disable-external-lib-logs"]
     environment = {**os.environ, "ROS_DOMAIN_ID": str(started.domain())}
     with subprocess.Popen(command, env=environment) as intruder:
         try:
@@ -274,22 +274,17 @@ def _named(run: SimulateRun, node: str, kind: str, pattern: str) -> Finding:
         for level, name, message in diagnostics(run.bag)
         if level >= WARN and name.startswith(node) and re.search(pattern, message)
     ]
-    seen = (
-        f"log: {logged[0] if logged else 'nothing'}; diagnostics: {told[0] if told else 'nothing'}"
-    )
     return Finding(
         f"{kind}_named",
         f"bad data '{kind}'",
         "a clear line in the log and in diagnostics",
-        seen,
+        f"log: {(*logged, 'nothing')[0]}; diagnostics: {(*told, 'nothing')[0]}",
         bool(logged and told),
     )
 
 
 def _unmoved(run: SimulateRun, usual: SimulateRun, key: str) -> Finding:
-    topics = ("/device/joint_trajectory", "/sim/tip_pose")
-    ours, theirs = payloads(run.bag, topics), payloads(usual.bag, topics)
-    differ = [topic for topic in topics if ours[topic] != theirs[topic]]
+    differ = _differences(run.bag, usual.bag, ("/device/joint_trajectory", "/sim/tip_pose"))
     return Finding(
         f"{key}_no_motion",
         "motion with bad data",

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,6 +24,7 @@ from needle_verification.checks import (
     check_tracker,
 )
 from needle_verification.descendants import ending_descendants
+from needle_verification.workplace import checkout, make_folder, temporary_folder
 
 STEPS: Mapping[str, tuple[Check, ...]] = {
     "A": check_simulation.CHECKS,
@@ -69,12 +68,13 @@ def _verify(arguments: Sequence[str]) -> int:
     begin = time.monotonic()
     findings: list[tuple[str, Finding]] = []
     tqdm.monitor_interval = 0  # its thread would outlive the bar
+    keep = given.keep and make_folder("--keep", given.keep, exist_ok=False)
     with (
-        _folder(given.keep) as folder,
+        contextlib.nullcontext(keep) if keep else temporary_folder() as folder,
         ending_descendants(),
         _progress(len(checks)) as bar,
     ):
-        bench = Workbench([str(_checkout() / "scripts" / "simulate")], folder)
+        bench = Workbench([str(checkout() / "scripts" / "simulate")], folder)
         for step, check in checks:
             bar.set_description(f"{step} {check.__name__}")
             for finding in _findings(check, bench):
@@ -136,30 +136,6 @@ def _flat(findings: Sequence[tuple[str, Finding]], wall: float) -> dict[str, Jso
         values[f"{step}_{finding.key}_wanted"] = finding.wanted
         values[f"{step}_{finding.key}_seen"] = finding.seen
     return values
-
-
-@contextlib.contextmanager
-def _folder(keep: str | None) -> Iterator[Path]:
-    if keep is None:
-        folder = Path(tempfile.mkdtemp(prefix="needle_verify_"))
-        try:
-            yield folder
-        finally:
-            shutil.rmtree(folder, ignore_errors=True)
-        return
-    folder = Path(keep).absolute()
-    try:
-        folder.mkdir(parents=True)
-    except OSError as error:
-        raise UserError(f"--keep {keep}: {error.strerror}") from error
-    yield folder
-
-
-def _checkout() -> Path:
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "scripts" / "simulate").is_file():
-            return folder
-    raise UserError("verify runs from a checkout only: there is no scripts/simulate beside it")
 
 
 if __name__ == "__main__":

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 from needle_common.commands.cli import EXIT_DONE, run_command, write_json
 from needle_common.commands.options import CommandParser, output_file
 from needle_common.errors import UserError
 from needle_verification.descendants import ending_descendants
+from needle_verification.workplace import checkout, make_folder, temporary_folder
 
 PAGE = "paper.md"
 IMAGES = "images"
@@ -48,9 +46,9 @@ def _paper(arguments: Sequence[str]) -> int:
     if not given.seed.isdecimal() or int(given.seed) >= 2**31 - 100:
         raise UserError(f"--seed {given.seed!r} is not a whole number of at most 31 bits")
     file = output_file("--json", given.json)
-    checkout = _checkout()
-    out = checkout / OUT if given.out is None else Path(given.out).expanduser().absolute()
-    _make(out / IMAGES, "--out")
+    root = checkout()
+    out = make_folder("--out", given.out or str(root / OUT))
+    make_folder("--out", str(out / IMAGES))
     # They take a second to import: not for a command line that is refused.
     from needle_analysis.report.figure_style import save  # noqa: PLC0415
     from needle_verification.paper.paper_figures import figures_of  # noqa: PLC0415
@@ -58,8 +56,12 @@ def _paper(arguments: Sequence[str]) -> int:
     from needle_verification.paper.paper_results import collect  # noqa: PLC0415
     from needle_verification.paper.paper_runs import Laboratory  # noqa: PLC0415
 
-    with _folder(given.runs) as folder, ending_descendants():
-        laboratory = Laboratory([str(checkout / "scripts" / "simulate")], folder)
+    runs = given.runs and make_folder("--runs", given.runs)
+    with (
+        contextlib.nullcontext(runs) if runs else temporary_folder() as folder,
+        ending_descendants(),
+    ):
+        laboratory = Laboratory([str(root / "scripts" / "simulate")], folder)
         results = collect(laboratory, int(given.seed), quick=given.quick)
     for name, figure in figures_of(results).items():
         save(figure, out / IMAGES / f"{name}.png")
@@ -69,38 +71,6 @@ def _paper(arguments: Sequence[str]) -> int:
     if file is not None:
         write_json(file, key_figures(results))
     return EXIT_DONE
-
-
-def _make(folder: Path, option: str) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{option} {folder}: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def _folder(keep: str | None) -> Iterator[Path]:
-    if keep is not None:
-        folder = Path(keep).expanduser().absolute()
-        _make(folder, "--runs")
-        yield folder
-        return
-    folder = Path(tempfile.mkdtemp(prefix="needle_paper_"))
-    try:
-        yield folder
-    except UserError:
-        raise  # it may name a log in there
-    except BaseException:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def _checkout() -> Path:
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "scripts" / "simulate").is_file():
-            return folder
-    raise UserError("paper runs from a checkout only: there is no scripts/simulate beside it")
 
 
 if __name__ == "__main__":

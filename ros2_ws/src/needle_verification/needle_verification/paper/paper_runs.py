@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy.typing as npt
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bringup.simulation.installed import find_executable
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
-from needle_common.errors import UserError
+from needle_verification.descendants import ran
 
 Columns = Mapping[str, npt.NDArray[np.float64]]
 SUMMARY = "summary.json"
@@ -90,10 +89,5 @@ class Laboratory:
 
 def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:
     print(f"running {name} ...", file=sys.stderr, flush=True)
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode in good:
-        return
-    if done.returncode in (130, -2):
+    if ran(command, (*good, 130, -2), what=name).returncode in (130, -2):
         raise KeyboardInterrupt
-    last = (done.stderr.strip() or done.stdout.strip() or "it said nothing").splitlines()[-1]
-    raise UserError(f"{name}: {Path(command[0]).name} ended with code {done.returncode}: {last}")

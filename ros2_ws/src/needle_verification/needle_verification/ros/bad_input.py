@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import array
 import dataclasses
-import itertools
 import math
 import sys
 
@@ -12,7 +11,6 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import Image, JointState
 
-from needle_common.errors import UserError
 from needle_common.ros.base_node import run_node
 from needle_common.ros.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_common.ros.parameters import NodeParameters
@@ -24,23 +22,18 @@ bad_input: publishes bad tips or lonely images beside the good ones, stamped lik
 """
 TIPS = ("not_finite", "frame", "millimetres")
 LEFT_IMAGE = "left_image"
+# Joint states from one bad message to the next.
+_EVERY = 40
 
 
 @dataclasses.dataclass(frozen=True)
 class BadInputParameters:
     """Parameters of the publisher."""
 
-    kinds: tuple[str, ...] = fixed_parameter(
-        ("not_finite",), "-", "What is bad; several take turns.", choices=(*TIPS, LEFT_IMAGE)
-    )
-    every: int = fixed_parameter(
-        40, "-", "Joint states from one bad message to the next.", 1, 10000
-    )
+    kind: str = fixed_parameter("not_finite", "-", "What is bad.", choices=(*TIPS, LEFT_IMAGE))
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if not self.kinds:
-            raise UserError("kinds is empty")
 
 
 class BadInput(WholeNode):
@@ -48,30 +41,23 @@ class BadInput(WholeNode):
 
     def __init__(self) -> None:
         super().__init__("bad_input")
-        values = NodeParameters(self, BadInputParameters).values
-        self._every = values.every
-        self._turns = itertools.cycle(values.kinds)
+        self._kind = NodeParameters(self, BadInputParameters).values.kind
         self._seen = 0
-        images = LEFT_IMAGE in values.kinds
-        self._left = (
-            self.create_publisher(Image, "stereo/left/image_raw", IMAGES) if images else None
-        )
-        self._tip = (
-            self.create_publisher(PointStamped, "needle/tip", RELIABLE)
-            if set(values.kinds) & set(TIPS)
-            else None
+        self._bad = (
+            self.create_publisher(Image, "stereo/left/image_raw", IMAGES)
+            if self._kind == LEFT_IMAGE
+            else self.create_publisher(PointStamped, "needle/tip", RELIABLE)
         )
         self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
 
     def _on_joints(self, message: JointState) -> None:
         self._seen += 1
-        if self._seen % self._every:
+        if self._seen % _EVERY:
             return
-        kind = next(self._turns)
-        if kind == LEFT_IMAGE and self._left is not None:
-            self._left.publish(_image(message.header.stamp))
-        elif self._tip is not None:
-            self._tip.publish(_tip(kind, message.header.stamp, float(message.position[0])))
+        stamp, insertion = message.header.stamp, float(message.position[0])
+        self._bad.publish(
+            _image(stamp) if self._kind == LEFT_IMAGE else _tip(self._kind, stamp, insertion)
+        )
 
 
 def _tip(kind: str, stamp: Time, insertion: float) -> PointStamped:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-import time
-from collections.abc import Callable
 from typing import Any
 
 import rclpy
@@ -21,7 +19,7 @@ from rclpy.parameter import Parameter
 
 from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
-from needle_common.ros.whole_node import WholeNode
+from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 Answer = dict[str, Any]
 
@@ -41,10 +39,9 @@ CASES: dict[str, dict[str, Any]] = {
 }
 """Values that each case sets; every one must be refused as a whole."""
 FAR_PLANE = 0.09
-_LIMIT = 20.0
 
 
-class BadParameters(WholeNode):
+class BadParameters(ListeningNode):
     """Speaks to `plane_controller` in its own domain."""
 
     def __init__(self) -> None:
@@ -62,9 +59,9 @@ class BadParameters(WholeNode):
         self._get = self.create_client(GetParameters, "plane_controller/get_parameters")
         self._list = self.create_client(ListParameters, "plane_controller/list_parameters")
         for client in (self._set, self._get, self._list):
-            if not client.wait_for_service(timeout_sec=_LIMIT):
+            if not client.wait_for_service(timeout_sec=PATIENCE):
                 raise UserError("plane_controller does not answer")
-        self._until(lambda: self._offset != "", "needle/controller_status")
+        self.until(lambda: self._offset != "", "needle/controller_status")
 
     def answers(self) -> dict[str, Answer]:
         """Try every case."""
@@ -77,7 +74,7 @@ class BadParameters(WholeNode):
         request = SetParametersAtomically.Request(
             parameters=[Parameter(name, value=v).to_parameter_msg() for name, v in values.items()]
         )
-        result = self._call(self._set, request).result
+        result = self.answer_to(self._set, request).result
         return {
             "refused": not result.successful,
             "reason": result.reason,
@@ -91,27 +88,13 @@ class BadParameters(WholeNode):
         plane.pose.position.x = FAR_PLANE
         plane.pose.orientation.w = 1.0
         self._planes.publish(plane)
-        self._until(lambda: self._complaint != "", "a word on target_plane in /diagnostics")
+        self.until(lambda: self._complaint != "", "a word on target_plane in /diagnostics")
         return {"refused": True, "reason": self._complaint, "kept": self._offset == before}
 
     def _values(self) -> str:
-        names = self._call(self._list, ListParameters.Request()).result.names
-        values = self._call(self._get, GetParameters.Request(names=names)).values
+        names = self.answer_to(self._list, ListParameters.Request()).result.names
+        values = self.answer_to(self._get, GetParameters.Request(names=names)).values
         return str(list(zip(names, values, strict=True)))
-
-    def _call(self, client: Any, request: Any) -> Any:
-        future = client.call_async(request)
-        rclpy.spin_until_future_complete(self, future, timeout_sec=_LIMIT)
-        if not future.done():
-            raise UserError(f"no answer from {client.srv_name}")
-        return future.result()
-
-    def _until(self, condition: Callable[[], bool], what: str) -> None:
-        end = time.monotonic() + _LIMIT
-        while not condition():
-            if time.monotonic() > end:
-                raise UserError(f"waited in vain for {what}")
-            rclpy.spin_once(self, timeout_sec=0.05)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self._offset = values_of(message).get("target_offset_m", "")
@@ -128,7 +111,7 @@ def main() -> int:
     try:
         node = BadParameters()
         print(json.dumps(node.answers()))
-        node.destroy_node()
+        node.close()
     except UserError as error:
         print(error, file=sys.stderr)
         return 2

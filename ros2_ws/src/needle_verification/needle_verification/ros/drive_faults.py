@@ -52,9 +52,6 @@ def fault_trials(
     watchdog : float, optional
         How long driver and drives wait for each other, in place of the driver's defaults [s].
     """
-    for kind in kinds:
-        if kind not in FAULTS:
-            raise UserError(f"fault {kind!r} is not one of {', '.join(FAULTS)}")
     driver = {"retraction_speed": _FAST}
     if watchdog is not None:
         driver |= {"watchdog": watchdog, "reply_age_limit": watchdog}
@@ -88,12 +85,7 @@ def _start_over(hand: DriveHand) -> None:
 
 def _get_ready(hand: DriveHand) -> None:
     """Needle out, homed, enabled; not held."""
-    hand.insist("confirm_needle_out", True)
-    hand.insist("home")
-    hand.until(
-        lambda: hand.status.get("homed") == "true" and hand.status.get("state") == "DISABLED",
-        "homed",
-    )
+    hand.home()
     hand.insist("enable", True)
 
 

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
@@ -27,14 +26,13 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.ros.whole_node import WholeNode
+from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 JOINTS = ("insertion_joint", "rotation_joint")
 # What a count of each encoder is [m], [rad]: the emulator's defaults.
 INSERTION_COUNT = 1.0 / 2.0e7
 ROTATION_COUNT = math.tau / 65536.0
 _HOLD_PERIOD = 0.05
-_PATIENCE = 20.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Motors:
     rotation: float
 
 
-class DriveHand(WholeNode):
+class DriveHand(ListeningNode):
     """Presses the hold, sends steps, calls services; hears what came of it.
 
     Parameters
@@ -90,34 +88,10 @@ class DriveHand(WholeNode):
             for name in names
         }
         self.create_timer(_HOLD_PERIOD, self.send_hold, clock=STEADY_CLOCK)
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self)
 
-    # ---- waiting ------------------------------------------------------------------------------
-
-    def look(self, timeout: float = 0.0) -> None:
-        """Take one message, waiting for it at most `timeout` [s]."""
-        self._executor.spin_once(timeout_sec=timeout)
-
-    def until(self, condition: Callable[[], bool], what: str, patience: float = _PATIENCE) -> None:
-        """Wait for a condition.
-
-        Raises
-        ------
-        UserError
-            If it does not come within `patience` [s].
-        """
-        deadline = time.monotonic() + patience
-        while not condition():
-            if time.monotonic() > deadline:
-                raise UserError(f"waited {patience:g} s in vain: {what}; device: {self.status}")
-            self.look(0.01)
-
-    def pause(self, seconds: float) -> None:
-        """Listen for so long."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end:
-            self.look(0.005)
+    def state_now(self) -> str:
+        """Return what the device said last."""
+        return f"; device: {self.status}"
 
     # ---- acting -------------------------------------------------------------------------------
 
@@ -132,28 +106,35 @@ class DriveHand(WholeNode):
     def call(self, name: str, data: bool | None = None) -> tuple[bool, str]:
         """Call a service of the device; return its answer."""
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
-        future = self._device[name].call_async(request)
-        self.until(future.done, f"an answer from device/{name}")
-        answer = future.result()
+        answer = self.answer_to(self._device[name], request)
         return bool(answer.success), str(answer.message)
 
-    def insist(self, name: str, data: bool | None = None, patience: float = _PATIENCE) -> None:
+    def insist(self, name: str, data: bool | None = None) -> None:
         """Call a service until it succeeds.
 
         Raises
         ------
         UserError
-            If it does not within `patience` [s].
+            If it does not within 20 s.
         """
-        deadline = time.monotonic() + patience
+        deadline = time.monotonic() + PATIENCE
         while True:
             success, message = self.call(name, data)
             if success:
                 return
             if time.monotonic() > deadline:
                 fault = self.status.get("fault", "")
-                raise UserError(f"device/{name} refused for {patience:g} s: {message} ({fault})")
+                raise UserError(f"device/{name} refused for {PATIENCE:g} s: {message} ({fault})")
             self.pause(0.05)
+
+    def home(self) -> None:
+        """Home both axes, the needle being out; not enabled afterwards."""
+        self.insist("confirm_needle_out", True)
+        self.insist("home")
+        self.until(
+            lambda: self.status.get("homed") == "true" and self.status.get("state") == "DISABLED",
+            "homed",
+        )
 
     def command(self, insertion: float, rotation: float, duration: float) -> int:
         """Send a step to these joints [m], [rad] in `duration` [s]; return its stamp."""
@@ -188,11 +169,6 @@ class DriveHand(WholeNode):
         message.header.frame_id = self.get_name()
         message.header.stamp = to_stamp(self._last_hold)
         self._holds.publish(message)
-
-    def close(self) -> None:
-        """Let go of everything."""
-        self._executor.shutdown()
-        self.destroy_node()
 
     # ---- hearing ------------------------------------------------------------------------------
 

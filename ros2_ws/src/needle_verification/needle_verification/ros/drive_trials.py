@@ -11,7 +11,7 @@ import argparse
 import json
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +19,18 @@ import rclpy
 
 from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
+from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_verification.ros.drive_faults import FAULTS, fault_trials
 from needle_verification.ros.drive_steps import random_steps
 from needle_verification.ros.fuzz_trials import fuzz_trials
 from needle_verification.ros.graph_kills import KILLED, kill_trials
-from needle_verification.ros.nuisance import KINDS
+from needle_verification.ros.nuisance import NUISANCES
 from needle_verification.ros.nuisance_trials import nuisance_trials
 from needle_verification.ros.two_rigs import two_rigs_trials
 
 TRIALS = ("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
+KINDS = {"faults": FAULTS, "kills": KILLED, "nuisances": NUISANCES}
 
 
 def main() -> int:
@@ -55,21 +57,28 @@ def main() -> int:
 
 
 def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Iterator[dict[str, Any]]:
+    known = KINDS.get(given.trial, ())
+    kinds = [_known(kind, known) for kind in given.kinds] or known
     if given.trial == "steps":
         yield random_steps(folder, domain, given.count, given.seed)
     elif given.trial == "faults":
-        kinds = given.kinds or FAULTS
         yield from fault_trials(
             folder, domain, kinds, given.count, given.seed, watchdog=given.watchdog
         )
     elif given.trial == "nuisances":
-        yield from nuisance_trials(folder, domain, given.kinds or KINDS, float(given.count))
+        yield from nuisance_trials(folder, domain, kinds, float(given.count))
     elif given.trial == "fuzz":
         yield from fuzz_trials(folder, domain, float(given.count), given.seed)
     elif given.trial == "two_rigs":
         yield from two_rigs_trials(folder, domain, given.count, given.seed)
     else:
-        yield from kill_trials(folder, domain, given.kinds or KILLED, given.count, given.seed)
+        yield from kill_trials(folder, domain, kinds, given.count, given.seed)
+
+
+def _known(kind: str, known: Sequence[str]) -> str:
+    if kind not in known:
+        raise UserError(f"{kind!r} is not one of {', '.join(known)}")
+    return kind
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,8 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
 from needle_bags.format.message_definitions import message_class
-from needle_common.errors import UserError
-from needle_common.ros.base_node import executor_of
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
-from needle_common.ros.whole_node import WholeNode
+from needle_verification.ros.listening_node import ListeningNode
 from needle_verification.trials.random_messages import random_message
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
@@ -62,10 +60,10 @@ def fuzz_trials(folder: Path, domain: int, seconds: float, seed: int) -> Iterato
     witness = _Witness()
     rng = random.Random(seed)
     try:
-        witness.until(lambda: witness.state == "DISABLED", "a driver")
+        witness.until(lambda: witness.state == "DISABLED", "a driver", _READY)
         nodes = {name.lstrip("/") for name in parameters}
         fuzzer = _Fuzzer(witness, nodes, rng)
-        witness.until(lambda: fuzzer.look_around() >= nodes, "all nodes")
+        witness.until(lambda: fuzzer.look_around() >= nodes, "all nodes", _READY)
         for half in ("without clocks and devices", "with"):
             if half == "with":
                 fuzzer.left_out = ()
@@ -99,35 +97,17 @@ def _half(
     }
 
 
-class _Witness(WholeNode):
+class _Witness(ListeningNode):
     """Sees the driver's first state, and whether a motor turned, by the emulator's own word."""
 
     def __init__(self) -> None:
         super().__init__("fuzz")
         self.state = ""
         self.places: set[tuple[float, ...]] = set()
-        self._executor = executor_of(self)
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
         self.create_subscription(
             JointState, "sim/drive_positions", self._on_positions, JOINT_STATES
         )
-
-    def look(self, timeout: float) -> None:
-        """Take one message, waiting for it at most `timeout` [s]."""
-        self._executor.spin_once(timeout_sec=timeout)
-
-    def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait for a condition; `UserError` if it does not come."""
-        end = time.monotonic() + _READY
-        while not condition():
-            if time.monotonic() > end:
-                raise UserError(f"waited {_READY:g} s in vain: {what}")
-            self.look(0.01)
-
-    def close(self) -> None:
-        """Let go of everything."""
-        self._executor.shutdown()
-        self.destroy_node()
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.state = values_of(message).get("state", "")

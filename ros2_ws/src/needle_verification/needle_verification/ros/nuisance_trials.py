@@ -13,11 +13,9 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Bool
 
-from needle_common.errors import UserError
 from needle_common.ros.conversions import RELIABLE, values_of
 from needle_device_driver.ros.parameters import LONGEST_WATCHDOG
 from needle_verification.ros.drive_hand import DriveHand
-from needle_verification.ros.nuisance import KINDS
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
 
 _STEP = 0.0019
@@ -37,7 +35,7 @@ def nuisance_trials(
     domain : int
         ROS_DOMAIN_ID.
     kinds : sequence of str
-        Which of `KINDS`.
+        Which of `NUISANCES`.
     duration : float
         How long each goes on [s], within one step.
     """
@@ -47,8 +45,6 @@ def nuisance_trials(
     trial = _Trial(processes, domain)
     try:
         for kind in kinds:
-            if kind not in KINDS:
-                raise UserError(f"nuisance {kind!r} is not one of {', '.join(KINDS)}")
             yield {"nuisance": kind, **trial.run(kind, duration)}
             processes.check()
     finally:
@@ -71,12 +67,7 @@ class _Trial:
         hand = self.hand
         hand.until(hand.ready, "the driver", 60.0)
         hand.until(lambda: self._estops.get_subscription_count() > 0, "the emergency stop's ear")
-        hand.insist("confirm_needle_out", True)
-        hand.insist("home")
-        hand.until(
-            lambda: hand.status.get("homed") == "true" and hand.status.get("state") == "DISABLED",
-            "homed",
-        )
+        hand.home()
 
     def run(self, kind: str, duration: float) -> dict[str, Any]:
         """Begin a step, be a nuisance, press the emergency stop in the middle of it."""

@@ -7,11 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.commands.cli import EXIT_BAD_INPUT
 from needle_verification.ros.drive_hand import DriveHand
-from needle_verification.trials.trial_processes import Parameters, TrialProcesses, drives_and_driver
+from needle_verification.trials.trial_processes import (
+    Parameters,
+    TrialProcesses,
+    drives_and_driver,
+    without_recorder,
+)
 
 DEVICES = ("device_driver", "sim_rig")
 STARTED = (*DEVICES, "plane_controller", "operator")
@@ -86,9 +90,5 @@ def _way(positions: list[float]) -> float:
 
 
 def _parameters() -> Parameters:
-    options = SimulateOptions(level="tip", depth_mm=_DEPTH_MM)
-    parameters = command_line_parameters(options, Path())
-    for values in parameters.values():
-        values.pop("wait_for_recorder", None)
-    simulation = {name: parameters[name] for name in STARTED if name != "device_driver"}
+    simulation = without_recorder(SimulateOptions(level="tip", depth_mm=_DEPTH_MM))
     return {**simulation, **drives_and_driver({"insertion_start": _START}, {})}

@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +21,7 @@ from needle_bags.recovery.bag_recovery import recover_bag
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_verification.checking import unreadable
+from needle_verification.descendants import busy
 
 # The first bytes of every message: the encoding, then the stamp's seconds; its nanoseconds are the
 # message's number.
@@ -88,16 +89,15 @@ class Killed:
     unreadable: str
 
 
-def record_full_rate(
-    folder: Path, duration: float, *, burners: int = 2, images: bool = True
-) -> FullRate:
+def record_full_rate(folder: Path, duration: float, *, burners: int = 2) -> FullRate:
     """Record what a rig at full rate sends, while `burners` processes keep the cores busy."""
     bag = folder / "full_rate"
-    with own_domain() as domain, contextlib.ExitStack() as stack:
-        recorder = stack.enter_context(_process(domain, "recorder", bag=str(bag)))
-        for _ in range(burners):
-            stack.enter_context(_running([sys.executable, "-c", "while True: pass"]))
-        load = stack.enter_context(_process(domain, _LOAD, duration=duration, images=images))
+    with (
+        own_domain() as domain,
+        _process(domain, "recorder", bag=str(bag)) as recorder,
+        busy(burners),
+        _process(domain, _LOAD, duration=duration) as load,
+    ):
         begin, before = time.monotonic(), _processor_time(recorder.pid)
         memory: list[float] = []
         while load.poll() is None and recorder.poll() is None:
@@ -193,17 +193,9 @@ def _process(
     words = [sys.executable, "-m", _MODULES[node], "--ros-args"]
     for name, value in parameters.items():
         words += ["-p", f"{name}:={str(value).lower() if isinstance(value, bool) else value}"]
-    with _running(words, {**os.environ, "ROS_DOMAIN_ID": str(domain)}) as process:
-        yield process
-
-
-@contextlib.contextmanager
-def _running(
-    words: list[str], environment: Mapping[str, str] | None = None
-) -> Iterator[subprocess.Popen[str]]:
     with subprocess.Popen(
         words,
-        env=environment,
+        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,

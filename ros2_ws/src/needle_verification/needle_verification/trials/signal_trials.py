@@ -6,8 +6,6 @@ import dataclasses
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -24,6 +22,7 @@ from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_verification.checking import unreadable
+from needle_verification.descendants import busy
 
 # From the start-up to the middle of the insertion [s].
 LATEST = 12.0
@@ -82,18 +81,13 @@ def signal_trials(
         Latest moment [s].
     """
     rng = random.Random(seed)
-    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(burners)]
-    try:
+    with busy(burners):
         for number in range(count):
             place = folder / f"signals_{number}"
             place.mkdir()
             kind, moment = _KINDS[number % len(_KINDS)], rng.uniform(0.0, latest)
             with own_domain() as domain:
                 yield from _trial(place, domain, kind, moment, rng)
-    finally:
-        for process in busy:
-            process.kill()
-            process.wait()
 
 
 def _trial(

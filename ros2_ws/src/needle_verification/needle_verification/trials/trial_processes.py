@@ -13,7 +13,6 @@ from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
     can_adapter,
     command_line_parameters,
-    nodes_of,
     write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions
@@ -132,8 +131,13 @@ def graph_in_real_time(seed: int) -> Parameters:
     seed : int
         Of the simulation.
     """
-    options = SimulateOptions(level="drive", real_time_factor=1.0, seed=seed)
+    return without_recorder(SimulateOptions(level="drive", real_time_factor=1.0, seed=seed))
+
+
+def without_recorder(options: SimulateOptions) -> Parameters:
+    """Return the parameters of a simulation's nodes but the recorder, for which none waits."""
     parameters = command_line_parameters(options, Path())
+    del parameters["recorder"]
     for values in parameters.values():
         values.pop("wait_for_recorder", None)
-    return {node: parameters[node] for node in nodes_of(options) if node != "recorder"}
+    return parameters
