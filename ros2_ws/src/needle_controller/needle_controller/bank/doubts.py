@@ -17,8 +17,6 @@ LARGEST_NOISE = 3.0
 """Noise as a multiple of what is claimed."""
 LARGEST_SLIP = 0.15
 """Distance of the insertion scale from 1."""
-LARGEST_SHORTFALL = 0.001
-"""What the first tips may show too little of the insertion, beside the error of the first [m]."""
 _AT_LIMIT = 0.03
 
 
@@ -26,7 +24,6 @@ def doubts_of(
     learned: Array,
     x_variance: Array,
     unexplained: Array,
-    shortfall: Array,
     settings: FilterSettings,
 ) -> dict[str, npt.NDArray[np.bool_]]:
     """Return each reason for doubt with the needles that have it, shape (N,).
@@ -39,10 +36,8 @@ def doubts_of(
         Of the distance from the plane [m^2].
     unexplained : ndarray, shape (N,)
         Share of the last tips that were outliers.
-    shortfall : ndarray, shape (N,)
-        See `Shortfall` [m].
     settings : FilterSettings
-        What the curvature is kept to, and what is claimed of the tips.
+        What the curvature is kept to.
     """
     curvature = learned[:, L_CURVATURE] / settings.curvature
     least, most = settings.curvature_range
@@ -52,8 +47,6 @@ def doubts_of(
         "tips are far noisier than claimed": learned[:, L_NOISE] > LARGEST_NOISE,
         "the needle does not go in as the stage does": np.abs(learned[:, L_SCALE] - 1.0)
         > LARGEST_SLIP,
-        "tips lie short of the insertion from the start: late, or the needle stuck": shortfall
-        > LARGEST_SHORTFALL + settings.believed_bound,
         "the curvature is at its limit": (curvature < least + _AT_LIMIT)
         | (curvature > most - _AT_LIMIT),
     }

@@ -115,6 +115,8 @@ class FilterSettings:
         How far a phantom or a tracker may be displaced [m], and turned [rad], at once.
     initial_angle_std : float
         How well pitch and yaw at the entry are known [rad].
+    entry_std : float
+        How far from the entry point, along the needle, its tip may be with the stage at 0 [m].
     orientation_drift : float
         Growth of the orientation's standard deviation over a metre [rad/sqrt(m)].
     play_drift, lag_drift : float
@@ -150,6 +152,7 @@ class FilterSettings:
     jump_std: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.003
     jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(3.0)
     initial_angle_std: Annotated[float, Bounds(1e-6, math.pi, "rad")] = math.radians(8.0)
+    entry_std: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.0005
     orientation_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = math.sqrt(0.001)
     play_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = 0.2
     lag_drift: Annotated[float, Bounds(0.0, 1.0, "sqrt(m)")] = 0.003

@@ -36,7 +36,6 @@ from needle_controller.bank.hypothesis_mixture import (
 )
 from needle_controller.bank.hypothesis_pruning import merge
 from needle_controller.bank.hypothesis_start import start_bank
-from needle_controller.bank.shortfall import Shortfall
 from needle_controller.bank.tip_update import ALONG, BOUND, FOUND, READ, READING_ROWS
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
@@ -85,7 +84,6 @@ class HypothesisFilter:
         rotation = self.initial_rotation @ rotation_from_angles(turned)
         self._bank = start_bank(self.settings, start, rotation)
         self._start_turn = turned[:, 2].copy()
-        self._shortfall = Shortfall(start)
         self._queue: list[tuple[Array, Array]] = []
         self._too_late = np.zeros(needles, dtype=bool)
         self._version = self._corrections = 0
@@ -99,7 +97,6 @@ class HypothesisFilter:
         if not np.all(np.isfinite(turn)):
             raise ValueError(f"d_rotation = {d_rotation!r} rad, wants finite")
         self._version += 1
-        self._shortfall.advance(length)
         self._queue.append((length, turn))
         if len(self._queue) > _LONGEST_QUEUE:
             self._move(self._bank, *self._queue.pop(0))
@@ -117,7 +114,6 @@ class HypothesisFilter:
         position = np.array(position.reshape(-1, 3))
         self._version += 1
         self._corrections += 1
-        self._shortfall.see(position, self._flat(age))
         self._too_late = self._catch_up(self._flat(age))
         if np.any(self._too_late):
             position = np.where(self._too_late[:, None], np.nan, position)
@@ -149,9 +145,7 @@ class HypothesisFilter:
         uncertainty = np.empty((needles, 3))
         noises = self.settings.noises()
         mixture(bank.tiles, noises, coordinates, linearized, learned, ambiguous, table, uncertainty)
-        doubts = doubts_of(
-            learned, uncertainty[:, 0], bank.unexplained, self._shortfall.mean(), self.settings
-        )
+        doubts = doubts_of(learned, uncertainty[:, 0], bank.unexplained, self.settings)
         version = self._version
 
         def covariance() -> Array:
@@ -182,7 +176,6 @@ class HypothesisFilter:
         transform = np.asarray(T_new_old, dtype=float)
         turn = transform[:3, :3]
         tiles = self._bank.tiles
-        self._shortfall.change_frame(transform)
         self._version += 1
         self.initial_rotation = turn @ self.initial_rotation
         set_rows(tiles, X, rows(tiles, X, 3) @ turn.T + transform[:3, 3])

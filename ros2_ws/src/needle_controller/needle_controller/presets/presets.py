@@ -7,6 +7,7 @@ import numpy.typing as npt
 
 from needle_controller.bank.filter_settings import BOUNDED_NOISE, NORMAL_NOISE, FilterSettings
 from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.bank.late_tips import LateTips
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.law import Law, LinearizingLaw, OpenLoopLaw, StepLaw
 from needle_controller.model.gains import Gains
@@ -46,7 +47,9 @@ def observer_settings(settings: SteeringSettings, gains: Gains) -> LuenbergerSet
 
 
 def make_controller(
-    settings: SteeringSettings, initial_rotation: npt.ArrayLike
+    settings: SteeringSettings,
+    initial_rotation: npt.ArrayLike,
+    entry: npt.ArrayLike | None = None,
 ) -> tuple[Estimator, StepLaw]:
     """Return a preset's estimator and law, for one needle or for as many as there will be tips.
 
@@ -56,6 +59,8 @@ def make_controller(
         The preset and its numbers.
     initial_rotation : array_like, shape (3, 3)
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
+    entry : array_like, shape (3,), optional
+        Where it enters, in `target_plane` [m]; not known if none is given.
     """
     plan = FlipPlan(settings.flip_depths)
     if settings.preset == "best":
@@ -65,7 +70,8 @@ def make_controller(
             noise_hypotheses=BOUNDED_NOISE if settings.has_bounded_noise else NORMAL_NOISE,
             initial_angle_std=settings.entry_angle_std,
         )
-        return HypothesisFilter(known, initial_rotation), roll_law(settings, plan)
+        estimator = LateTips(HypothesisFilter(known, initial_rotation), entry)
+        return estimator, roll_law(settings, plan)
     gains = settings.gains()
     paper_law = make_law(settings, gains)
     observer = LuenbergerObserver(observer_settings(settings, gains), initial_rotation)

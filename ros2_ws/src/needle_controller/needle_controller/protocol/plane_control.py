@@ -7,14 +7,14 @@ import math
 
 import numpy as np
 
-from needle_controller.laws.law import SteeringCommand
+from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.model.point_reach import point_reachability
 from needle_controller.model.reachability import Reachability, reachability
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.model.target_plane import TargetPlane
-from needle_controller.observers.estimator import Estimate
+from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.path_steering import PathSteering, configured_obstacles
 from needle_controller.presets.point_steering import PointSteering, point_law
@@ -85,7 +85,7 @@ class PlaneControl:
         self.target_point = _point(settings)
         self.obstacles = configured_obstacles(settings)
         self._path = PathSteering(settings)
-        self._estimator, self._law = make_controller(settings, plane.T_plane_rig[:3, :3])
+        self._estimator, self._law = _new_controller(settings, plane)
         self._joints: JointSample | None = None
         self._first_joints: JointSample | None = None
         self._warm_up()
@@ -134,8 +134,7 @@ class PlaneControl:
         A preset that cannot steer to a point ends it.
         """
         if self._joints is None:
-            rotation = self._plane.T_plane_rig[:3, :3]
-            self._estimator, self._law = make_controller(settings, rotation)
+            self._estimator, self._law = _new_controller(settings, self._plane)
         else:
             # A new estimator that starts where the needle is now, its base turned as it is.
             now, joints = self._estimator.estimate(), self._joints
@@ -157,8 +156,7 @@ class PlaneControl:
 
     def restart(self) -> None:
         """Forget the needle: the next tip is the first."""
-        rotation = self._plane.T_plane_rig[:3, :3]
-        self._estimator, self._law = make_controller(self._settings, rotation)
+        self._estimator, self._law = _new_controller(self._settings, self._plane)
         self._joints = self._first_joints = None
         if self._points is not None:
             self._points = PointSteering(self._settings, self._points.motion)
@@ -279,6 +277,11 @@ class PlaneControl:
             ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
             PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)
         estimate.covariance  # noqa: B018 - lazy, and compiled too
+
+
+def _new_controller(settings: SteeringSettings, plane: TargetPlane) -> tuple[Estimator, StepLaw]:
+    """Return estimator and law of a needle that is out, along z of `rig` at its origin."""
+    return make_controller(settings, plane.T_plane_rig[:3, :3], plane.from_rig(np.zeros(3)))
 
 
 def _point(settings: SteeringSettings) -> Array | None:

@@ -193,7 +193,7 @@ def controller_factory(
         If there is no such controller, or it cannot flip.
     """
     settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths)
-    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3)), covariance)
+    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3), np.zeros(3)), covariance)
 
 
 def point_controller_factory(
@@ -214,7 +214,7 @@ def point_controller_factory(
             return sliding_law(motion, settings.max_rotation_per_length)
         return PointSteering(settings, motion).command
 
-    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3))[0], new_law, covariance)
+    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3), np.zeros(3))[0], new_law, covariance)
 
 
 def _what_is_told(

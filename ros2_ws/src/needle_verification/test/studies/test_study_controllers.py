@@ -42,7 +42,7 @@ def test_the_controller_is_told_what_is_claimed(
     made: list[SteeringSettings] = []
     recorder = Recorder(FilterSettings())
 
-    def make(settings: SteeringSettings, rotation: Array) -> tuple[Recorder, Any]:
+    def make(settings: SteeringSettings, *_: Array) -> tuple[Recorder, Any]:
         made.append(settings)
         return recorder, still
 

@@ -1,0 +1,124 @@
+"""Tips that are late and do not say so, and what only looks like it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.bank.late_tips import FIRST, LATE, LateTips, untold_age
+from needle_controller.model.arrays import Array
+
+STEP = 0.001
+RADIUS = 0.122
+NEEDLES = 20
+KNOWN = {"entry_std": 0.0005, "bound": 0.001, "scale_spread": 0.04}
+
+
+def arc(inserted: Array | float) -> Array:
+    """Return tips of a needle that bends, (..., 3) [m]."""
+    angle = np.asarray(inserted) / RADIUS
+    x = RADIUS * (1.0 - np.cos(angle))
+    return np.stack([x, np.zeros_like(x), RADIUS * np.sin(angle)], axis=-1)
+
+
+def inserted_by(
+    steps: int,
+    *,
+    late: int = 0,
+    age: float = 0.0,
+    slip: float = 0.0,
+    bump: float = 0.0,
+    outliers: float = 0.0,
+    at: Array | None = None,
+) -> LateTips:
+    """Return what has seen needles that are inserted without a turn, tips with +-1 mm noise.
+
+    In the middle of it everything may be expressed in another frame, (4, 4).
+    """
+    rng = np.random.default_rng(7)
+    turn, offset = (np.eye(3), np.zeros(3)) if at is None else (at[:3, :3], at[:3, 3])
+    estimator = LateTips(HypothesisFilter(FilterSettings()), np.zeros(3))
+    estimator.reset(rng.uniform(-STEP, STEP, (NEEDLES, 3)), np.zeros(2))
+    for k in range(1, steps + 1):
+        estimator.advance(STEP, 0.0)
+        tips = arc(max(k - late, 0) * STEP / (1.0 + slip)) + rng.uniform(-STEP, STEP, (NEEDLES, 3))
+        tips[:, 2] -= bump if k > 25 else 0.0
+        off = np.where(rng.random(NEEDLES) < outliers, 0.005, 0.0)[:, None]
+        tips += off * rng.uniform(-1.0, 1.0, (NEEDLES, 3))
+        if at is not None and k == 10:
+            estimator.change_frame(at)
+        if k >= 10:
+            tips = tips @ turn.T + offset
+        estimator.correct(tips, age=min(age, k * STEP))
+    return estimator
+
+
+@pytest.mark.parametrize("late", [3, 5])
+def test_late_tips_are_taken_as_late_and_doubted(late: int) -> None:
+    estimate = inserted_by(40, late=late).estimate()
+    np.testing.assert_array_equal(estimate.doubtful, True)
+    assert LATE in estimate.doubts
+    # Where the needle is, not where it was.
+    off = estimate.position[:, 2] - arc(40 * STEP)[2]
+    assert np.max(np.abs(off)) < STEP
+
+
+def test_late_tips_are_the_same_in_another_frame() -> None:
+    at = np.eye(4)
+    # Axis for axis: noise is bounded along each.
+    at[:3] = [[0.0, 1.0, 0.0, 0.01], [-1.0, 0.0, 0.0, -0.02], [0.0, 0.0, 1.0, 0.03]]
+    elsewhere, here = inserted_by(30, late=3, at=at).estimate(), inserted_by(30, late=3).estimate()
+    assert LATE in elsewhere.doubts
+    np.testing.assert_allclose(
+        elsewhere.position, here.position @ at[:3, :3].T + at[:3, 3], atol=2e-4
+    )
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {},
+        {"slip": 0.05},
+        {"slip": 0.1},
+        {"slip": -0.05},
+        {"bump": 0.003},
+        {"outliers": 0.1},
+        {"late": 3, "age": 3 * STEP},
+    ],
+)
+def test_what_is_not_late_or_says_so_is_not_called_late(other: dict[str, float]) -> None:
+    assert LATE not in inserted_by(40, **other).estimate().doubts  # type: ignore[arg-type]
+
+
+def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
+    """Return insertions, and the ways of tips without noise."""
+    inserted = np.arange(1, 21) * STEP
+    return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
+
+
+def test_an_age_is_not_a_slip() -> None:
+    inserted, ways = seen(0.003)
+    # Two coordinates of two tips are off by what is claimed, in the mean.
+    ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
+    assert untold_age(inserted, ways, np.zeros(()), **KNOWN) == pytest.approx(0.003, abs=1e-4)
+    assert untold_age(*seen(0.0, 0.2), np.zeros(()), **KNOWN) == 0.0
+
+
+def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:
+    inserted, ways = seen(0.0)
+    ways[:, 2] -= 0.0022
+    unknown = {**KNOWN, "entry_std": np.inf}
+    assert untold_age(inserted, ways, np.zeros(()), **unknown) > 0.0
+    assert untold_age(inserted, ways, np.array(0.0022), **KNOWN) == 0.0
+
+
+def test_nothing_is_said_without_a_start_or_without_tips() -> None:
+    inserted, ways = seen(0.003)
+    few = np.where((inserted < FIRST + 4.5 * STEP)[:, None], ways, np.nan)
+    every = np.stack([few, np.full_like(ways, np.nan), ways], axis=1)
+    ages = untold_age(inserted[:, None], every, np.zeros(3), **KNOWN)
+    np.testing.assert_array_equal(ages > 0.0, [True, False, True])
+    few[np.argmax(inserted >= FIRST)] = np.nan
+    assert untold_age(inserted, few, np.zeros(()), **KNOWN) == 0.0
