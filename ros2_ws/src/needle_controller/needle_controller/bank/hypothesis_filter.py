@@ -194,24 +194,18 @@ class HypothesisFilter:
         pending = np.sum([length for length, _ in self._queue], axis=0) + np.zeros(len(age))
         ahead = pending - age
         too_late = ahead < -AGE_TOLERANCE
-        if np.all(np.abs(age) <= AGE_TOLERANCE):
-            for length, turn in self._queue:
-                self._move(self._bank, length, turn)
-            self._queue = []
-            return cast(npt.NDArray[np.bool_], too_late)
-        while self._queue and np.any(ahead > AGE_TOLERANCE):
-            length, turn = self._queue.pop(0)
+        queue, self._queue = self._queue, []
+        for length, turn in queue:
             take = np.clip(ahead, 0.0, length)
             # What only turned belongs to the place it turned at.
-            share = np.where(length > 0.0, take / np.where(length > 0.0, length, 1.0), ahead > 0.0)
+            turned = (ahead > 0.0) | (age <= AGE_TOLERANCE)
+            share = np.where(length > 0.0, take / np.where(length > 0.0, length, 1.0), turned)
             share = np.where(share > 1.0 - 1e-9, 1.0, share)
-            self._move(self._bank, share * length, share * turn)
+            if np.any(share > 0.0):
+                self._move(self._bank, share * length, share * turn)
             ahead = ahead - take
             if np.any(share < 1.0):
-                rest = 1.0 - share
-                self._queue.insert(0, (rest * length, rest * turn))
-                if not np.any(take > 0.0):
-                    break
+                self._queue.append(((1.0 - share) * length, (1.0 - share) * turn))
         return cast(npt.NDArray[np.bool_], too_late)
 
     def _looked_ahead(self) -> Bank:
