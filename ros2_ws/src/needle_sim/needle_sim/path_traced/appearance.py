@@ -11,7 +11,7 @@ from needle_common.errors import UserError
 
 Metal = Literal["polished", "drawn", "oxide", "painted"]
 Lamps = Literal["softbox", "softboxes", "strip", "room"]
-Floor = Literal["grey", "dark", "light", "graph", "brushed", "cloth", "print", "panel"]
+Floor = Literal["grey", "dark", "light", "graph", "brushed", "cloth", "print", "panel", "clutter"]
 
 METALS: tuple[Metal, ...] = get_args(Metal)
 LAMPS: tuple[Lamps, ...] = get_args(Lamps)
@@ -29,6 +29,7 @@ _LEVELS: dict[Floor, tuple[float, float]] = {
     "cloth": (60.0, 165.0),
     "print": (110.0, 195.0),
     "panel": (140.0, 215.0),
+    "clutter": (50.0, 150.0),
 }
 # Roughness (GGX alpha) along the shaft, across it and of the ground face, by metal.
 _ROUGHNESS: dict[Metal, tuple[tuple[float, float], ...]] = {
@@ -56,7 +57,7 @@ class Appearance:
     roughness_along, roughness_across, face_roughness : float
         GGX alpha of the shaft, along and across, 0.05 to 0.45, and of the ground face, 0.05 to 0.4.
     diameter : float
-        Of the shaft: 0.7 mm three times in five, else 0.5 to 1 mm [m].
+        Of the shaft: 0.7 mm three times in five, else 0.5 to 1.3 mm [m].
     bevel_angle : float
         Between ground face and axis, 18 to 45 deg [rad].
     hollow : bool
@@ -68,17 +69,21 @@ class Appearance:
     room_light : float
         Light of the room over that of the lamps, 0.04 to 0.6.
     floor : str
-        One of `FLOORS`.
+        One of `FLOORS`: under the phantom, or behind a clear box, for each camera another.
     floor_height : float
         x of the floor in `rig`, -35 to -18 mm [m].
+    behind : float
+        How far behind a clear box there is what a camera sees through it, 5 to 120 mm [m].
     floor_level : float
         Median of the image without needle [grey levels].
     floor_blur_px : float
         How much less sharp the floor is than the needle, 0 to 2.5 px [px].
     bubbles, lint, tracks : int
-        How many: 0 to 90, 0 to 25, 0 to 3 (paths of older needles).
+        How many: 0 to 90, 0 to 25, 0 to 4 (paths of older needles).
+    track_strength : float
+        Contrast of the strongest path of an older needle, 0.03 to 0.35.
     haze : float
-        Share of the light that the phantom scatters on the way to the camera, 0 to 0.35.
+        Share of the light that the phantom scatters on the way through it, 0 to 0.35.
     blur_px : float
         Standard deviation of the lens's blur at the needle, 0.3 to 1.1 px [px].
     bloom : float
@@ -89,6 +94,8 @@ class Appearance:
         Of the noise at full scale, from the light itself, 0.5 to 5 [grey levels].
     flicker : float
         Standard deviation of the exposure from pair to pair, 0 to 0.03.
+    lag : float
+        How much farther in the needle is when the right camera exposes, 0 to 0.2 mm [m].
     """
 
     name: str
@@ -106,17 +113,20 @@ class Appearance:
     room_light: float
     floor: Floor
     floor_height: float
+    behind: float
     floor_level: float
     floor_blur_px: float
     bubbles: int
     lint: int
     tracks: int
+    track_strength: float
     haze: float
     blur_px: float
     bloom: float
     noise: float
     shot_noise: float
     flicker: float
+    lag: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,6 +164,9 @@ APPEARANCES = {
     "oxide_on_grey": Fixed("dark oxide under two softboxes", "oxide", "softboxes", "grey"),
     "oxide_over_lit_panel": Fixed("dark oxide against a lit panel", "oxide", "softbox", "panel"),
     "painted_on_print": Fixed("black paint over printed paper", "painted", "softbox", "print"),
+    "drawn_before_clutter": Fixed(
+        "drawn steel, screws and cables behind", "drawn", None, "clutter"
+    ),
     "absent": Fixed("no needle: bubbles, lint, print; all drawn by the seed", needle=False),
 }
 """The names, and what each fixes."""
@@ -204,7 +217,7 @@ def draw_appearance(name: str, seed: int) -> Appearance:
         roughness_along=along,
         roughness_across=across,
         face_roughness=face,
-        diameter=some(0.4, 0.0005, 0.001) or _PLAIN_DIAMETER,
+        diameter=some(0.4, 0.0005, 0.0013) or _PLAIN_DIAMETER,
         bevel_angle=float(np.deg2rad(between(18.0, 45.0))),
         hollow=bool(rng.random() < 0.35),
         lean=float(np.deg2rad(some(0.4, 2.0, 6.0))),
@@ -216,11 +229,14 @@ def draw_appearance(name: str, seed: int) -> Appearance:
         floor_blur_px=some(0.7, 0.2, 2.5),
         bubbles=round(some(0.8, 3.0, 90.0)),
         lint=round(some(0.7, 1.0, 25.0)),
-        tracks=round(some(0.4, 0.51, 3.49)),
+        tracks=round(some(0.5, 0.51, 4.49)),
         haze=some(0.4, 0.05, 0.35),
         blur_px=between(0.3, 1.1),
         bloom=some(0.6, 0.005, 0.05),
         noise=between(0.4, 4.0),
         shot_noise=between(0.5, 5.0),
         flicker=some(0.6, 0.003, 0.03),
+        lag=some(0.3, 0.00002, 0.0002),
+        behind=between(0.005, 0.12),
+        track_strength=between(0.03, 0.35),
     )

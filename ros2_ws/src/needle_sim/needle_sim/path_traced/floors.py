@@ -12,7 +12,7 @@ from needle_sim.camera.optics import FloatImage
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Floor
 
-# What the picture covers in `rig`: y over its rows, z over its columns [m].
+# What the picture covers: what is across the needle over its rows, z over its columns [m].
 SIDE = 0.1
 BEGIN = -0.06
 END = 0.2
@@ -28,6 +28,7 @@ ALBEDO: dict[Floor, float] = {
     "cloth": 0.35,
     "print": 0.75,
     "panel": 0.6,
+    "clutter": 0.4,
 }
 """Share of the light that the plain floor gives back."""
 
@@ -47,10 +48,10 @@ class FloorPicture:
 
     reflectance: FloatImage
 
-    def at(self, points: FloatArray) -> FloatImage:
-        """Return the reflectance, (rows, columns), at points (rows, columns, 3) in `rig` [m]."""
-        column = ((points[..., 2] - BEGIN) / SPACING - 0.5).astype(np.float32)
-        row = ((points[..., 1] + SIDE) / SPACING - 0.5).astype(np.float32)
+    def at(self, aside: FloatArray, along: FloatArray) -> FloatImage:
+        """Return the reflectance, (rows, columns), at places, both (rows, columns) [m]."""
+        column = ((along - BEGIN) / SPACING - 0.5).astype(np.float32)
+        row = ((aside + SIDE) / SPACING - 0.5).astype(np.float32)
         sampled = cv2.remap(
             self.reflectance, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT
         )
@@ -81,6 +82,8 @@ def floor_picture(floor: Floor, rng: np.random.Generator) -> FloorPicture:
         picture *= _weave(rng)
     elif floor == "print":
         picture *= _print(rng)
+    elif floor == "clutter":
+        picture *= _clutter(rng)
     elif floor == "panel":
         picture *= 1.0 - rng.uniform(0.0, 0.03) * _dots(rng)
     return FloorPicture(np.clip(picture, 0.01, 0.95))
@@ -178,3 +181,43 @@ def _print(rng: np.random.Generator) -> FloatImage:
             cv2.circle(ink, place, round(size), 255, thick, cv2.LINE_AA)
     strength = rng.uniform(0.3, 0.9)
     return np.asarray(1.0 - strength / 255.0 * ink, dtype=np.float32)
+
+
+def _clutter(rng: np.random.Generator) -> FloatImage:
+    """Return rails, cables and screws of 0.2 to 2 times the wall's brightness."""
+    seen = np.ones(_SHAPE, dtype=np.float32)
+    rows, columns = _SHAPE
+
+    def place() -> tuple[int, int]:
+        return int(rng.integers(columns)), int(rng.integers(rows))
+
+    for _ in range(rng.integers(2, 7)):
+        # Rails and edges: along the needle or across it, askew by a little.
+        middle, size = (
+            place(),
+            (rng.uniform(0.04, 0.25) / SPACING, rng.uniform(0.003, 0.03) / SPACING),
+        )
+        turned = float(rng.normal(0.0, 3.0)) + (90.0 if rng.random() < 0.4 else 0.0)
+        corners = cv2.boxPoints((middle, size, turned)).astype(np.int32)
+        shade = float(rng.uniform(0.3, 1.6))
+        cv2.fillPoly(seen, [corners], shade, cv2.LINE_AA)
+        if rng.random() < 0.6:
+            cv2.polylines(seen, [corners], True, 0.4 * shade, int(rng.integers(2, 12)), cv2.LINE_AA)
+    for _ in range(rng.integers(0, 4)):
+        bend = np.cumsum(rng.normal(0.0, 0.006, (30, 2)).cumsum(axis=0), axis=0) / SPACING / 3.0
+        cable = (bend + place()).astype(np.int32)
+        thick = round(float(rng.uniform(0.001, 0.006)) / SPACING)
+        shade = float(rng.uniform(0.1, 0.6))
+        cv2.polylines(seen, [cable], False, shade, thick, cv2.LINE_AA)
+        cv2.polylines(seen, [cable], False, 1.8 * shade, max(thick // 4, 1), cv2.LINE_AA)
+    for _ in range(rng.integers(2, 12)):
+        # A head that shines on one side, and its slot.
+        middle, radius = place(), round(float(rng.uniform(0.0015, 0.006)) / SPACING)
+        bright = float(rng.uniform(0.4, 2.0))
+        cv2.circle(seen, middle, radius + 4, 0.3, -1, cv2.LINE_AA)
+        cv2.circle(seen, middle, radius, bright, -1, cv2.LINE_AA)
+        turned = float(rng.uniform(0.0, np.pi))
+        away = round(0.8 * radius * np.cos(turned)), round(0.8 * radius * np.sin(turned))
+        first, last = ((middle[0] + k * away[0], middle[1] + k * away[1]) for k in (-1, 1))
+        cv2.line(seen, first, last, 0.2, max(radius // 4, 1), cv2.LINE_AA)
+    return np.asarray(cv2.GaussianBlur(seen, (0, 0), rng.uniform(1.0, 6.0)), dtype=np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Iterator
 
@@ -16,7 +17,6 @@ from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray, exp_twist
 from needle_sim.path_traced.appearance import Appearance
-from needle_sim.path_traced.level_surface import check_level
 from needle_sim.path_traced.needle_mesh import NeedleEnd, NeedleMesh, needle_mesh
 from needle_sim.path_traced.renderer import PathTracedRenderer
 from needle_sim.path_traced.tracer import Mitsuba
@@ -44,8 +44,9 @@ class TracedPair:
         What the stage says [m].
     truth : Truth or None
         None where there is no needle in the phantom.
-    mesh : NeedleMesh or None
-        The needle that was drawn, with its extreme point and the middle of its face.
+    meshes : pair of NeedleMesh or None
+        The needle that left and right saw, with its extreme point and the middle of its face; the
+        right one is farther in where its camera exposes later.
     share_seen : pair of float
         Of the needle's last 10 mm, by the left and the right camera.
     """
@@ -54,7 +55,7 @@ class TracedPair:
     images: tuple[GreyImage, GreyImage]
     insertion: float
     truth: Truth | None
-    mesh: NeedleMesh | None
+    meshes: tuple[NeedleMesh, NeedleMesh] | None
     share_seen: tuple[float, float]
 
 
@@ -101,9 +102,8 @@ def trace_insertion(
     Raises
     ------
     UserError
-        If no path of this depth stays inside the phantom, or the rig has windows.
+        If no path of this depth stays inside the phantom.
     """
-    check_level(rig)
     path = random_path(look.seed, depth, (rig.half_height, rig.half_width), curvature)
     plant = NeedlePlant(_entry(look.seed, path), curvature=curvature)
     optics = [Optics(camera, None) for camera in (rig.left, rig.right)]
@@ -113,19 +113,20 @@ def trace_insertion(
         for number in range(frames):
             insertion = min(begin + number * step, depth)
             advance_to(plant, insertion, path.rotation)
-            truth = mesh = None
+            truth = meshes = None
             seen = (0.0, 0.0)
             if look.needle and insertion > 0.0:
-                pose = plant.T_rig_tip
-                line = _middle_line(plant, look)
-                end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
-                # It bends towards its sharp side.
-                mesh = needle_mesh(line, -pose[:3, 1], end)
-                truth = truth_of(pose, _shape(look))
-                distal = line[-int(_DISTAL_LENGTH / _SPACING) :]
-                seen = (_share_seen(distal, optics[0]), _share_seen(distal, optics[1]))
-            images = renderer.render(mesh, number)
-            yield TracedPair(number, images, insertion, truth, mesh, seen)
+                left = right = _mesh(plant, look)
+                truth = truth_of(plant.T_rig_tip, _shape(look))
+                if look.lag > 0.0:
+                    later = copy.deepcopy(plant)
+                    advance_to(later, min(insertion + look.lag, depth), path.rotation)
+                    right = _mesh(later, look)
+                meshes = left, right
+                distal = [mesh.line[-int(_DISTAL_LENGTH / _SPACING) :] for mesh in meshes]
+                seen = (_share_seen(distal[0], optics[0]), _share_seen(distal[1], optics[1]))
+            images = renderer.render(meshes, number)
+            yield TracedPair(number, images, insertion, truth, meshes, seen)
 
     return pairs()
 
@@ -150,6 +151,12 @@ def _shape(look: Appearance) -> NeedleShape:
         return NeedleShape(diameter=look.diameter, bend_angle=0.0, lean=0.0)
     # Half of the bend leans the end to one side of the path, half the shaft to the other.
     return NeedleShape(diameter=look.diameter, bend_angle=2.0 * look.lean, lean=look.lean)
+
+
+def _mesh(plant: NeedlePlant, look: Appearance) -> NeedleMesh:
+    end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
+    # It bends towards its sharp side.
+    return needle_mesh(_middle_line(plant, look), -plant.T_rig_tip[:3, 1], end)
 
 
 def _middle_line(plant: NeedlePlant, look: Appearance) -> FloatArray:

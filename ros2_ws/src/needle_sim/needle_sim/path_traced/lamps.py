@@ -8,9 +8,10 @@ import numpy as np
 
 from needle_sim.camera.projection import refraction_point
 from needle_sim.camera.stereo_rig import StereoRig
+from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Lamps
-from needle_sim.path_traced.level_surface import refractive_index
+from needle_sim.path_traced.block import refractive_index
 
 MIDDLE = np.array([0.0, 0.0, 0.06])
 """Of what the cameras see of the phantom, in `rig` [m]: lamps point there."""
@@ -70,13 +71,15 @@ def apparent_centre(lamp: Lamp, rig: StereoRig) -> FloatArray:
     """Return where a lamp seems to stand from the middle of the phantom, (3,) in `rig` [m].
 
     It is seen straight above its place on the ground, as much higher as Snell's law makes the light
-    steeper inside.
+    steeper inside: through a level top without layers, whatever the cameras look through.
     """
-    crossing = refraction_point(MIDDLE, lamp.centre, rig.left.window)
+    up, index = np.array([1.0, 0.0, 0.0]), refractive_index(rig)
+    top = SimulatedWindow(up, rig.half_height, (), (index,))
+    crossing = refraction_point(MIDDLE, lamp.centre, top)
     inside = crossing - MIDDLE
     aside = lamp.centre[1:] - MIDDLE[1:]
     bent = float(np.linalg.norm(inside[1:]))
-    height = refractive_index(rig) * lamp.centre[0]
+    height = index * lamp.centre[0]
     if bent > 1e-6:
         height = inside[0] / bent * float(np.linalg.norm(aside))
     return np.array([height, *lamp.centre[1:]])

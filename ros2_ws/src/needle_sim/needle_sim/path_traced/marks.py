@@ -1,4 +1,4 @@
-"""Thin things in the phantom that are drawn, not traced: lint, dust, and paths of older needles."""
+"""What is drawn and not traced: lint, dust, paths of older needles, and edges of a clear box."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import numpy as np
 
 from needle_sim.camera.insertions import CURVATURE, advance_to, random_path
 from needle_sim.camera.optics import FloatImage, Optics
-from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.camera.stroke import stroke
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.appearance import Appearance
+from needle_sim.path_traced.block import LENGTH, is_box, sides
+from needle_sim.path_traced.world import World
 
 _STREAM = 32
 _SPACING = 0.0004
-# Where lint is: heights over the floor's, to both sides, along the needle [m].
-_SIDE = 0.055
+# Where lint is, along the needle, and how far from the phantom's faces at least [m].
 _LENGTHS = (0.004, 0.14)
+_CLEARANCE = 0.001
 _FIBRE_LENGTHS = (0.0005, 0.007)
 _FIBRE_DIAMETERS = (0.00003, 0.00012)
 _DUST_SHARE = 0.5
@@ -25,7 +25,7 @@ _DUST_DIAMETERS = (0.00008, 0.0003)
 _LINT_BLUR_PX = 0.4
 _TRACK_DIAMETERS = (0.0003, 0.0009)
 _TRACK_DEPTHS = (0.03, 0.12)
-_TRACK_STRENGTH = (0.03, 0.14)
+_TRACK_ASIDE = 0.01
 # Clouds come and go over such a length, and thin out over the last of it [m].
 _CLOUD_LENGTH = 0.005
 # A track's edge is no edge: it blurs over this [px].
@@ -33,23 +33,24 @@ _TRACK_BLUR_PX = 1.5
 
 
 class Marks:
-    """Lint and old paths of one phantom; each camera sees the same ones.
+    """Lint, old paths and edges of one phantom; each camera sees the same ones.
 
     Parameters
     ----------
-    look : Appearance
-        How many, and the seed.
-    rig : StereoRig
-        The phantom.
+    world : World
+        The phantom, how many, and the seed.
     """
 
-    def __init__(self, look: Appearance, rig: StereoRig) -> None:
+    def __init__(self, world: World) -> None:
+        look = world.look
         rng = np.random.default_rng([look.seed, 0, _STREAM])
         self._lines: list[tuple[FloatArray, float, FloatArray, float]] = []
         for _ in range(look.tracks):
-            self._add_track(rng, rig)
+            self._add_track(rng, world)
         for _ in range(look.lint):
-            self._add_lint(rng, look, rig)
+            self._add_lint(rng, world)
+        if is_box(world.rig):
+            self._add_edges(rng, world)
 
     def draw(self, image: FloatImage, optics: Optics, white: float) -> None:
         """Draw them over an image of the floor.
@@ -75,11 +76,10 @@ class Marks:
             colour = np.where(grey[seen.sample] > 0.0, white, 0.0)
             image[there] += seen.coverage * strength * (colour - image[there])
 
-    def _add_lint(self, rng: np.random.Generator, look: Appearance, rig: StereoRig) -> None:
+    def _add_lint(self, rng: np.random.Generator, world: World) -> None:
         """Add a fibre that is bent and turned at random, or a speck; light or dark."""
-        low = [look.floor_height, -_SIDE, _LENGTHS[0]]
-        high = [rig.half_height - 0.001, _SIDE, _LENGTHS[1]]
-        middle = rng.uniform(low, high)
+        low, high = np.transpose([*sides(world.rig, world.look), _LENGTHS])
+        middle = rng.uniform(low + _CLEARANCE, high - _CLEARANCE)
         is_dust = rng.random() < _DUST_SHARE
         length = _DUST_LENGTH if is_dust else rng.uniform(*_FIBRE_LENGTHS)
         diameter = rng.uniform(*(_DUST_DIAMETERS if is_dust else _FIBRE_DIAMETERS))
@@ -91,19 +91,31 @@ class Marks:
         strength = rng.uniform(0.3, 1.0) * rng.choice([-1.0, 1.0])
         self._lines.append((line, float(diameter), np.full(count, strength), _LINT_BLUR_PX))
 
-    def _add_track(self, rng: np.random.Generator, rig: StereoRig) -> None:
+    def _add_edges(self, rng: np.random.Generator, world: World) -> None:
+        """Add the box's four edges along the needle, where its walls are glued together."""
+        z = np.arange(0.0, LENGTH, _SPACING)
+        (_, x), (_, y) = sides(world.rig, world.look)
+        for up, aside in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
+            line = np.stack([np.full_like(z, up * x), np.full_like(z, aside * y), z], axis=1)
+            strength = rng.uniform(0.2, 0.8) * rng.choice([-1.0, 1.0])
+            diameter = world.wall * float(rng.uniform(0.1, 1.0))
+            self._lines.append((line, diameter, np.full(len(z), strength), _TRACK_BLUR_PX))
+
+    def _add_track(self, rng: np.random.Generator, world: World) -> None:
         """Add the path of an older needle: gel that is torn and clouded, unevenly."""
-        depth = rng.uniform(*_TRACK_DEPTHS)
+        depth, rig = rng.uniform(*_TRACK_DEPTHS), world.rig
         path = random_path(
             int(rng.integers(2**31)), depth, (rig.half_height, rig.half_width), CURVATURE
         )
         plant = NeedlePlant(initial_pose(path.pitch, path.roll), curvature=CURVATURE)
         advance_to(plant, depth, path.rotation)
         line = plant.centreline(_SPACING)
-        line[:, 1] += rng.uniform(-0.01, 0.01)
+        line[:, 1] += rng.uniform(-_TRACK_ASIDE, _TRACK_ASIDE)
         smooth = np.hanning(round(2.0 * _CLOUD_LENGTH / _SPACING))
         cloud = np.convolve(rng.standard_normal(len(line)), smooth / np.linalg.norm(smooth), "same")
-        strength = rng.uniform(*_TRACK_STRENGTH) * np.clip(1.0 + 0.6 * cloud, 0.0, 2.5)
+        strength = (
+            rng.uniform(0.2, 1.0) * world.look.track_strength * np.clip(1.0 + 0.6 * cloud, 0.0, 2.5)
+        )
         left = np.arange(len(line))[::-1] * _SPACING
         strength *= np.clip(left / _CLOUD_LENGTH, 0.0, 1.0)
         sign = 1.0 if rng.random() < 0.7 else -1.0

@@ -43,8 +43,8 @@ class PathTracer:
         *,
         samples: int,
         key: list[int],
-    ) -> tuple[FloatArray, FloatArray]:
-        """Return light and coverage of what stands before the floor.
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return light, coverage and distance of what stands before the floor.
 
         Parameters
         ----------
@@ -67,6 +67,8 @@ class PathTracer:
             Mean radiance of a pixel's paths, those that meet the floor first counted as 0.
         cover : ndarray, shape (N,)
             Share of the paths that meet something else first.
+        way : ndarray, shape (N,)
+            How far those go, on average over all paths: times `cover` the distance [m].
         """
         parts = [
             self._part(scene, part, camera, rig, samples=samples, key=[*key, number])
@@ -76,9 +78,9 @@ class PathTracer:
             if len(part)
         ]
         if not parts:
-            return np.zeros(0), np.zeros(0)
-        light, cover = (np.concatenate(which) for which in zip(*parts, strict=True))
-        return light, cover
+            return np.zeros(0), np.zeros(0), np.zeros(0)
+        light, cover, way = (np.concatenate(which) for which in zip(*parts, strict=True))
+        return light, cover, way
 
     def covered(
         self, scene: Scene, pixels: PixelArray, camera: SimulatedCamera, rig: StereoRig
@@ -89,13 +91,13 @@ class PathTracer:
         origin = mi.Point3f(*(MM * rays.origin.T).astype(np.float32))
         direction = mi.Vector3f(*rays.direction.T.astype(np.float32))
         hit = scene.tracer.ray_intersect_preliminary(mi.Ray3f(origin, direction), coherent=True)
-        before = hit.is_valid() & (hit.shape != mi.ShapePtr(scene.floor))
+        before = self._before(hit, scene)
         return np.asarray(before, dtype=np.bool_)
 
     def floor_light(
         self, scenes: list[Scene], points: FloatArray, *, samples: int, key: list[int]
     ) -> list[FloatArray]:
-        """Return the light that falls on places of the floor in each of several scenes.
+        """Return the light that falls from above on places in each of several scenes.
 
         Only what comes straight from lamps and room counts. The scenes' light is sampled alike, so
         that their ratio shows what stands in the way and no noise.
@@ -127,10 +129,11 @@ class PathTracer:
         )
         light = weight.x * self._dr.maximum(towards.d.x, 0.0) / np.pi
         ray = at.spawn_ray_to(towards.p)
-        return [
-            self._mean(self._dr.select(scene.tracer.ray_test(ray), 0.0, light), samples)
-            for scene in scenes
+        # A floor throws no shadow: another camera's backdrop is no wall between lamp and box.
+        blocked = [
+            self._before(scene.tracer.ray_intersect_preliminary(ray), scene) for scene in scenes
         ]
+        return [self._mean(self._dr.select(hidden, 0.0, light), samples) for hidden in blocked]
 
     def _part(
         self,
@@ -141,7 +144,7 @@ class PathTracer:
         *,
         samples: int,
         key: list[int],
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         mi = self._mi
         sampler = self._sampler(key, len(pixels) * samples)
         index = self._index(len(pixels), samples)
@@ -167,11 +170,20 @@ class PathTracer:
             mi.Ray3f(mi.Point3f(origin), mi.Vector3f(self._dr.normalize(direction)))
         )
         hit = scene.tracer.ray_intersect_preliminary(ray, coherent=True)
-        before = hit.is_valid() & (hit.shape != mi.ShapePtr(scene.floor))
+        before = self._before(hit, scene)
         light, _, _ = self._integrator.sample(scene.tracer, sampler, ray, None, before)
         cover = self._dr.select(before, mi.Float(1.0), 0.0)
         bounded = self._dr.select(before, self._dr.minimum(light.x, _BRIGHTEST), 0.0)
-        return self._mean(bounded, samples), self._mean(cover, samples)
+        way = self._dr.select(before, hit.t / MM, 0.0)
+        mean = self._mean
+        return mean(bounded, samples), mean(cover, samples), mean(way, samples)
+
+    def _before(self, hit: Any, scene: Scene) -> Any:
+        """Return which rays meet something, and not a floor."""
+        before = hit.is_valid()
+        for floor in scene.floors:
+            before &= hit.shape != self._mi.ShapePtr(floor)
+        return before
 
     def _sampler(self, key: list[int], size: int) -> Any:
         sampler = self._mi.load_dict({"type": "independent"})

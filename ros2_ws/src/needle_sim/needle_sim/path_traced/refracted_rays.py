@@ -1,51 +1,51 @@
-"""Rays from a camera's pixels into the phantom: Snell's law at its flat top, exactly."""
+"""Rays from a camera's pixels into the phantom: Snell's law at its window's faces, exactly."""
 
 from __future__ import annotations
 
 import dataclasses
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.path_traced.level_surface import refractive_index
+from needle_sim.path_traced.block import LENGTH, is_box, reach_sideways
 
 # Each iteration leaves less than a hundredth of the lens distortion's error.
-_UNDISTORTING_STEPS = 7
+_UNDISTORTING_STEPS = 14
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Rays:
-    """Rays that start on the plane of the phantom's top.
+    """Rays that start where lines of sight enter the phantom, or pass it by.
 
     Attributes
     ----------
     origin : ndarray, shape (..., 3)
-        Where the line of sight crosses that plane, in `rig` [m].
+        On the window's inner face, in `rig`; of lines of sight that pass it by, on the outer [m].
     direction : ndarray, shape (..., 3)
-        Of unit length, in `rig`, below that plane.
-    incoming : ndarray, shape (..., 3)
-        Of unit length, in `rig`, above that plane: from the camera down.
+        Of unit length, in `rig`, behind that face.
+    in_air : ndarray of bool, shape (...)
+        Whether a line of sight passes the phantom by: nothing bends it.
     """
 
     origin: FloatArray
     direction: FloatArray
-    incoming: FloatArray
+    in_air: NDArray[np.bool_]
 
 
 def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -> Rays:
     """Return the lines of sight of pixels.
 
-    The phantom begins at z = 0, where the needle enters. Before its front face there is air, and
-    the lines of sight go straight on.
+    The phantom begins at z = 0, where the needle enters. A surface that both cameras share has no
+    other end; a box's wall ends at the box's other walls.
 
     Parameters
     ----------
     pixels : array_like, shape (..., 2)
         u, v [px]; whole numbers are pixel centres.
     camera : SimulatedCamera
-        The calibrated camera.
+        One of the rig's.
     rig : StereoRig
         The phantom.
 
@@ -55,28 +55,34 @@ def refracted_rays(pixels: ArrayLike, camera: SimulatedCamera, rig: StereoRig) -
         One for each pixel.
     """
     pixels = np.asarray(pixels, dtype=np.float64)
-    pose = camera.T_optical_rig
+    pose, window = camera.T_optical_rig, camera.window
     seen = np.ones((*pixels.shape[:-1], 3))
     seen[..., :2] = _undistorted(pixels, camera)
     incoming = seen @ pose[:3, :3]
     incoming /= np.linalg.norm(incoming, axis=-1, keepdims=True)
 
-    centre = camera.centre
-    length = (rig.half_height - centre[0]) / incoming[..., 0]
-    origin = centre + length[..., np.newaxis] * incoming
+    inwards = incoming @ window.normal
+    length = (window.outer - window.height(camera.centre)) / inwards
+    outer = camera.centre + length[..., np.newaxis] * incoming
+    # Snell: what lies in the faces shrinks by n, the rest of the unit length leads inwards.
+    flat = incoming - inwards[..., np.newaxis] * window.normal
+    origin = outer
+    for thickness, index in zip(window.thicknesses, window.indices, strict=False):
+        direction = _bent(flat / index, window.normal)
+        origin = origin - thickness / (direction @ window.normal)[..., np.newaxis] * direction
+    direction = _bent(flat / window.indices[-1], window.normal)
 
-    # Snell: what lies in the surface shrinks by n, the rest of the unit length is downwards.
-    direction = incoming / refractive_index(rig)
-    direction[..., 0] = -np.sqrt(1.0 - (direction[..., 1:] ** 2).sum(axis=-1))
     in_air = origin[..., 2] <= 0.0
-    direction[in_air] = incoming[in_air]
-    return Rays(origin, direction, incoming)
+    if is_box(rig):
+        beside = np.abs(origin @ window.sideways) >= reach_sideways(camera, rig)
+        in_air |= (origin[..., 2] >= LENGTH) | beside
+    straight = in_air[..., np.newaxis]
+    return Rays(np.where(straight, outer, origin), np.where(straight, incoming, direction), in_air)
 
 
-def points_at_height(rays: Rays, height: float) -> FloatArray:
-    """Return where rays reach the plane x = `height` [m] below the surface, (..., 3) [m]."""
-    length = (height - rays.origin[..., 0]) / rays.direction[..., 0]
-    return np.asarray(rays.origin + length[..., np.newaxis] * rays.direction)
+def _bent(flat: FloatArray, normal: FloatArray) -> FloatArray:
+    """Return unit vectors against a normal with a part (..., 3) across it."""
+    return np.asarray(flat - np.sqrt(1.0 - (flat**2).sum(axis=-1))[..., np.newaxis] * normal)
 
 
 def _undistorted(pixels: FloatArray, camera: SimulatedCamera) -> FloatArray:

@@ -13,11 +13,12 @@ from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.path_traced.appearance import Appearance
+from needle_sim.path_traced.block import Backdrop
 from needle_sim.path_traced.floors import ALBEDO
 from needle_sim.path_traced.marks import Marks
 from needle_sim.path_traced.needle_mesh import NeedleMesh
 from needle_sim.path_traced.path_tracing import PathTracer
-from needle_sim.path_traced.refracted_rays import points_at_height, refracted_rays
+from needle_sim.path_traced.refracted_rays import refracted_rays
 from needle_sim.path_traced.scene import Scene
 from needle_sim.path_traced.sensor import flicker, grey_image
 from needle_sim.path_traced.tracer import Mitsuba
@@ -26,13 +27,14 @@ from needle_sim.path_traced.world import PANEL_RADIANCE, make_world
 _GAIN_STREAM = 33
 # Paths a pixel of the needle, of what stands still, and of each place of the floor.
 _NEEDLE_SAMPLES = 96
-_STILL_SAMPLES = 24
+_STILL_SAMPLES = 64
 _FLOOR_SAMPLES = 192
 _SHADOW_SAMPLES = 48
-# What the floor's light is sampled over [m]: y, z; spacing.
+# What the floor's light is sampled over [m]: across the needle, along it; spacing.
 _SIDE = 0.072
 _REACH = (-0.03, 0.15)
 _SPACING = 0.00075
+_GRID_SHAPE = (round(2.0 * _SIDE / _SPACING), round((_REACH[1] - _REACH[0]) / _SPACING))
 # How far around what stands before the floor pixels are traced [px].
 _MARGIN_PX = 2
 _BLACK = (0.0, 8.0)
@@ -41,17 +43,22 @@ _BLACK = (0.0, 8.0)
 class PathTracedRenderer:
     """Draws a metal needle as both cameras see it.
 
-    An image is made of layers. The floor is its picture times the light on it, which is sampled on
-    a grid, with and without the needle, so that the needle's shadow is there. What stands before
-    the floor (needle, bubbles, walls) is path-traced where it is, with its share of each pixel.
-    Lint and old paths are drawn on the floor's layer. Then come haze, blur, blooming and noise.
+    An image is made of layers. The backdrop (the floor, or what stands behind a clear box) is its
+    picture times the light on it, which is sampled on a grid, with and without the needle, so that
+    the needle's shadow is there. What stands before it (needle, bubbles, walls) is path-traced
+    where it is, with its share of each pixel. Lint, old paths and a box's edges are drawn on the
+    backdrop's layer. Haze takes from all layers by their distance; then come its glow, blur,
+    blooming and noise.
 
-    Exact are shape and place of all that is traced: lines of sight obey Snell's law at the endless
-    top of the phantom, which begins at z = 0. Approximated are: light inside the phantom, which
-    comes straight from lamps that stand where the phantom's middle sees them; what the surface
-    mirrors back into the phantom, a ring of one brightness; light that the floor gets from walls
-    and needle, none; caustics of bubbles, which only throw shadows; haze, an operation on the
-    image; the surface's own reflections, none; and a floor that is Lambertian, brushed metal too.
+    Exact are shape and place of all that is traced: lines of sight obey Snell's law at each
+    camera's window, layer by layer; the phantom begins at z = 0, a box ends at its walls.
+    Approximated are: light inside the phantom, which comes straight from lamps that stand where the
+    phantom's middle sees them through a level top, also in a box; what the surface mirrors back
+    into the phantom, a ring of one brightness, in a box nothing; light that the floor gets from
+    walls and needle, none; caustics of bubbles, which only throw shadows; haze, which fades what is
+    far by one exponential and glows by one width; the window's own reflections, none; a floor that
+    is Lambertian, brushed metal too; and what stands behind a box, which is a flat picture, seen as
+    if the gel reached to it, in a light that falls on it from above and before.
 
     Two renderers of one rig and appearance draw the same images, bit for bit, whatever was drawn
     before and on however many cores.
@@ -72,35 +79,37 @@ class PathTracedRenderer:
         self._tracer = PathTracer(mitsuba)
         self._still = Scene(mitsuba, self._world)
         self._moving: Scene | None = None
-        self._grid = _floor_grid(look.floor_height)
-        points = self._grid.reshape(-1, 3)
-        (light,) = self._tracer.floor_light(
-            [self._still], points, samples=_FLOOR_SAMPLES, key=[look.seed]
-        )
-        # One sample's noise is finer than any shade of still things.
-        self._light = cv2.GaussianBlur(
-            light.reshape(self._grid.shape[:2]).astype(np.float32), (0, 0), 1.5
-        )
-        cameras = (rig.left, rig.right)
-        self._views = [self._view(camera, side) for side, camera in enumerate(cameras)]
-        # What is before the phantom counts for no exposure.
-        inside = np.concatenate(
-            [view.floor[view.floor_points[..., 2] > 0.0] for view in self._views]
-        )
+        self._light: dict[Backdrop, FloatImage] = {}
+        for behind in dict.fromkeys(self._world.backdrops):
+            (light,) = self._tracer.floor_light(
+                [self._still],
+                _grid(behind).reshape(-1, 3),
+                samples=_FLOOR_SAMPLES,
+                key=[look.seed],
+            )
+            # One sample's noise is finer than any shade of still things.
+            self._light[behind] = cv2.GaussianBlur(
+                light.reshape(_GRID_SHAPE).astype(np.float32), (0, 0), 1.5
+            )
+        cameras = zip((rig.left, rig.right), self._world.backdrops, strict=True)
+        self._views = [self._view(*each, side) for side, each in enumerate(cameras)]
         rng = np.random.default_rng([look.seed, 0, _GAIN_STREAM])
         self._black = float(rng.uniform(*_BLACK))
-        gain = (look.floor_level - self._black) / float(np.median(inside))
-        self._gains = gain * rng.normal(1.0, 0.03, 2)
+        # What is before the phantom counts for no exposure.
+        medians = [np.median(view.floor[view.floor_points[..., 2] > 0.0]) for view in self._views]
+        self._gains = (
+            (look.floor_level - self._black) / np.array(medians) * rng.normal(1.0, 0.03, 2)
+        )
 
     def render(
-        self, needle: NeedleMesh | None, exposure_number: int
+        self, needles: tuple[NeedleMesh, NeedleMesh] | None, exposure_number: int
     ) -> tuple[GreyImage, GreyImage]:
         """Return the images of one exposure.
 
         Parameters
         ----------
-        needle : NeedleMesh or None
-            None is not there.
+        needles : pair of NeedleMesh or None
+            As it is when left and right expose; None is not there.
         exposure_number : int
             Keys the noise; not negative.
 
@@ -109,17 +118,12 @@ class PathTracedRenderer:
         left, right : ndarray of uint8, shape (image_height, image_width)
             Grey images.
         """
-        look, scene, shadow = self._look, self._still, None
-        if needle is not None:
-            scene = self._scene_with(needle)
-            # A lit panel outshines the lamps' shadows.
-            if look.floor != "panel":
-                shadow = self._shadow(scene, [look.seed, exposure_number])
+        look = self._look
         light = flicker(look, exposure_number)
         images = []
         for side, view in enumerate(self._views):
             key = [look.seed, exposure_number, side]
-            image = self._exposed(view, scene, needle, shadow, key)
+            image = self._exposed(view, needles and needles[side], key)
             rng = np.random.default_rng(key)
             grey = np.asarray(image * (self._gains[side] * light), dtype=np.float32)
             images.append(grey_image(grey, look, self._black, rng))
@@ -133,47 +137,66 @@ class PathTracedRenderer:
             self._moving.bend(needle.parts)
         return self._moving
 
-    def _shadow(self, scene: Scene, key: list[int]) -> FloatImage:
+    def _shadow(self, scene: Scene, behind: Backdrop, key: list[int]) -> FloatImage:
         """Return which share of the light on the grid the needle leaves."""
         without, beside = self._tracer.floor_light(
-            [self._still, scene], self._grid.reshape(-1, 3), samples=_SHADOW_SAMPLES, key=key
+            [self._still, scene],
+            _grid(behind).reshape(-1, 3),
+            samples=_SHADOW_SAMPLES,
+            key=key,
         )
         left = beside / np.maximum(without, 1e-9)
-        image = left.reshape(self._grid.shape[:2]).astype(np.float32)
+        image = left.reshape(_GRID_SHAPE).astype(np.float32)
         return np.asarray(cv2.GaussianBlur(image, (0, 0), 0.7), dtype=np.float32)
 
-    def _exposed(
+    def _exposed(self, view: _View, needle: NeedleMesh | None, key: list[int]) -> FloatImage:
+        floor, light, cover = view.floor, view.light, view.cover
+        if needle is not None:
+            scene = self._scene_with(needle)
+            # A lit panel outshines the lamps' shadows.
+            if self._look.floor != "panel":
+                floor = floor * view.on_grid(self._shadow(scene, view.behind, key[:2]))
+            pixels = _needle_pixels(view.optics, needle)
+            light, cover = light.copy(), cover.copy()
+            self._trace(view, scene, pixels, light, cover, samples=_NEEDLE_SAMPLES, key=key)
+        return np.asarray((1.0 - cover) * floor + light, dtype=np.float32)
+
+    def _trace(
         self,
         view: _View,
         scene: Scene,
-        needle: NeedleMesh | None,
-        shadow: FloatImage | None,
+        pixels: NDArray[np.int64],
+        light: FloatImage,
+        cover: FloatImage,
+        *,
+        samples: int,
         key: list[int],
-    ) -> FloatImage:
-        floor, light, cover = view.floor, view.light, view.cover
-        if shadow is not None:
-            floor = floor * _on_grid(shadow, view.floor_points)
-        if needle is not None:
-            pixels = _needle_pixels(view.optics, needle)
-            traced = self._tracer.layer(
-                scene, pixels, view.camera, self._rig, samples=_NEEDLE_SAMPLES, key=key
-            )
-            light, cover = light.copy(), cover.copy()
-            light[pixels[:, 1], pixels[:, 0]], cover[pixels[:, 1], pixels[:, 0]] = traced
-        return np.asarray((1.0 - cover) * floor + light, dtype=np.float32)
+    ) -> None:
+        """Put what pixels, (N, 2), show before the backdrop into light and cover."""
+        there = (pixels[:, 1], pixels[:, 0])
+        seen, covered, way = self._tracer.layer(
+            scene, pixels, view.optics.camera, self._rig, samples=samples, key=key
+        )
+        clear = _clearness(self._look.haze, way / np.maximum(covered, 1e-9) / view.behind.gel)
+        clear = np.where(view.in_air[there], 1.0, clear)
+        light[there] = clear * seen + (1.0 - clear) * covered * view.veil
+        cover[there] = covered
 
-    def _view(self, camera: SimulatedCamera, side: int) -> _View:
+    def _view(self, camera: SimulatedCamera, behind: Backdrop, side: int) -> _View:
         look, rig = self._look, self._rig
         optics = Optics(camera, None)
         size = (camera.image_height, camera.image_width)
         row, column = np.mgrid[: size[0], : size[1]]
         pixels = np.stack([column, row], axis=-1)
-        points = points_at_height(refracted_rays(pixels, camera, rig), look.floor_height)
-        floor = _on_grid(self._light, points)
+        rays = refracted_rays(pixels, camera, rig)
+        points = behind.met_by(rays.origin, rays.direction)
+        blank = np.zeros(size, dtype=np.float32)
+        view = _View(optics, behind, points, rays.in_air, 0.0, blank, blank.copy(), blank.copy())
+        floor = view.on_grid(self._light[behind])
         # The mean over each pixel: a quarter of the way to the next one, in both directions.
         right, down = (np.gradient(points, axis=axis) / 4.0 for axis in (1, 0))
         quarters = [
-            self._world.picture.at(points + u * right + v * down)
+            behind.reflectance(points + u * right + v * down)
             for u in (-1.0, 1.0)
             for v in (-1.0, 1.0)
         ]
@@ -182,24 +205,26 @@ class PathTracedRenderer:
         floor = floor * np.mean(quarters, axis=0)
         if look.floor_blur_px > 0.0:
             floor = cv2.GaussianBlur(floor, (0, 0), look.floor_blur_px)
+        veil = float(np.median(floor))
+        clear = np.where(rays.in_air, 1.0, _clearness(look.haze, 1.0))
+        floor = np.asarray(clear * floor + (1.0 - clear) * veil, dtype=np.float32)
         # Clouded gel scatters light from all sides, over a dark floor little of it.
-        white = 0.4 * float(np.median(self._light)) + float(np.median(floor))
-        Marks(look, rig).draw(floor, optics, white)
+        Marks(self._world).draw(floor, optics, 0.4 * float(np.median(self._light[behind])) + veil)
 
-        flat = pixels.reshape(-1, 2)
-        found = self._tracer.covered(self._still, flat, camera, rig).reshape(size)
+        view = dataclasses.replace(view, veil=veil, floor=floor)
+        found = self._tracer.covered(self._still, pixels.reshape(-1, 2), camera, rig).reshape(size)
         around = np.ones((2 * _MARGIN_PX + 1,) * 2, dtype=np.uint8)
         near = cv2.dilate(found.astype(np.uint8), around) > 0
-        light, cover = np.zeros(size, dtype=np.float32), np.zeros(size, dtype=np.float32)
-        light[near], cover[near] = self._tracer.layer(
+        self._trace(
+            view,
             self._still,
             pixels[near],
-            camera,
-            rig,
+            view.light,
+            view.cover,
             samples=_STILL_SAMPLES,
             key=[look.seed, side],
         )
-        return _View(camera, optics, points, np.asarray(floor, dtype=np.float32), light, cover)
+        return view
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -208,24 +233,43 @@ class _View:
 
     Attributes
     ----------
-    camera : SimulatedCamera
-        Who sees it.
     optics : Optics
-        Where it sees points.
+        Where the camera sees points.
+    behind : Backdrop
+        What it sees behind the needle.
     floor_points : ndarray, shape (rows, columns, 3)
-        Where lines of sight meet the floor, in `rig` [m].
+        Where lines of sight meet that, in `rig` [m].
+    in_air : ndarray of bool, shape (rows, columns)
+        Which of them pass the phantom by.
+    veil : float
+        Radiance of haze.
     floor : ndarray of float32, shape (rows, columns)
-        The floor's radiance without a needle.
+        The backdrop's radiance without a needle.
     light, cover : ndarray of float32, shape (rows, columns)
-        Radiance and share of what stands before the floor.
+        Radiance and share of what stands before it.
     """
 
-    camera: SimulatedCamera
     optics: Optics
+    behind: Backdrop
     floor_points: FloatArray
+    in_air: NDArray[np.bool_]
+    veil: float
     floor: FloatImage
     light: FloatImage
     cover: FloatImage
+
+    def on_grid(self, values: FloatImage) -> FloatImage:
+        """Return values of the backdrop's grid where lines of sight meet it, (rows, columns)."""
+        aside, along = self.floor_points @ self.behind.sideways, self.floor_points[..., 2]
+        column = ((along - _REACH[0]) / _SPACING).astype(np.float32)
+        row = ((aside + _SIDE) / _SPACING).astype(np.float32)
+        there = cv2.remap(values, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(there, dtype=np.float32)
+
+
+def _clearness(haze: float, way: FloatArray | float) -> FloatArray:
+    """Return the share of light left after a share of the way through the phantom."""
+    return np.asarray((1.0 - haze) ** np.minimum(way, 1.0))
 
 
 def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:
@@ -240,20 +284,7 @@ def _needle_pixels(optics: Optics, needle: NeedleMesh) -> NDArray[np.int64]:
     return np.stack(np.nonzero(near)[::-1], axis=-1).astype(np.int64)
 
 
-def _floor_grid(height: float) -> FloatArray:
-    """Return places of the floor, (rows, columns, 3): rows along y, columns along z [m]."""
-    y = np.arange(-_SIDE, _SIDE, _SPACING)
-    z = np.arange(*_REACH, _SPACING)
-    grid = np.empty((len(y), len(z), 3))
-    grid[..., 0] = height
-    grid[..., 1] = y[:, np.newaxis]
-    grid[..., 2] = z
-    return grid
-
-
-def _on_grid(values: FloatImage, points: FloatArray) -> FloatImage:
-    """Return values of the floor's grid at points, (..., 3) [m]."""
-    column = ((points[..., 2] - _REACH[0]) / _SPACING).astype(np.float32)
-    row = ((points[..., 1] + _SIDE) / _SPACING).astype(np.float32)
-    there = cv2.remap(values, column, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(there, dtype=np.float32)
+def _grid(behind: Backdrop) -> FloatArray:
+    """Return places of a backdrop in `rig`, (*_GRID_SHAPE, 3): rows across the needle [m]."""
+    aside, along = np.mgrid[: _GRID_SHAPE[0], : _GRID_SHAPE[1]]
+    return behind.points(aside * _SPACING - _SIDE, along * _SPACING + _REACH[0])

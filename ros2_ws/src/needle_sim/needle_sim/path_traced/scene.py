@@ -14,9 +14,9 @@ import numpy as np
 from needle_sim.camera.bubbles import BubbleCloud
 from needle_sim.path_traced import floors
 from needle_sim.path_traced.appearance import Metal
+from needle_sim.path_traced.block import LENGTH, Backdrop, is_box, refractive_index, sides
 from needle_sim.path_traced.floors import ALBEDO
 from needle_sim.path_traced.lamps import MIDDLE, apparent_centre
-from needle_sim.path_traced.level_surface import refractive_index
 from needle_sim.path_traced.needle_mesh import Mesh
 from needle_sim.path_traced.tracer import MM, Mitsuba
 from needle_sim.path_traced.world import PANEL_RADIANCE, World, room_light
@@ -26,8 +26,6 @@ _STEEL_INDEX = 2.9
 _STEEL_EXTINCTION = 3.1
 _PAINT_INDEX = 1.5
 _DARK: dict[Metal, float] = {"oxide": 0.05, "painted": 0.02}
-_BOX_SIDE = 0.07
-_BOX_END = 0.155
 _SHEATH_LENGTH = 0.04
 _SHEATH_RADIUS = 0.0015
 # The floor in the scene is only seen in mirrors: coarser than in the image.
@@ -52,8 +50,11 @@ class Scene:
     ) -> None:
         self._mi = mitsuba.mi
         parts: dict[str, Any] = {"type": "scene", **self._box(world), **self._light(world)}
-        self.floor = self._mi.load_dict(self._floor(world))
-        parts["floor"] = self.floor
+        self.floors = [
+            self._mi.load_dict(self._floor(world, behind))
+            for behind in dict.fromkeys(world.backdrops)
+        ]
+        parts |= {f"floor_{number}": shape for number, shape in enumerate(self.floors)}
         if world.bubbles is not None:
             parts |= self._bubbles(world.bubbles, refractive_index(world.rig))
         for name, mesh in (needle or {}).items():
@@ -122,18 +123,17 @@ class Scene:
             }
         )
 
-    def _floor(self, world: World) -> dict[str, Any]:
-        height, half_z = world.look.floor_height, (floors.END - floors.BEGIN) / 2.0
+    def _floor(self, world: World, behind: Backdrop) -> dict[str, Any]:
+        half_z = (floors.END - floors.BEGIN) / 2.0
+        middle = behind.points(np.array(0.0), np.array(floors.BEGIN + half_z))
         transform = self._transform().look_at(
-            origin=_mm([height, 0.0, floors.BEGIN + half_z]),
-            target=_mm([height + 1.0, 0.0, floors.BEGIN + half_z]),
-            up=[0.0, 1.0, 0.0],
+            origin=_mm(middle), target=_mm(middle + behind.normal), up=behind.sideways.tolist()
         )
         shape: dict[str, Any] = {
             "type": "rectangle",
             "to_world": transform @ self._transform().scale([MM * half_z, MM * floors.SIDE, 1.0]),
         }
-        picture = world.picture.reflectance[::_COARSER, ::_COARSER, np.newaxis]
+        picture = behind.picture.reflectance[::_COARSER, ::_COARSER, np.newaxis]
         if world.look.floor == "panel":
             shape["emitter"] = {"type": "area", "radiance": PANEL_RADIANCE}
             picture = np.full_like(picture, ALBEDO["panel"])
@@ -151,17 +151,21 @@ class Scene:
 
     def _box(self, world: World) -> dict[str, Any]:
         """Return the box's walls and the sheath before it, through which the needle comes."""
-        top, bottom, wall = world.rig.half_height, world.look.floor_height, world.wall
-        # Half sides and middles: front (where the needle enters), far end, both sides.
+        (bottom, top), (_, beside) = sides(world.rig, world.look)
+        wall = world.wall
+        # Half sides and middles: front (where the needle enters), far end, and both opaque sides.
         high = (top - bottom) / 2.0
         middle = (top + bottom) / 2.0 - 1e-5
-        long = (_BOX_END + 2.0 * wall) / 2.0
+        long = (LENGTH + 2.0 * wall) / 2.0
         walls = {
-            "front": ([middle, 0.0, -wall / 2.0], [high, _BOX_SIDE, wall / 2.0]),
-            "end": ([middle, 0.0, _BOX_END + wall / 2.0], [high, _BOX_SIDE, wall / 2.0]),
-            "left": ([middle, -_BOX_SIDE - wall / 2.0, long - wall], [high, wall / 2.0, long]),
-            "right": ([middle, _BOX_SIDE + wall / 2.0, long - wall], [high, wall / 2.0, long]),
+            "front": ([middle, 0.0, -wall / 2.0], [high, beside, wall / 2.0]),
+            "end": ([middle, 0.0, LENGTH + wall / 2.0], [high, beside, wall / 2.0]),
         }
+        if not is_box(world.rig):
+            walls |= {
+                name: ([middle, y, long - wall], [high, wall / 2.0, long])
+                for name, y in (("left", -beside - wall / 2.0), ("right", beside + wall / 2.0))
+            }
         material = self._mi.load_dict({"type": "diffuse", "reflectance": world.wall_albedo})
         parts = {
             name: {

@@ -1,4 +1,4 @@
-"""From light to grey levels: haze, the lens's blur, blooming, exposure and noise."""
+"""From light to grey levels: haze's glow, the lens's blur, blooming, exposure and noise."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def grey_image(
     """
     image = np.minimum(light, _BRIGHTEST).astype(np.float32)
     if look.haze > 0.0:
-        # Haze brightens all, takes contrast, and most of it from what is small.
-        veil = cv2.GaussianBlur(image, (0, 0), _HAZE_BLUR_PX)
-        image = (1.0 - look.haze) * image + 0.5 * look.haze * (veil + np.float32(image.mean()))
+        # What is scattered forwards arrives beside its place: it takes contrast from what is small.
+        glow = cv2.GaussianBlur(image, (0, 0), _HAZE_BLUR_PX)
+        image += 0.5 * look.haze * (glow - image)
     image = cv2.GaussianBlur(image, (0, 0), look.blur_px)
     if look.bloom > 0.0:
         beyond = np.maximum(image - _FULL, 0.0)

@@ -20,7 +20,7 @@ TRUTH_COLUMNS = (
 def truth_values(look: Appearance, pair: TracedPair) -> list[float | str]:
     """Return the values of `TRUTH_COLUMNS`; empty where there is no needle."""
     scene: list[float | str] = [look.lamps, look.floor, look.metal, look.bubbles]
-    if pair.truth is None or pair.mesh is None:
+    if pair.truth is None or pair.meshes is None:
         return [*[""] * 14, look.lamps, look.floor, "", look.bubbles]
     truth = pair.truth
     heading = (
@@ -29,6 +29,6 @@ def truth_values(look: Appearance, pair: TracedPair) -> list[float | str]:
         np.cos(truth.pitch) * np.cos(truth.yaw),
     )
     end = NeedleEnd(look.diameter, look.bevel_angle, look.hollow)
-    places = np.concatenate([truth.tip, pair.mesh.extreme, pair.mesh.face_middle])
+    places = np.concatenate([truth.tip, pair.meshes[0].extreme, pair.meshes[0].face_middle])
     values = [*places * MM, *heading, end.bevel_length * MM, end.diameter * MM]
     return [*(round(float(value), 6) for value in values), *scene]

@@ -11,9 +11,9 @@ from needle_sim.camera.optics import FloatImage
 from needle_sim.camera.scenarios import Bubbles
 from needle_sim.camera.stereo_rig import StereoRig
 from needle_sim.path_traced.appearance import Appearance
-from needle_sim.path_traced.floors import ALBEDO, FloorPicture, floor_picture
+from needle_sim.path_traced.block import Backdrop, backdrop, is_box, refractive_index
+from needle_sim.path_traced.floors import ALBEDO, floor_picture
 from needle_sim.path_traced.lamps import Lamp, irradiance, place_lamps
-from needle_sim.path_traced.level_surface import refractive_index
 
 PANEL_RADIANCE = 1.0
 """Of a lit panel, as of the brightest lamp."""
@@ -42,8 +42,8 @@ class World:
         Where the light comes from.
     room : float
         Radiance of the room, against the brightest lamp's.
-    picture : FloorPicture
-        The floor.
+    backdrops : pair of Backdrop
+        What left and right see behind the needle; the same one where they share a surface.
     bubbles : BubbleCloud or None
         Air in the phantom.
     wall : float
@@ -56,7 +56,7 @@ class World:
     look: Appearance
     lamps: list[Lamp]
     room: float
-    picture: FloorPicture
+    backdrops: tuple[Backdrop, Backdrop]
     bubbles: BubbleCloud | None
     wall: float
     wall_albedo: float
@@ -72,14 +72,19 @@ def make_world(rig: StereoRig, look: Appearance) -> World:
         kinds = Bubbles(look.bubbles, _SMALLEST_BUBBLE, float(rng.uniform(*_LARGEST_BUBBLES)))
         bubbles = place_bubbles(kinds, rig, rng)
     room = look.room_light * irradiance(lamps, rig) / np.pi if lamps else 1.0
-    return World(rig, look, lamps, room, floor_picture(look.floor, rng), bubbles, wall, albedo)
+    left = backdrop(rig.left, rig, look, floor_picture(look.floor, rng))
+    right = left
+    if is_box(rig):
+        right = backdrop(rig.right, rig, look, floor_picture(look.floor, rng))
+    return World(rig, look, lamps, room, (left, right), bubbles, wall, albedo)
 
 
 def room_light(world: World) -> FloatImage:
     """Return the room's radiance by direction, as one inside the phantom sees it.
 
     Rows lead from straight up to straight down, columns around. Above the critical angle there is
-    the room; below it the surface mirrors what is in the phantom: mostly its floor.
+    the room; below it the surface mirrors what is in the phantom: mostly its floor. A clear box is
+    open to all sides.
     """
     look = world.look
     rng = np.random.default_rng([look.seed, 0, _ROOM_STREAM])
@@ -91,6 +96,8 @@ def room_light(world: World) -> FloatImage:
         np.cos((turns + 1) * around + shift) / (turns + 1) for turns, shift in enumerate(phase)
     )
     sky = world.room * (1.0 + strength * np.sin(polar)[:, np.newaxis] * waves / 1.9)
+    if is_box(world.rig):
+        return np.asarray(np.maximum(sky, 0.0), dtype=np.float32)
     light = irradiance(world.lamps, world.rig) / np.pi + world.room
     mirrored = ALBEDO[look.floor] * light
     if look.floor == "panel":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import sys
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -24,6 +25,7 @@ from needle_sim.path_traced.appearance import APPEARANCES, RANDOM, Appearance, d
 from needle_sim.path_traced.insertion import TracedPair, trace_insertion
 from needle_sim.path_traced.tracer import load_mitsuba
 from needle_sim.path_traced.truth_columns import TRUTH_COLUMNS, truth_values
+from needle_sim.sequences.boxes import draw_box
 
 RENDERERS = ("quick", "path_traced")
 
@@ -46,6 +48,8 @@ examples:
   ros2 run needle_sim render_images --output /tmp/empty --scenario absent --frames 720 --step-mm 0.2
   ros2 run needle_sim render_images --output /tmp/traced --renderer path_traced --seed 7 \\
       --start-mm 54 --depth-mm 60
+  ros2 run needle_sim render_images --output /tmp/box --renderer path_traced --box --seed 7 \
+      --appearance drawn_before_clutter --start-mm 54 --depth-mm 60
 
 exit codes: 0 done, 2 bad input or something missing, 130 interrupted.
 """
@@ -64,6 +68,7 @@ class RenderOptions:
     step: float
     curvature: float
     calibration: Path | None
+    box: bool
     json: Path | None
 
 
@@ -75,6 +80,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def render_images(options: RenderOptions) -> int:
     """Render what was asked for."""
+    if not options.box:
+        return _render(options)
+    with tempfile.TemporaryDirectory() as folder:
+        calibration = Path(folder) / "box.yaml"
+        calibration.write_text(draw_box(options.seed), encoding="utf-8")
+        return _render(dataclasses.replace(options, calibration=calibration))
+
+
+def _render(options: RenderOptions) -> int:
     begin = time.perf_counter()
     calibration = options.calibration
     if calibration is None:
@@ -122,6 +136,8 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
     frames = math.ceil((depth - begin) / step - 1e-9) + 1
     if given.frames is not None:
         frames = whole_number("--frames", given.frames, 1, 999_999)
+    if given.box and given.calibration is not None:
+        raise UserError("--box draws a calibration of its own: --calibration is not for it")
     seed = whole_number("--seed", given.seed, 0, 2**31 - 1)
     return RenderOptions(
         output=Path(given.output).expanduser(),
@@ -133,6 +149,7 @@ def parse(arguments: Sequence[str]) -> RenderOptions:
         step=step,
         curvature=number("--curvature", given.curvature, 0.0, 100.0, "1/m"),
         calibration=None if given.calibration is None else Path(given.calibration).expanduser(),
+        box=given.box,
         json=output_file("--json", given.json),
     )
 
@@ -208,6 +225,7 @@ def _parser() -> CommandParser:
     )
     add("--noise", metavar="SIGMA", help="of quick's sensor [grey levels] (default: scenario's)")
     add("--calibration", metavar="FILE", help="of the cameras (default: needle_tracker's own)")
+    add("--box", action="store_true", help="draw two webcams before an acrylic box, by the seed")
     add("--json", metavar="FILE", help="write what was done as one flat JSON object")
     return parser
 

@@ -24,22 +24,25 @@ BOUNDS = {
     "roughness_along": (0.05, 0.45),
     "roughness_across": (0.05, 0.45),
     "face_roughness": (0.05, 0.4),
-    "diameter": (0.0005, 0.001),
+    "diameter": (0.0005, 0.0013),
     "bevel_angle": (np.deg2rad(18.0), np.deg2rad(45.0)),
     "lean": (0.0, np.deg2rad(6.0)),
     "room_light": (0.02, 0.6),
     "floor_height": (-0.035, -0.018),
+    "behind": (0.005, 0.12),
     "floor_level": (22.0, 215.0),
     "floor_blur_px": (0.0, 2.5),
     "bubbles": (0, 90),
     "lint": (0, 25),
-    "tracks": (0, 3),
+    "tracks": (0, 4),
+    "track_strength": (0.03, 0.35),
     "haze": (0.0, 0.35),
     "blur_px": (0.3, 1.1),
     "bloom": (0.0, 0.05),
     "noise": (0.4, 4.0),
     "shot_noise": (0.5, 5.0),
     "flicker": (0.0, 0.03),
+    "lag": (0.0, 0.0002),
 }
 
 
@@ -76,8 +79,7 @@ def test_an_unknown_name_is_refused() -> None:
 def test_a_floor_gives_back_a_share_of_the_light(floor: Floor) -> None:
     picture = floor_picture(floor, np.random.default_rng(3))
     assert 0.01 <= picture.reflectance.min() < picture.reflectance.max() <= 0.95
-    place = np.array([[[-0.018, 0.01, 0.05], [-0.018, -0.02, 0.1]]])
-    assert picture.at(place).shape == (1, 2)
+    assert picture.at(np.array([[0.01, -0.02]]), np.array([[0.05, 0.1]])).shape == (1, 2)
 
 
 def test_the_same_seed_gives_the_same_floor() -> None:

@@ -65,10 +65,13 @@ def trace_scene(mitsuba: Mitsuba, rig: StereoRig, seed: int, plain_width_px: flo
         mitsuba, rig, look, frames=_EXPOSURES, depth=depth, step=step, begin=begin
     )
     for pair in pairs:
-        for camera, image in zip((rig.left, rig.right), pair.images, strict=True):
+        for side, (camera, image) in enumerate(
+            zip((rig.left, rig.right), pair.images, strict=True)
+        ):
             share, end = np.zeros_like(image), np.full(2, np.nan)
-            if pair.mesh is not None:
-                line = pair.mesh.line[pair.mesh.line[:, 2] > 0.0]
+            if pair.meshes is not None:
+                line = pair.meshes[side].line
+                line = line[line[:, 2] > 0.0]
                 share, end, width = _shaft(line, look.diameter, camera, rig)
             images.append(image)
             shares.append(share)
