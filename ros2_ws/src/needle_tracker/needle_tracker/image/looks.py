@@ -29,10 +29,12 @@ Rows = tuple[int, int] | None
 _SURE_ENOUGH = 0.3  # of a line that may be the needle
 _MAP_CONTRAST = 80.0  # the same, of 255, where paths are looked for
 _CLEAR_INSIDE = 0.5
-_CLEAR_WIDTHS = 1.2
-_ALLOWANCE = 2.5
-_LINE_SYSTEMATIC_PX, _END_SYSTEMATIC_PX = 0.2, 0.7
-# In needle widths: beyond such a gap may be another thing, and beyond such a one there is.
+CLEAR_WIDTHS = 1.2
+"""Standard deviation along the shaft of an end that a map shows [needle widths]."""
+_ALLOWANCE = 0.54  # for each pixel of the needle's width
+# In needle widths: what shape and light leave in line and end.
+_LINE_SYSTEMATIC, _END_SYSTEMATIC = 0.043, 0.15
+# Likewise: beyond such a gap may be another thing, and beyond such a one there is.
 _GAP_WIDTHS, _HIDDEN_WIDTHS = 1.5, 8.0
 _ROOM_WIDTHS = 6.0  # drawn around an end that is fitted
 
@@ -174,9 +176,9 @@ class MapLook:
         height, wide = image.shape
         if sure < _SURE_ENOUGH or not (2.0 <= u <= wide - 3.0 and 2.0 <= v <= height - 3.0):
             return None
-        point, along = np.array([u, v]), math.hypot(along, _END_SYSTEMATIC_PX)
-        across = math.hypot(across, _LINE_SYSTEMATIC_PX)
-        clear = inside > _CLEAR_INSIDE and along < _CLEAR_WIDTHS * width
+        point, along = np.array([u, v]), math.hypot(along, _END_SYSTEMATIC * width)
+        across = math.hypot(across, _LINE_SYSTEMATIC * width)
+        clear = inside > _CLEAR_INSIDE and along < CLEAR_WIDTHS * width
         clear = clear and not self._is_seam(image, point, width)
         if expected.sigma_along > 0.0:
             off = abs(float((point - expected.point) @ expected.direction))
@@ -186,15 +188,14 @@ class MapLook:
         return ImageTip(
             point=point,
             direction=np.array([d_u, d_v]),
-            sigma_across=math.hypot(across, _LINE_SYSTEMATIC_PX)
-            * (1.0 if clear else HIDDEN_FACTOR),
+            sigma_across=across * (1.0 if clear else HIDDEN_FACTOR),
             sigma_along=along if clear else HIDDEN_END_PX,
-            sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC_PX / (LINE_WIDTHS * width)),
+            sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC / LINE_WIDTHS),
             contrast=255.0 * sure,
             visibility=sure,
             clear=clear,
             bright=True,
-            allowance=_ALLOWANCE,
+            allowance=_ALLOWANCE * width,
         )
 
 

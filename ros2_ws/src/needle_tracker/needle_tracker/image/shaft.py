@@ -160,14 +160,21 @@ def shaft_problem(
     if np.count_nonzero(sideways > allowed) > len(points) // 4:
         return "the shaft lies where the needle cannot"
     if insertion is not None:
-        length = _length(points, distance)
+        length = shaft_length(points)
         if abs(length - insertion) > insertion_margin:
             return "the shaft's length is not the insertion"
     return None
 
 
-def _length(points: Array, distance: Array) -> float:
-    """Return the length of a smooth curve from the origin through the points to the last."""
+def shaft_length(points: Array) -> float:
+    """Return the length of a smooth curve from the origin through points to the last of them [m].
+
+    Parameters
+    ----------
+    points : ndarray, shape (n, 3)
+        Outwards along the shaft, in `rig` [m].
+    """
+    distance = np.linalg.norm(points, axis=1)
     span = float(distance[-1])
     s = distance / span
     terms = np.stack([s, s**2, s**3], axis=1)

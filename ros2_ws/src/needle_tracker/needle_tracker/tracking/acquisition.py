@@ -252,10 +252,14 @@ class Acquisition:
         # How long a short shaft is, its coarse path hardly says; its ends do.
         plain = not wanted and is_sound(found, SOUND_PX, SOUND_ALONG_PX)
         young = plain and self._begins_at_entry(measured, insertion)
-        problem = self._shaft_problem(paths, tip, None if young else insertion)
+        gates = self._settings.gates
+        shaft = shaft_points(self._views, paths, tip.position)
+        problem = shaft_problem(
+            shaft, gates.reach, None if young else insertion, gates.insertion_margin
+        )
         if problem is not None:
             return dataclasses.replace(measured, tip=None, reason=problem)
-        return self._decided(measured, insertion, wanted)
+        return self._decided(dataclasses.replace(measured, shaft=shaft), insertion, wanted)
 
     def _decided(self, measured: Measurement, insertion: float | None, wanted: int) -> Measurement:
         """Return what is measured, believed if no more sights are wanted or it has had them."""
@@ -360,13 +364,6 @@ class Acquisition:
 
     def _is_near_entry(self, tip: SpatialTip, insertion: float) -> bool:
         return insertion <= _ENTRY_REGION and self._entry_surprise(tip, insertion) < _ENTRY_NEAR
-
-    def _shaft_problem(
-        self, paths: tuple[Path, Path], tip: SpatialTip, insertion: float | None
-    ) -> str | None:
-        gates = self._settings.gates
-        points = shaft_points(self._views, paths, tip.position)
-        return shaft_problem(points, gates.reach, insertion, gates.insertion_margin)
 
     def _paths(
         self, image: Image, i: int, grid: SearchGrid, insertion: float | None, last: Last | None

@@ -11,9 +11,17 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from numpy.typing import NDArray
 
+from needle_tracker.image.shaft import shaft_length
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.triangulation import SpatialTip
+
+Array = NDArray[np.float64]
+
+_PITCH = 2e-3  # of points along the shaft [m]
+_LEAST_POINTS = 4
+_SLIP = 0.01  # of the insertion, between pairs of a run [-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,3 +91,85 @@ class Claims:
         claimed = np.linalg.pinv(normal, hermitian=True, rtol=1e-9)
         claimed += np.outer(ahead, ahead) * (unseen.along * self._needle_width) ** 2
         return dataclasses.replace(tip, covariance=tip.covariance + claimed)
+
+
+class StagedEnd:
+    """What the stage says of an end that is seen badly: the needle is as long as it was pushed in.
+
+    A stage's zero is off by as much in all pairs of a run. The end that was seen best in it says by
+    how much, as far as it knows better than what a zero is worth; ends that lie short because a
+    face is unseen do so again and again, and are not averaged.
+
+    Parameters
+    ----------
+    zero_sigma : float
+        Standard deviation of where the stage's zero is along the needle [m].
+    """
+
+    def __init__(self, zero_sigma: float) -> None:
+        self._zero_variance = zero_sigma * zero_sigma
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin a new run."""
+        self._shaft = np.empty((0, 3))
+        self._best: _Offset | None = None
+
+    def placed(self, tip: SpatialTip, shaft: Array | None, insertion: float | None) -> SpatialTip:
+        """Return a tip moved along the needle to where its end is seen and the stage has it.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            As believed of one pair.
+        shaft : ndarray, shape (n, 3), or None
+            Points along the whole shaft in `rig` [m], where the pair shows it.
+        insertion : float or None
+            Length of needle in the phantom [m].
+        """
+        ahead = tip.direction
+        behind = self._shaft if shaft is None else shaft[:-1]
+        behind = behind[(behind - tip.position) @ ahead < -_PITCH]
+        if insertion is None or len(behind) < _LEAST_POINTS:
+            return tip
+        self._shaft = np.vstack([behind, tip.position])
+        seen = float(ahead @ tip.covariance @ ahead)
+        now = _Offset(shaft_length(self._shaft) - insertion, seen, insertion)
+        best = self._best
+        if best is None or seen <= best.variance_at(insertion):
+            self._best = best = now
+        variance = best.variance_at(insertion)
+        # A zero that is plainly off is worth less.
+        zero = max(self._zero_variance, best.value * best.value - variance)
+        offset = best.value * zero / (zero + variance)
+        left = variance * zero / (zero + variance)
+        beside = np.eye(3) - np.outer(ahead, ahead)
+        return dataclasses.replace(
+            tip,
+            position=tip.position + (offset - now.value) * ahead,
+            covariance=beside @ tip.covariance @ beside + left * np.outer(ahead, ahead),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class _Offset:
+    """By how much a needle is seen longer than it was pushed in.
+
+    Attributes
+    ----------
+    value : float
+        That [m].
+    variance : float
+        Of the end along the needle [m^2].
+    insertion : float
+        At which it was seen [m].
+    """
+
+    value: float
+    variance: float
+    insertion: float
+
+    def variance_at(self, insertion: float) -> float:
+        """Return the variance at another insertion [m^2]: the needle slips."""
+        slipped = _SLIP * (insertion - self.insertion)
+        return self.variance + slipped * slipped

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
+from numpy.typing import NDArray
+
 from needle_tracker.image.tip_fit import Expected, ImageTip
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.triangulation import SpatialTip, triangulate
 
+Array = NDArray[np.float64]
 
-@dataclasses.dataclass(frozen=True)
+
+@dataclasses.dataclass(frozen=True, eq=False)
 class Measurement:
     """What a pair of images gave.
 
@@ -30,6 +35,8 @@ class Measurement:
         The tip that is not believed.
     regions : pair of (Expected or None)
         Where in the left and the right image was searched; None: everywhere, or not at all.
+    shaft : ndarray, shape (n, 3), or None
+        Points along the whole shaft in `rig`, the tip last [m]; None where only its end was seen.
     """
 
     tip: SpatialTip | None
@@ -38,6 +45,7 @@ class Measurement:
     image_tips: tuple[ImageTip | None, ImageTip | None] = (None, None)
     contested: SpatialTip | None = None
     regions: tuple[Expected | None, Expected | None] = (None, None)
+    shaft: Array | None = None
 
 
 def judged(

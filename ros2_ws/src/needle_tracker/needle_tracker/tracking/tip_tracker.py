@@ -13,9 +13,9 @@ import numpy as np
 
 from needle_tracker.image.backgrounds import Backgrounds
 from needle_tracker.image.detection import Image
-from needle_tracker.image.looks import MapLook
+from needle_tracker.image.looks import CLEAR_WIDTHS, MapLook
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims
+from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, StagedEnd
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
@@ -26,8 +26,8 @@ _BOTH_EVERY = 10
 """So often maps are held against lines that show a needle."""
 _IN_VAIN, _RESTS = 5, 3
 """After so many looks in which maps show no needle, they are drawn of every third pair."""
-_DEPTH_SIGMA = 0.8e-3
-"""A tip known so badly is better than none [m]: maps know what they do not see."""
+_APART_WIDTHS = 2.0
+"""So far along the needle may two views see a bevel end."""
 _ALIKE = 7.8
 """Squared distance over the covariance that two measurements of one tip keep in 95 of 100."""
 _IN_A_ROW = 3
@@ -49,11 +49,19 @@ class TipTracker:
         self._lines = StereoTracker(calibration, settings)
         widths = self._lines.needle_widths_px
         self._claims = Claims(self._lines.views, widths, settings.needle_width)
+        self._staged = StagedEnd(0.5 * settings.gates.reach.hole_tolerance)
         left, right = self._looks = (MapLook(widths[0]), MapLook(widths[1]))
         self._backgrounds = Backgrounds(
             self._lines.views, settings.hole_clearance, settings.reference
         )
-        gates = dataclasses.replace(settings.gates, max_depth_sigma=_DEPTH_SIGMA)
+        # A tip that is known badly is better than none: maps know what they do not see.
+        gates = dataclasses.replace(
+            settings.gates,
+            max_depth_sigma=CLEAR_WIDTHS * settings.needle_width,
+            max_disagreement=max(
+                settings.gates.max_disagreement, _APART_WIDTHS * settings.needle_width
+            ),
+        )
         wider = dataclasses.replace(settings, gates=gates)
         self._maps = StereoTracker(calibration, wider, (left, right))
         self.settings = settings
@@ -71,6 +79,7 @@ class TipTracker:
         self._begin()
 
     def _begin(self) -> None:
+        self._staged.forget()
         self._maps_count = self._have_agreed = False
         self._against = 0
         self._pairs = self._in_vain = 0
@@ -101,7 +110,8 @@ class TipTracker:
             return lines
         maps = self._maps.process(left, right, insertion)
         if maps.tip is not None:
-            maps = dataclasses.replace(maps, tip=self._claims.widened(maps.tip, OF_MAP))
+            tip = self._claims.widened(maps.tip, OF_MAP)
+            maps = dataclasses.replace(maps, tip=self._staged.placed(tip, maps.shaft, insertion))
         shown = maps.tip is not None or maps.state is TrackState.CONFIRMING
         self._in_vain = 0 if shown else self._in_vain + 1
         if lines.tip is None or maps.tip is None:

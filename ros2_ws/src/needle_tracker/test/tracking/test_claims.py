@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, Unseen
+from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, StagedEnd, Unseen
 from needle_tracker.tracking.triangulation import SpatialTip, midpoint
 
 WIDTH, WIDTHS_PX = 0.7e-3, (4.6, 5.1)
@@ -50,3 +50,47 @@ def test_a_tip_claims_no_more_than_its_fit(views: Views) -> None:
     assert np.linalg.eigvalsh(widened.covariance - loose).min() > 0.0
     assert widened.covariance == pytest.approx(loose, rel=0.1, abs=1e-7)
     assert np.array_equal(widened.position, POSITION)
+
+
+def _along(sigma: float, short: float, length: float) -> SpatialTip:
+    """Return a tip on the z axis that is seen so much short of a length [m]."""
+    end = np.array([0.0, 0.0, length - short])
+    covariance = np.diag([1e-10, 4e-10, sigma * sigma])
+    return SpatialTip(end, covariance, np.array([0.0, 0.0, 1.0]), np.eye(3) * 1e-4, 0.0, 0.0)
+
+
+def _shaft(length: float) -> np.ndarray:
+    return np.linspace([0.0, 0.0, 5e-3], [0.0, 0.0, length], 11)
+
+
+def test_an_end_that_is_seen_badly_lies_where_the_stage_has_it() -> None:
+    staged = StagedEnd(0.25e-3)
+    first = staged.placed(_along(0.4e-3, 0.4e-3, 0.05), _shaft(0.05), 0.05)
+    # Weights are the inverse variances of a zero of 0.25 mm and an end of 0.4 mm.
+    assert 0.05 - first.position[2] == pytest.approx(0.4e-3 * 25 / 89, rel=0.02)
+    assert first.covariance[2, 2] == pytest.approx(1.0 / (0.25**-2 + 0.4**-2) * 1e-6, rel=0.01)
+    np.testing.assert_allclose(first.covariance[:2, :2], np.diag([1e-10, 4e-10]))
+    # Seen as badly ten times more, no more is known.
+    for k in range(1, 11):
+        length = 0.05 + 1e-3 * k
+        later = staged.placed(_along(0.4e-3, 0.4e-3, length), None, length)
+    assert 0.06 - later.position[2] == pytest.approx(0.4e-3 * 25 / 89, rel=0.05)
+    assert later.covariance[2, 2] == pytest.approx(first.covariance[2, 2], rel=0.05)
+
+
+def test_the_end_that_was_seen_best_says_where_the_stage_has_its_zero() -> None:
+    staged = StagedEnd(0.25e-3)
+    staged.placed(_along(0.05e-3, 0.9e-3, 0.05), _shaft(0.05), 0.05)
+    hidden = staged.placed(_along(0.4e-3, 1.4e-3, 0.052), None, 0.052)
+    assert 0.052 - hidden.position[2] == pytest.approx(0.9e-3, abs=0.02e-3)
+    # Its next run begins with another zero.
+    staged.forget()
+    other = staged.placed(_along(0.05e-3, 0.0, 0.05), _shaft(0.05), 0.05)
+    assert other.position[2] == pytest.approx(0.05, abs=0.01e-3)
+
+
+def test_without_stage_or_shaft_a_tip_stays_as_it_is() -> None:
+    staged = StagedEnd(0.25e-3)
+    seen = _along(0.4e-3, 0.4e-3, 0.05)
+    assert staged.placed(seen, None, 0.05) is seen
+    assert staged.placed(seen, _shaft(0.05), None) is seen
