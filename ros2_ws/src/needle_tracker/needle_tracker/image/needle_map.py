@@ -19,7 +19,7 @@ Box = tuple[int, int, int, int]
 
 _WIDTH_PX = 4.5
 """Width of a needle in what the net sees: of 3.5 to 5.5 it sees long bevels whole, of 6 not."""
-_LIKE = (0.9, 1.1)  # widths so near to that, as a ratio, are not scaled
+_LIKE = (0.85, 1.2)  # widths so near to that, as a ratio, are not scaled
 _MARGIN_PX = 24  # what is seen around a box, in what the net sees: farther off matters little
 _TILE = 64
 _PART_PX = 384  # what the net sees at once
