@@ -214,7 +214,11 @@ def point_controller_factory(
             return sliding_law(motion, settings.max_rotation_per_length)
         return PointSteering(settings, motion).command
 
-    return lambda: NeedlesToPoints(make_controller(settings, np.eye(3), np.zeros(3))[0], new_law, covariance)
+    def needles() -> NeedlesToPoints:
+        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3))
+        return NeedlesToPoints(estimator, new_law, covariance)
+
+    return needles
 
 
 def _what_is_told(
