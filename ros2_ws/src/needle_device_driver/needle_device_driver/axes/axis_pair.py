@@ -43,12 +43,8 @@ class PairSnapshot:
     @property
     def fault(self) -> str:
         """The faults of both axes; empty: none."""
-        faults = []
-        if self.insertion.fault:
-            faults.append(f"insertion axis: {self.insertion.fault}")
-        if self.rotation.fault:
-            faults.append(f"rotation axis: {self.rotation.fault}")
-        return "; ".join(faults)
+        axes = {"insertion": self.insertion, "rotation": self.rotation}
+        return "; ".join(f"{name} axis: {at.fault}" for name, at in axes.items() if at.fault)
 
     @property
     def fault_rule(self) -> Rule:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
+
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
@@ -95,22 +98,18 @@ class Cia402Axis(Axis):
             If it does not answer.
         """
         node = self._settings.node_id
-        try:
+        with self._as_axis_error():
             # A stopped node answers to nothing else.
             self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
             ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
-        except (LinkError, DriveError) as error:
-            raise self._error(error) from error
 
     # ---- orders -------------------------------------------------------------------------------
 
     def configure(self) -> None:
         """Open the link and set the drive up; moves nothing."""
-        try:
+        with self._as_axis_error():
             self._link.open()
             self._set_up(survived=False)
-        except (LinkError, DriveError) as error:
-            raise self._error(error) from error
         self._configured = True
 
     def power(self, on: bool) -> None:
@@ -134,11 +133,9 @@ class Cia402Axis(Axis):
             self._count_from_home()
             return
         self._homed = self._limits_due = False
-        try:
+        with self._as_axis_error():
             write_limits(self._access, self._settings, homed=False)
             write_homing(self._access, self._settings, speed)
-        except (LinkError, DriveError) as error:
-            raise self._error(error) from error
         self._machine.mode = Mode.HOMING
         self._homing = HomingRun(
             here=self._settings.homing_method in HERE, tolerance_counts=self._rest_counts
@@ -174,16 +171,14 @@ class Cia402Axis(Axis):
             return
         self._homing = None
         self._machine.stop()
-        try:
+        with self._as_axis_error():
             self._send_order()
-        except LinkError as error:
-            raise self._error(error) from error
 
     def reset(self) -> None:
         """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
         self._machine.want(Goal.OFF)
         self._homing = None
-        try:
+        with self._as_axis_error():
             self._link.open()
             self._link.other_master = ""
             survived = (
@@ -195,8 +190,6 @@ class Cia402Axis(Axis):
             self.monitor.emergency = None
             reset_fault(self._link, self._settings)
             self._refresh()
-        except (LinkError, DriveError) as error:
-            raise self._error(error) from error
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest reply."""
@@ -235,12 +228,11 @@ class Cia402Axis(Axis):
             return
         self._homing = None
         try:
-            self._machine.want(Goal.OFF)
-            if not self._switch_off_now():
-                raise DriveError("does not say that it is off; its watchdog will switch it off")
-            disarm_watchdog(self._link, self._settings)
-        except (LinkError, DriveError) as error:
-            raise self._error(error) from error
+            with self._as_axis_error():
+                self._machine.want(Goal.OFF)
+                if not self._switch_off_now():
+                    raise DriveError("does not say that it is off; its watchdog will switch it off")
+                disarm_watchdog(self._link, self._settings)
         finally:
             self._configured = False
 
@@ -341,9 +333,14 @@ class Cia402Axis(Axis):
         if fault is not None:
             raise AxisError(f"{self.name} axis: {fault[1]}", fault[0])
 
-    def _error(self, error: LinkError | DriveError) -> AxisError:
-        rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
-        return AxisError(f"{self.name} axis: {error}", rule)
+    @contextlib.contextmanager
+    def _as_axis_error(self) -> Iterator[None]:
+        """Raise what goes wrong with link or drive as the axis' own error."""
+        try:
+            yield
+        except (LinkError, DriveError) as error:
+            rule = Rule.LINK_LOSS if isinstance(error, LinkError) else Rule.ONE_FAULT_STOPS_BOTH
+            raise AxisError(f"{self.name} axis: {error}", rule) from error
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 

@@ -53,11 +53,6 @@ class DriveMachine:
         self.trouble = ""
 
     @property
-    def goal(self) -> Goal:
-        """Goal."""
-        return self._goal
-
-    @property
     def state(self) -> DriveState | None:
         """State that the drive told last; None: nothing that CiA 402 has."""
         return drive_state(self.at.statusword)

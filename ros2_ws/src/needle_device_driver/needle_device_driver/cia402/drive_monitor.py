@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from functools import partial
 
 from needle_device_driver.link.can_link import CanLink
 from needle_device_driver.link.objects import (
@@ -80,11 +82,13 @@ class DriveMonitor:
         self._outdated = False
         self.rebooted = False
         self.emergency: int | None = None
-        self.malformed = 0
-        link.subscribe(STATUS.function_code + node_id, self._on_status)
-        link.subscribe(POSITION.function_code + node_id, self._on_position)
-        link.subscribe(HEARTBEAT + node_id, self._on_heartbeat)
-        link.subscribe(EMCY + node_id, self._on_emergency)
+        for function_code, handler in (
+            (STATUS.function_code, self._on_status),
+            (POSITION.function_code, self._on_position),
+            (HEARTBEAT, self._on_heartbeat),
+            (EMCY, self._on_emergency),
+        ):
+            link.subscribe(function_code + node_id, partial(self._take, handler))
 
     @property
     def feedback(self) -> Feedback:
@@ -196,48 +200,39 @@ class DriveMonitor:
             self._number += not self._outdated
             self._outdated = False
             self._fresh_time = time
-        self._lock.notify_all()
+
+    def _take(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
+        """Take a frame; one that is not as its kind must be is counted by the link."""
+        with self._lock:
+            try:
+                handler(data, time)
+            except ValueError:
+                self._link.error_frames += 1
+                return
+            self._lock.notify_all()
 
     def _on_status(self, data: bytes, time: float) -> None:
-        with self._lock:
-            try:
-                if len(data) == _LENGTH_WITHOUT_INPUTS:
-                    self._statusword, self._mode = STATUS_WITHOUT_INPUTS.unpack(data)
-                else:
-                    self._statusword, self._mode, self._inputs = STATUS.unpack(data)
-            except ValueError:
-                self.malformed += 1
-                return
-            self._answer(STATUS.function_code, time)
+        if len(data) == _LENGTH_WITHOUT_INPUTS:
+            self._statusword, self._mode = STATUS_WITHOUT_INPUTS.unpack(data)
+        else:
+            self._statusword, self._mode, self._inputs = STATUS.unpack(data)
+        self._answer(STATUS.function_code, time)
 
     def _on_position(self, data: bytes, time: float) -> None:
-        with self._lock:
-            try:
-                (self._position,) = POSITION.unpack(data)
-            except ValueError:
-                self.malformed += 1
-                return
-            self._answer(POSITION.function_code, time)
+        (self._position,) = POSITION.unpack(data)
+        self._answer(POSITION.function_code, time)
 
     def _on_heartbeat(self, data: bytes, time: float) -> None:
-        with self._lock:
-            if len(data) != 1:
-                self.malformed += 1
-                return
-            self._heartbeats += 1
-            self._heartbeat_time = time
-            # The upper bit toggles in the older protocol, node guarding.
-            self._nmt_state = data[0] & 0x7F
-            if self._nmt_state == NMT_BOOT_UP and self._watching:
-                self.rebooted = True
-            self._lock.notify_all()
+        (state,) = data
+        self._heartbeats += 1
+        self._heartbeat_time = time
+        # The upper bit toggles in the older protocol, node guarding.
+        self._nmt_state = state & 0x7F
+        if self._nmt_state == NMT_BOOT_UP and self._watching:
+            self.rebooted = True
 
     def _on_emergency(self, data: bytes, _: float) -> None:
-        with self._lock:
-            if len(data) < 2:
-                self.malformed += 1
-                return
-            code = int.from_bytes(data[:2], "little")
-            if code and self.emergency is None:
-                self.emergency = code
-            self._lock.notify_all()
+        lower, upper, *_rest = data
+        code = lower | upper << 8
+        if code and self.emergency is None:
+            self.emergency = code

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Annotated
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_common.settings.bounds import ABOVE_0, check_bounds
+from needle_common.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 from needle_device_driver.link import objects as od
 
 # Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
 HERE = (35, 37)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
 HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
+_Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,19 +47,19 @@ class DriveSettings:
         False: a hand moves it, the drive only says where it is.
     """
 
-    node_id: int
-    counts_per_unit: float
+    node_id: Annotated[int, Bounds(1, 126, "-")]
+    counts_per_unit: _Positive
     reverse: bool
-    speed: float
-    acceleration: float
-    quick_stop_deceleration: float
+    speed: _Positive
+    acceleration: _Positive
+    quick_stop_deceleration: _Positive
     homing_method: int
-    following_error: float
-    following_error_time: float
+    following_error: _Positive
+    following_error_time: _Positive
     max_torque: float
     lower: float
     upper: float
-    tolerance: float
+    tolerance: _Positive
     actuated: bool = True
 
     def __post_init__(self) -> None:
@@ -68,17 +70,7 @@ class DriveSettings:
         UserError
             A value that is not finite, not positive where it must be, or no homing method.
         """
-        check_bounds("node_id", self.node_id, 1, 126, "-")
-        for name in (
-            "counts_per_unit",
-            "speed",
-            "acceleration",
-            "quick_stop_deceleration",
-            "following_error",
-            "following_error_time",
-            "tolerance",
-        ):
-            check_bounds(name, getattr(self, name), ABOVE_0, math.inf, "SI")
+        check_bounded_fields(self)
         if self.homing_method not in HOMING_METHODS:
             raise UserError(f"homing_method = {self.homing_method} is none of CiA 402's")
         if not self.lower < self.upper:

@@ -41,7 +41,7 @@ class LinkError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class LinkSettings:
-    """Which adapter, and where.
+    """Kind of the adapter, and where it is.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ class CanLink:
 
     @property
     def errors(self) -> int:
-        """Number of error frames, lines that are no frame, and refused frames."""
+        """Number of error frames, lines and process data that are none, and refused frames."""
         bus = self._bus
         own = bus.malformed if isinstance(bus, SlcanBus | SocketcandBus) else 0
         return self.error_frames + own + self.refused

@@ -12,6 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.ros.conversions import to_diagnostic_status, to_nanoseconds, to_stamp
+from needle_device_driver.axes.axis_pair import PairSnapshot
 from needle_device_driver.supervisor.command import (
     INSERTION_JOINT,
     ROTATION_JOINT,
@@ -19,7 +20,7 @@ from needle_device_driver.supervisor.command import (
     CommandPoint,
 )
 from needle_device_driver.supervisor.hold import HoldMessage
-from needle_device_driver.supervisor.reports import DeviceStatus, MeasuredJoints, StepResult
+from needle_device_driver.supervisor.reports import DeviceStatus, StepResult
 from needle_device_driver.supervisor.states import State
 
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
@@ -51,12 +52,12 @@ def to_hold_message(message: Joy) -> HoldMessage:
     )
 
 
-def to_joint_state(joints: MeasuredJoints, stamp: Time) -> JointState:
+def to_joint_state(joints: PairSnapshot, stamp: Time) -> JointState:
     """Return measured joints as a message."""
     message = JointState(
         name=[INSERTION_JOINT, ROTATION_JOINT],
-        position=[joints.insertion, joints.rotation],
-        velocity=[joints.insertion_velocity, joints.rotation_velocity],
+        position=[joints.insertion.position, joints.rotation.position],
+        velocity=[joints.insertion.velocity, joints.rotation.velocity],
     )
     message.header.stamp = stamp
     return message

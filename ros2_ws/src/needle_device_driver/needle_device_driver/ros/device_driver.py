@@ -33,8 +33,7 @@ from needle_common.ros.parameter_desk import ParameterDesk
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeLifecycleNode
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.cia402.cycle_clock import CycleClock
-from needle_device_driver.cia402.cycle_schedule import CycleSchedule
+from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
 from needle_device_driver.link.can_link import CanLink, LinkError
@@ -151,7 +150,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._clocks is not None and one_too_many(self, self._clocks):
             return [f"one /clock: {one_too_many(self, self._clocks)}"]
         missing = []
-        publishers = [self._device.joint_states, self._device.results, self._device.statuses]
+        publishers = self._device.publishers
         if self._settings.lock_step:
             missing += unheard(self, [publisher.topic_name for publisher in publishers])
         if self._settings.wait_for_recorder:
@@ -265,9 +264,8 @@ class DeviceDriverNode(WholeLifecycleNode):
             self._waiting_for = f"the drives: {why_not}"
             self.get_logger().info(f"waiting for {self._waiting_for}")
 
-    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Open the link and set both drives up; moves nothing."""
-        del state
         now = time.monotonic()
         if self._supervisor.state is not State.UNCONFIGURED:
             # A fault from before the configuration; an emergency stop that is pressed stays.
@@ -303,31 +301,27 @@ class DeviceDriverNode(WholeLifecycleNode):
         except LinkError:
             return False
 
-    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Answer to services from now on."""
-        del state
         self._active = True
         self.get_logger().info(f"both drives are there on {self._link.settings}")
         return TransitionCallbackReturn.SUCCESS
 
-    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Stop and switch off."""
-        del state
         self._active = False
         self._waiting_for = "the driver to be activated"
         self._supervisor.enable(False, time.monotonic())
         self._device.report()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Switch off and let go of drives and link."""
-        del state
         self._let_go()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+    def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Do as `on_cleanup` does, and end."""
-        del state
         self._let_go()
         self.ended = True
         return TransitionCallbackReturn.SUCCESS

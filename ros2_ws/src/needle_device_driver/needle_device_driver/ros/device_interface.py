@@ -9,6 +9,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
@@ -35,8 +36,13 @@ from needle_device_driver.ros.conversions import (
     to_result,
     to_status,
 )
-from needle_device_driver.supervisor.notice_limit import NoticeLimit
-from needle_device_driver.supervisor.reports import DeviceStatus, Notice, Reply, StepResult
+from needle_device_driver.supervisor.reports import (
+    DeviceStatus,
+    Notice,
+    NoticeLimit,
+    Reply,
+    StepResult,
+)
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 # Positions alone change device/status so often at most [s]; joint_states has them all.
@@ -58,11 +64,11 @@ class DeviceInterface:
         Where the device's health goes.
     simulated : bool or None
         Whether no real needle can move; None until that is known.
-    refuse : callable, optional
+    refuse : callable
         Returns why services are not ready yet, empty when they are; a stop, a disabling and an
         emergency stop are never refused.
-    on_result : callable, optional
-        Called with each result after it was published.
+    on_step_end : callable, optional
+        Called after each result was published.
 
     Raises
     ------
@@ -77,14 +83,14 @@ class DeviceInterface:
         diagnostics: DiagnosticsPublisher,
         *,
         simulated: bool | None,
-        refuse: Callable[[], str] = lambda: "",
-        on_result: Callable[[StepResult], None] = lambda _: None,
+        refuse: Callable[[], str],
+        on_step_end: Callable[[], None] = lambda: None,
     ) -> None:
         self._node = node
         self._supervisor = supervisor
         self._diagnostics = diagnostics
         self._refuse = refuse
-        self._on_result = on_result
+        self._on_step_end = on_step_end
         self._told: DeviceStatus | None = None
         self._told_at = 0.0
         self._notices = NoticeLimit()
@@ -102,6 +108,7 @@ class DeviceInterface:
         self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
         self.results = node.create_publisher(Header, "device/result", RELIABLE)
         self.statuses = node.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+        self.publishers: list[Publisher[Any]] = [self.joint_states, self.results, self.statuses]
         too_long = diagnostics.refuse
         self.commands = listen(
             node,
@@ -131,7 +138,7 @@ class DeviceInterface:
         for event in self._supervisor.take_events():
             if isinstance(event, StepResult):
                 self.results.publish(to_result(event))
-                self._on_result(event)
+                self._on_step_end()
             elif isinstance(event, Notice):
                 self._log(event)
         now = time.monotonic()

@@ -176,31 +176,15 @@ def _check_bounds(step: Step, context: CommandContext, limits: SafetyLimits) -> 
             f"insertion {step.insertion * 1e3:.4g} mm is not ahead of "
             f"{context.insertion * 1e3:.4g} mm",
         )
+    speed, rate = length / step.duration, rotation / step.duration
+    turns = abs(step.rotation) / (2 * math.pi)
     bounded = (
         (Rule.MAX_DEPTH, "depth", step.insertion * 1e3, limits.max_depth * 1e3, "mm"),
         (Rule.MAX_STEP_LENGTH, "step", length * 1e3, limits.max_step_length * 1e3, "mm"),
-        (
-            Rule.MAX_SPEED,
-            "speed",
-            length / step.duration * 1e3,
-            limits.max_speed * 1e3,
-            "mm/s",
-        ),
+        (Rule.MAX_SPEED, "speed", speed * 1e3, limits.max_speed * 1e3, "mm/s"),
         (Rule.MAX_ROTATION_STEP, "rotation", rotation, limits.max_rotation_step, "rad"),
-        (
-            Rule.MAX_ROTATION_RATE,
-            "rotation rate",
-            rotation / step.duration,
-            limits.max_rotation_rate,
-            "rad/s",
-        ),
-        (
-            Rule.MAX_TURNS,
-            "accumulated rotation",
-            abs(step.rotation) / (2 * math.pi),
-            limits.max_turns,
-            "turns",
-        ),
+        (Rule.MAX_ROTATION_RATE, "rotation rate", rate, limits.max_rotation_rate, "rad/s"),
+        (Rule.MAX_TURNS, "accumulated rotation", turns, limits.max_turns, "turns"),
     )
     for rule, name, value, bound, unit in bounded:
         if value > bound * _ROUNDING:

@@ -1,4 +1,4 @@
-"""A step or retraction under way: its set-points, what is wrong with it, when it has ended."""
+"""Axes and their motion under way: set-points, what is wrong with either, when it has ended."""
 
 from __future__ import annotations
 
@@ -13,6 +13,24 @@ from needle_device_driver.supervisor.states import Activity
 Problem = tuple[Rule, str]
 
 INNER_SWITCH = "the insertion axis is at its inner limit switch"
+
+
+def axes_problem(
+    at: PairSnapshot, now: float, limits: SafetyLimits, *, powered_wanted: bool, homed_wanted: bool
+) -> Problem | None:
+    """Return the rule that the axes' newest replies break, and how."""
+    if at.fault:
+        return at.fault_rule, at.fault
+    if at.age(now) > limits.reply_age_limit:
+        return (
+            Rule.REPLY_AGE,
+            f"no reply from an axis for {at.age(now):.3f} s, limit {limits.reply_age_limit:g} s",
+        )
+    if powered_wanted and not at.powered:
+        return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its power"
+    if homed_wanted and not at.homed:
+        return Rule.ONE_FAULT_STOPS_BOTH, "an axis lost its home position"
+    return None
 
 
 class MotionRun:

@@ -50,6 +50,31 @@ class Notice:
         return self.text if self.rule is None else f"{self.text} [{self.rule.value}]"
 
 
+MOST_NOTICES, NOTICE_PERIOD = 5, 1.0
+
+
+class NoticeLimit:
+    """Lets through `MOST_NOTICES` of a rule in `NOTICE_PERIOD`, counts others; faults always."""
+
+    def __init__(self) -> None:
+        self._since: dict[Rule | None, float] = {}
+        self._count: dict[Rule | None, int] = {}
+
+    def admit(self, notice: Notice, now: float) -> str:
+        """Return what to say of a notice at steady time `now` [s]; empty: nothing."""
+        if notice.fault:
+            return str(notice)
+        rule = notice.rule
+        left_out = 0
+        if now - self._since.get(rule, -NOTICE_PERIOD) >= NOTICE_PERIOD:
+            left_out = max(self._count.get(rule, 0) - MOST_NOTICES, 0)
+            self._since[rule], self._count[rule] = now, 0
+        self._count[rule] = self._count.get(rule, 0) + 1
+        if self._count[rule] > MOST_NOTICES:
+            return ""
+        return f"{notice} ({left_out} more were not told)" if left_out else str(notice)
+
+
 Event: TypeAlias = StepResult | Notice
 
 
@@ -120,13 +145,3 @@ class DeviceStatus:
     commands_refused: int
     needs_time: bool
     simulated: bool | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class MeasuredJoints:
-    """Measured joints: insertion [m], rotation [rad] and their velocities."""
-
-    insertion: float
-    rotation: float
-    insertion_velocity: float
-    rotation_velocity: float

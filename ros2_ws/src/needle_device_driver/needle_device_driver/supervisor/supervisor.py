@@ -14,7 +14,7 @@ from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage, HoldRefusals
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import INNER_SWITCH
-from needle_device_driver.supervisor.reports import DeviceStatus, Event, MeasuredJoints, Reply
+from needle_device_driver.supervisor.reports import DeviceStatus, Event, Reply
 from needle_device_driver.supervisor.states import Activity, State, Trigger
 
 _SWITCHING = "waiting for the axes to switch off"
@@ -85,17 +85,10 @@ class MotionSupervisor:
         """Return what happened since the last call."""
         return self._core.take_events()
 
-    def joints(self, now: float) -> MeasuredJoints | None:
+    def joints(self, now: float) -> PairSnapshot | None:
         """Return the measured joints; None when there is no reply within the age limit."""
-        snapshot = self._core.snapshot
-        if snapshot is None or snapshot.age(now) > self._limits.reply_age_limit:
-            return None
-        return MeasuredJoints(
-            snapshot.insertion.position,
-            snapshot.rotation.position,
-            snapshot.insertion.velocity,
-            snapshot.rotation.velocity,
-        )
+        at = self._core.snapshot
+        return None if at is None or at.age(now) > self._limits.reply_age_limit else at
 
     def may_move(self, now: float) -> bool:
         """Return whether what is under way would go on if `drive` were called now."""
@@ -117,8 +110,8 @@ class MotionSupervisor:
             hold_owner=plain(self._hold.owner or ""),
             press_again=plain(self._hold.unheeded(now) or ""),
             speed_scale=self._hold.speed_scale,
-            insertion=None if joints is None else joints.insertion,
-            rotation=None if joints is None else joints.rotation,
+            insertion=None if joints is None else joints.insertion.position,
+            rotation=None if joints is None else joints.rotation.position,
             fault=self._core.fault,
             reason=self._core.reason,
             needle_out_confirmed=self._needle_out,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_device_driver.cia402.cycle_schedule import CycleSchedule
+from needle_device_driver.cia402.cycle_clock import CycleSchedule
 
 PERIOD, SLACK = 0.02, 0.002
 

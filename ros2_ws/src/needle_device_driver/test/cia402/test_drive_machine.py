@@ -131,7 +131,7 @@ def test_a_fault_is_left_alone_and_a_word_of_no_state_is_trouble(machine: DriveM
     assert "0x0025" in machine.trouble
     machine.begin_anew(said(DISABLED))
     assert machine.trouble == ""
-    assert machine.goal is Goal.OFF
+    assert machine._goal is Goal.OFF
 
 
 @pytest.mark.parametrize(("statusword", "told"), [(0x0250, False), (0x0050, True)])

@@ -154,7 +154,10 @@ class DriveBench:
         assert joints is not None
         self.supervisor.submit(
             Bench.step_command(
-                joints.insertion + length, joints.rotation + rotation, self.ros_ns, duration
+                joints.insertion.position + length,
+                joints.rotation.position + rotation,
+                self.ros_ns,
+                duration,
             ),
             self.clock(),
         )

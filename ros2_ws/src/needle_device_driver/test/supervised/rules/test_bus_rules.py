@@ -134,7 +134,7 @@ def test_reply_age_an_axis_that_answers_late_is_not_sent_on_meanwhile(
         joints = bench.supervisor.joints(bench.clock())
         if joints is not None:
             # Three cycles' way at 2 mm/s; answers to SYNCs of long ago would be off by more.
-            assert abs(joints.insertion - bench.insertion.position / 20e6) <= 0.0001201
+            assert abs(joints.insertion.position - bench.insertion.position / 20e6) <= 0.0001201
     assert bench.drives.unanswered > 10
 
 
@@ -170,7 +170,7 @@ def staleness(bench: DriveBench, late: Callable[[int], int], cycles: int) -> flo
         bench.cycle(1, holding=True)
         joints = bench.supervisor.joints(bench.clock())
         if joints is not None:
-            worst = max(worst, abs(joints.insertion - at / 20e6))
+            worst = max(worst, abs(joints.insertion.position - at / 20e6))
         drive.held_back = [(count - 1, frames) for count, frames in drive.held_back]
         drive.answer()
         bench.bus.flush()
