@@ -10,6 +10,7 @@ from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
 
 from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
@@ -23,9 +24,7 @@ _LEAST_POSITION_VARIANCE = 1e-12
 
 def to_truth(T_rig_tip: FloatArray, stamp: Time) -> PoseStamped:  # noqa: N803
     """Return the true pose of the tip, shape (4, 4), as a message."""
-    message = PoseStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = RIG_FRAME
+    message = PoseStamped(header=Header(stamp=stamp, frame_id=RIG_FRAME))
     position, orientation = message.pose.position, message.pose.orientation
     position.x, position.y, position.z = map(float, T_rig_tip[:3, 3])
     quaternion = Rotation.from_matrix(T_rig_tip[:3, :3]).as_quat()
@@ -35,18 +34,14 @@ def to_truth(T_rig_tip: FloatArray, stamp: Time) -> PoseStamped:  # noqa: N803
 
 def to_tip(tip: FloatArray, stamp: Time) -> PointStamped:
     """Return a measured tip in `rig`, shape (3,), as a message."""
-    message = PointStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = RIG_FRAME
+    message = PointStamped(header=Header(stamp=stamp, frame_id=RIG_FRAME))
     message.point.x, message.point.y, message.point.z = map(float, tip)
     return message
 
 
 def to_tip_pose(tip: FloatArray, noise: float, stamp: Time) -> PoseWithCovarianceStamped:
     """Return a measured tip with uniform noise of +-`noise` [m] and no known orientation."""
-    message = PoseWithCovarianceStamped()
-    message.header.stamp = stamp
-    message.header.frame_id = RIG_FRAME
+    message = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id=RIG_FRAME))
     position = message.pose.pose.position
     position.x, position.y, position.z = map(float, tip)
     variance = max(noise**2 / 3.0, _LEAST_POSITION_VARIANCE)
@@ -56,15 +51,9 @@ def to_tip_pose(tip: FloatArray, noise: float, stamp: Time) -> PoseWithCovarianc
 
 def to_image(image: NDArray[np.uint8], frame: str, stamp: Time) -> Image:
     """Return a grey image as a message."""
-    message = Image(
-        height=image.shape[0],
-        width=image.shape[1],
-        encoding="mono8",
-        is_bigendian=0,
-        step=image.shape[1],
-    )
-    message.header.stamp = stamp
-    message.header.frame_id = frame
+    height, width = image.shape
+    message = Image(height=height, width=width, encoding="mono8", step=width)
+    message.header = Header(stamp=stamp, frame_id=frame)
     # Anything but an array of bytes is copied element by element.
     data = array.array("B")
     data.frombytes(np.ascontiguousarray(image).data)
@@ -74,7 +63,8 @@ def to_image(image: NDArray[np.uint8], frame: str, stamp: Time) -> Image:
 
 def to_camera_info(camera: SimulatedCamera, frame: str, stamp: Time) -> CameraInfo:
     """Return a camera's calibration as a message; the images are not rectified."""
-    message = CameraInfo(
+    return CameraInfo(
+        header=Header(stamp=stamp, frame_id=frame),
         height=camera.image_height,
         width=camera.image_width,
         distortion_model="plumb_bob",
@@ -83,6 +73,3 @@ def to_camera_info(camera: SimulatedCamera, frame: str, stamp: Time) -> CameraIn
         r=np.eye(3).ravel(),
         p=np.hstack([camera.camera_matrix, np.zeros((3, 1))]).ravel(),
     )
-    message.header.stamp = stamp
-    message.header.frame_id = frame
-    return message

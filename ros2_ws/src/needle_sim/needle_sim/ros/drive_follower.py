@@ -51,6 +51,13 @@ class DriveFollower:
         How long a tick may stay unanswered [s], steady clock.
     on_step_end : callable
         Called after each result.
+
+    Attributes
+    ----------
+    publishers : list of Publisher
+        Topics that partners must listen to: none.
+    subscriptions : list of Subscription
+        Topics that partners must publish.
     """
 
     def __init__(
@@ -73,22 +80,13 @@ class DriveFollower:
         self._estop = node.create_publisher(Bool, "device/estop", RELIABLE)
         subscribe = node.create_subscription
         # The order matters: what is heard in one look is taken in it.
-        self._subscriptions: list[Subscription[Any]] = [
+        self.publishers: list[Publisher[Any]] = []
+        self.subscriptions: list[Subscription[Any]] = [
             subscribe(Header, "device/result", self._on_result, RELIABLE),
             subscribe(DiagnosticStatus, "device/status", self._on_status, LATCHED),
             subscribe(JointState, "joint_states", self._on_joint_states, JOINT_STATES),
             subscribe(JointState, "sim/drive_positions", self._on_positions, JOINT_STATES),
         ]
-
-    @property
-    def publishers(self) -> list[Publisher[Any]]:
-        """Topics that partners must listen to."""
-        return []
-
-    @property
-    def subscriptions(self) -> list[Subscription[Any]]:
-        """Topics that partners must publish."""
-        return self._subscriptions
 
     def missing(self) -> list[str]:
         """Return what else is not there yet."""

@@ -6,14 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
 from needle_common.errors import UserError
 from needle_common.ros.base_node import DiagnosticsPublisher
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.reports import StepResult
 from needle_device_driver.supervisor.states import Activity
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.rig.bench import SimulatedBench
@@ -41,6 +39,13 @@ class SimulatedDevice:
         Called after each result.
     now : float
         Steady time [s].
+
+    Attributes
+    ----------
+    publishers : list of Publisher
+        Topics that partners must listen to.
+    subscriptions : list of Subscription
+        Topics that partners must publish.
     """
 
     def __init__(
@@ -62,29 +67,16 @@ class SimulatedDevice:
             self._insertion, self._rotation, limits, lock_step=in_lock_step
         )
         self._supervisor.configure(now)
-
-        def on_result(_: StepResult) -> None:
-            on_step_end()
-
-        self._interface = DeviceInterface(
+        self._interface = interface = DeviceInterface(
             node,
             self._supervisor,
             diagnostics,
             simulated=True,
             refuse=refuse,
-            on_result=on_result,
+            on_step_end=on_step_end,
         )
-
-    @property
-    def publishers(self) -> list[Publisher[Any]]:
-        """Topics that partners must listen to."""
-        interface = self._interface
-        return [interface.joint_states, interface.results, interface.statuses]
-
-    @property
-    def subscriptions(self) -> list[Subscription[Any]]:
-        """Topics that partners must publish."""
-        return [self._interface.commands, self._interface.holds]
+        self.publishers = interface.publishers
+        self.subscriptions: list[Subscription[Any]] = [interface.commands, interface.holds]
 
     def missing(self) -> list[str]:
         """Return what else is not there yet: nothing.

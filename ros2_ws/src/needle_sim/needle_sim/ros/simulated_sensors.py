@@ -39,6 +39,13 @@ class SimulatedTips:
         What is measured.
     values : SimRigParameters
         The node's.
+
+    Attributes
+    ----------
+    publishers, heard : list of Publisher
+        All of its publishers, and those that partners must listen to.
+    subscriptions : list of Subscription
+        Topics that partners must publish.
     """
 
     half_sizes = (math.inf, math.inf)
@@ -51,21 +58,9 @@ class SimulatedTips:
         self._tip_pose = node.create_publisher(
             PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE
         )
-
-    @property
-    def publishers(self) -> list[Publisher[Any]]:
-        """All of its publishers."""
-        return [self._tip, self._tip_pose]
-
-    @property
-    def heard(self) -> list[Publisher[Any]]:
-        """Topics that partners must listen to."""
-        return [self._tip]
-
-    @property
-    def subscriptions(self) -> list[Subscription[Any]]:
-        """Topics that partners must publish."""
-        return []
+        self.publishers: list[Publisher[Any]] = [self._tip, self._tip_pose]
+        self.heard: list[Publisher[Any]] = [self._tip]
+        self.subscriptions: list[Subscription[Any]] = []
 
     def expose(self, number: int, stamp: Time) -> None:
         """Publish the measurement of an exposure."""
@@ -90,6 +85,13 @@ class SimulatedCameras:
         The node's.
     on_answer : callable
         Called with what the tracker says of each pair.
+
+    Attributes
+    ----------
+    publishers, heard : list of Publisher
+        All of its publishers, and those that partners must listen to.
+    subscriptions : list of Subscription
+        Topics that partners must publish.
     """
 
     def __init__(
@@ -119,24 +121,12 @@ class SimulatedCameras:
             )
             for side in ("left", "right")
         ]
-        self._answers = node.create_subscription(
+        self.publishers: list[Publisher[Any]] = [one for view in self._views for one in view]
+        self.heard: list[Publisher[Any]] = [image_raw for image_raw, _ in self._views]
+        answers = node.create_subscription(
             PoseWithCovarianceStamped, "needle/tip_pose", on_answer, RELIABLE
         )
-
-    @property
-    def publishers(self) -> list[Publisher[Any]]:
-        """All of its publishers."""
-        return [publisher for view in self._views for publisher in view]
-
-    @property
-    def heard(self) -> list[Publisher[Any]]:
-        """Topics that partners must listen to."""
-        return [image_raw for image_raw, _ in self._views]
-
-    @property
-    def subscriptions(self) -> list[Subscription[Any]]:
-        """Topics that partners must publish."""
-        return [self._answers]
+        self.subscriptions: list[Subscription[Any]] = [answers]
 
     def expose(self, number: int, stamp: Time) -> None:
         """Publish the images of an exposure."""
