@@ -85,23 +85,18 @@ class CanopenDevice:
         self._errors: list[int] = []
         self._sdo = SdoServer(dictionary)
         self._add_communication_objects()
+
+        def cob_ids(codes: tuple[int, ...]) -> list[int]:
+            """Return what they are after power-up: only the first of a direction is on."""
+            return [code + node_id | (INVALID if k else 0) for k, code in enumerate(codes)]
+
         self._receive = [
-            ReceivePdo(
-                dictionary,
-                k,
-                base + node_id | (INVALID if k else 0),
-                default_receive if k == 0 else (),
-            )
-            for k, base in enumerate(_RECEIVE)
+            ReceivePdo(dictionary, k, cob_id, () if k else default_receive)
+            for k, cob_id in enumerate(cob_ids(_RECEIVE))
         ]
         self._transmit = [
-            TransmitPdo(
-                dictionary,
-                k,
-                base + node_id | (INVALID if k else 0),
-                default_transmit if k == 0 else (),
-            )
-            for k, base in enumerate(_TRANSMIT)
+            TransmitPdo(dictionary, k, cob_id, () if k else default_transmit)
+            for k, cob_id in enumerate(cob_ids(_TRANSMIT))
         ]
 
     def power_up(self, now: float) -> None:

@@ -14,7 +14,6 @@ from needle_sim.bus.object_dictionary import (
 )
 
 INVALID = 1 << 31
-_NO_REMOTE = 1 << 30
 _MOST_ENTRIES = 8
 _LAST_SYNCHRONOUS = 240
 _EVENT_DRIVEN = 254
@@ -35,11 +34,11 @@ class _Pdo:
         Mapping after power-up: index << 16 | subindex << 8 | bits.
     """
 
-    # Of each direction: indices of the first communication and mapping parameters, and the highest
-    # subindex of the former.
+    # Of each direction: indices of the first communication and mapping parameters, and what the
+    # former have beside COB-ID and transmission type.
     _first_parameters: int
     _first_mapping: int
-    _last_parameter: int
+    _more_parameters: tuple[int, ...] = ()
 
     def __init__(
         self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
@@ -49,9 +48,11 @@ class _Pdo:
         self._mapping = mapping = self._first_mapping + number
         add = dictionary.add
         writable = partial(add, access=Access.READ_WRITE)
-        add(parameters, 0, Kind.U8, self._last_parameter)
+        add(parameters, 0, Kind.U8, max((2, *self._more_parameters)))
         writable(parameters, 1, Kind.U32, cob_id)
         writable(parameters, 2, Kind.U8, 255)
+        for subindex in self._more_parameters:
+            writable(parameters, subindex, Kind.U16, 0)
         writable(mapping, 0, Kind.U8, len(mapped))
         for entry in range(1, _MOST_ENTRIES + 1):
             value = mapped[entry - 1] if entry <= len(mapped) else 0
@@ -115,13 +116,8 @@ class _Pdo:
 class ReceivePdo(_Pdo):
     """Takes values from the bus; parameters as of `_Pdo`."""
 
-    _first_parameters, _first_mapping, _last_parameter = 0x1400, 0x1600, 2
-
-    def __init__(
-        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
-    ) -> None:
-        super().__init__(dictionary, number, cob_id, mapped)
-        self._waiting: bytes | None = None
+    _first_parameters, _first_mapping = 0x1400, 0x1600
+    _waiting: bytes | None = None
 
     def take(self, data: bytes) -> None:
         """Take a frame's data: applied now or with the next SYNC."""
@@ -159,17 +155,12 @@ class TransmitPdo(_Pdo):
     Parameters as of `_Pdo`.
     """
 
-    _first_parameters, _first_mapping, _last_parameter = 0x1800, 0x1A00, 5
-
-    def __init__(
-        self, dictionary: ObjectDictionary, number: int, cob_id: int, mapped: tuple[int, ...]
-    ) -> None:
-        super().__init__(dictionary, number, cob_id, mapped)
-        dictionary.add(self._parameters, 3, Kind.U16, 0, access=Access.READ_WRITE)
-        dictionary.add(self._parameters, 5, Kind.U16, 0, access=Access.READ_WRITE)
-        self._syncs = 0
-        self._sent: bytes | None = None
-        self._sent_at = 0.0
+    _first_parameters, _first_mapping = 0x1800, 0x1A00
+    # Inhibit time and event timer.
+    _more_parameters = (3, 5)
+    _syncs = 0
+    _sent: bytes | None = None
+    _sent_at = 0.0
 
     def data(self) -> bytes:
         """Return the values as they are now."""

@@ -48,11 +48,6 @@ class SlcanAdapter:
         self._open = False
         self._listens_only = False
 
-    @property
-    def is_open(self) -> bool:
-        """Tell whether the computer has opened the channel."""
-        return self._open
-
     def feed(self, data: bytes) -> SlcanInput:
         """Take bytes from the computer, complete commands or not."""
         self._buffer += data

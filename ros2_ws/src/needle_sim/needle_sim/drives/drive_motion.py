@@ -213,27 +213,17 @@ class DriveMotion:
         return self._status_bits(enabled=enabled)
 
     def _status_bits(self, *, enabled: bool) -> int:
-        bits = _LIMITED if self._limited else 0
+        rests = self._demand.at_rest
+        reached = bit_12 = bit_13 = False
         if self._mode == PROFILE_POSITION:
-            reached = self._target is None and self._demand.at_rest
-            taken = self._word & NEW_SET_POINT
-            return (
-                bits
-                | (_REACHED if reached else 0)
-                | (_BIT_12 if taken else 0)
-                | (_BIT_13 if self._late else 0)
-            )
-        if self._mode == HOMING:
-            reached = self._homing is None and self._demand.at_rest
-            return (
-                bits
-                | (_REACHED if reached else 0)
-                | (_BIT_12 if self._homed else 0)
-                | (_BIT_13 if self._homing_failed else 0)
-            )
-        if self._mode == CYCLIC_SYNCHRONOUS_POSITION:
-            return bits | (_BIT_12 if enabled else 0) | (_BIT_13 if self._late else 0)
-        return bits
+            reached = self._target is None and rests
+            bit_12, bit_13 = bool(self._word & NEW_SET_POINT), self._late > 0.0
+        elif self._mode == HOMING:
+            reached = self._homing is None and rests
+            bit_12, bit_13 = self._homed, self._homing_failed
+        elif self._mode == CYCLIC_SYNCHRONOUS_POSITION:
+            bit_12, bit_13 = enabled, self._late > 0.0
+        return self._limited * _LIMITED | reached * _REACHED | bit_12 * _BIT_12 | bit_13 * _BIT_13
 
     # ---- inside -------------------------------------------------------------------------------
 

@@ -99,11 +99,6 @@ class EmulatedBus:
             states[name] = AxisState(drive.motor.position / scale, drive.motor.velocity / scale)
         return states
 
-    @property
-    def moves(self) -> bool:
-        """Tell whether a motor turns or is about to."""
-        return any(drive.moves for drive in self.drives.values())
-
     # ---- faults -------------------------------------------------------------------------------
 
     def stall(self, axis: str) -> None:

@@ -157,11 +157,6 @@ class EmulatedDrive:
         microseconds = self._objects.value(0x1006)
         return microseconds * 1e-6 if microseconds else self._motion.interpolation_period
 
-    @property
-    def moves(self) -> bool:
-        """Tell whether the motor turns or is about to."""
-        return self.motor.velocity != 0.0 or (self.state in _ON and not self._settled)
-
     def advance(self, steps: int) -> None:
         """Let `steps` of `MOTION_STEP` go by."""
         for _ in range(steps):

@@ -63,4 +63,4 @@ def test_closed_channel_passes_nothing() -> None:
     assert adapter.encode(CanFrame(0x08F, b"")) == b"t08F0\r"
     assert adapter.feed(b"V\rN\rF\r").reply == b"V1013\rNSIM1\rF00\r"
     adapter.feed(b"C\r")
-    assert not adapter.is_open
+    assert not adapter._open
