@@ -6,7 +6,6 @@ import csv
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import TextIO
 
 import cv2
@@ -100,17 +99,6 @@ class ImageFolder:
             self._truths = self._table(TRUTH, _TRUTH_COLUMNS + more_columns)
         except OSError as error:
             raise UserError(f"cannot write {folder}: {error.strerror}") from error
-
-    def __enter__(self) -> ImageFolder:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
     def write(
         self,

@@ -207,7 +207,7 @@ class Lens:
 
 @dataclasses.dataclass(frozen=True)
 class Scenario:
-    """Everything that the images of one run are troubled by.
+    """All troubles of the images of one run.
 
     Attributes
     ----------

@@ -69,12 +69,12 @@ class StereoRig:
 
     @property
     def half_height(self) -> float:
-        """How far the phantom reaches up and down from the needle's axis, along x [m]."""
+        """Reach of the phantom up and down from the needle's axis, along x [m]."""
         return self._reach(0, _HALF_HEIGHT)
 
     @property
     def half_width(self) -> float:
-        """How far it reaches to both sides, along y [m]."""
+        """Reach of the phantom to both sides, along y [m]."""
         return self._reach(1, math.inf)
 
     def _reach(self, axis: int, unseen: float) -> float:

@@ -77,7 +77,7 @@ class Moment:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class StillScene:
-    """What never moves, in `rig`; the same for both cameras.
+    """Content that never moves, in `rig`; the same for both cameras.
 
     Attributes
     ----------

@@ -7,6 +7,13 @@ from numpy.typing import ArrayLike
 
 from needle_sim.needle.se3 import FloatArray, exp_twist
 
+_STRETCH = np.dtype(
+    [
+        *(("start", np.float64), ("length", np.float64), ("pose", np.float64, (4, 4))),
+        *(("twist", np.float64, 6), ("angle", np.float64), ("turned", np.float64)),
+    ]
+)
+
 
 class Channel:
     """Poses of one needle's tip frame along the path it cut, by inserted length.
@@ -24,11 +31,7 @@ class Channel:
         self._entry_angle = entry_angle
         self.length = 0.0
         self._count = 0
-        self._starts = np.empty(64)
-        self._lengths = np.empty(64)
-        self._poses = np.empty((64, 4, 4))
-        self._twists = np.empty((64, 6))
-        self._angles = np.empty((64, 2))
+        self._stretches = np.empty(64, _STRETCH)
 
     def append(
         self,
@@ -51,17 +54,9 @@ class Channel:
         angle, turned : float
             The tip's angle where the stretch begins, and its rotation over the stretch [rad].
         """
-        if self._count == len(self._starts):
-            self._starts = np.concatenate([self._starts, np.empty_like(self._starts)])
-            self._lengths = np.concatenate([self._lengths, np.empty_like(self._lengths)])
-            self._poses = np.concatenate([self._poses, np.empty_like(self._poses)])
-            self._twists = np.concatenate([self._twists, np.empty_like(self._twists)])
-            self._angles = np.concatenate([self._angles, np.empty_like(self._angles)])
-        self._starts[self._count] = self.length
-        self._poses[self._count] = T_rig_start
-        self._lengths[self._count] = length
-        self._twists[self._count] = twist
-        self._angles[self._count] = angle, turned
+        if self._count == len(self._stretches):
+            self._stretches = np.concatenate([self._stretches, np.empty_like(self._stretches)])
+        self._stretches[self._count] = self.length, length, T_rig_start, twist, angle, turned
         self._count += 1
         self.length += length
 
@@ -85,13 +80,13 @@ class Channel:
         insertion = np.asarray(insertion, dtype=np.float64)
         if self._count == 0:
             return self._before_entry(insertion), np.full(insertion.shape, self._entry_angle)
-        starts = self._starts[: self._count]
-        index = np.clip(np.searchsorted(starts, insertion, side="right") - 1, 0, None)
+        starts = self._stretches["start"][: self._count]
+        cut = self._stretches[np.clip(np.searchsorted(starts, insertion, "right") - 1, 0, None)]
         # A share, since a rate over the shortest of stretches is beyond numbers.
-        lengths = self._lengths[index]
-        share = np.clip(insertion - starts[index], 0.0, lengths) / lengths
-        poses = self._poses[index] @ exp_twist(share[..., np.newaxis] * self._twists[index])
-        angles = self._angles[index, 0] + share * self._angles[index, 1]
+        share = np.clip(insertion - cut["start"], 0.0, cut["length"]) / cut["length"]
+        path = np.ascontiguousarray(cut["pose"])
+        poses = path @ exp_twist(share[..., np.newaxis] * cut["twist"])
+        angles = cut["angle"] + share * cut["turned"]
         outside = insertion < 0.0
         poses[outside] = self._before_entry(insertion[outside])
         return poses, np.where(outside, self._entry_angle, angles)

@@ -31,24 +31,6 @@ def initial_pose(pitch: float, roll: float) -> FloatArray:
     return np.asarray(rotation_about_y(pitch) @ rotation_about_z(roll))
 
 
-def bicycle_curvature(front_wheel_angle: ArrayLike, wheel_base: ArrayLike) -> FloatArray:
-    """Return kappa = tan(phi) / l1 of the bicycle model ([KC09] section II).
-
-    Parameters
-    ----------
-    front_wheel_angle : array_like, shape (...)
-        phi, the fixed angle of the front wheel against the rear one [rad].
-    wheel_base : array_like, shape (...)
-        l1, the distance between the wheels [m].
-
-    Returns
-    -------
-    ndarray, shape (...)
-        Curvature [1/m].
-    """
-    return np.asarray(np.tan(front_wheel_angle) / np.asarray(wheel_base, dtype=np.float64))
-
-
 class NeedlePlant:
     """An exact plant for [KC09] eqs (1)-(2), one needle or many over leading axes.
 

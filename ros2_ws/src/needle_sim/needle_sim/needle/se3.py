@@ -52,23 +52,22 @@ def exp_twist(twist: ArrayLike) -> FloatArray:
 
 def rotation_about_z(angle: ArrayLike) -> FloatArray:
     """Return Rz(angle) as a transform, shape (..., 4, 4), for `angle` (rad) of shape (...)."""
-    angle = np.asarray(angle, dtype=np.float64)
-    result = np.zeros((*angle.shape, 4, 4))
-    result[..., 0, 0] = result[..., 1, 1] = np.cos(angle)
-    result[..., 1, 0] = np.sin(angle)
-    result[..., 0, 1] = -result[..., 1, 0]
-    result[..., 2, 2] = result[..., 3, 3] = 1.0
-    return result
+    return _rotation(angle, 0, 1)
 
 
 def rotation_about_y(angle: ArrayLike) -> FloatArray:
     """Return Ry(angle) as a transform, shape (..., 4, 4), for `angle` (rad) of shape (...)."""
+    return _rotation(angle, 2, 0)
+
+
+def _rotation(angle: ArrayLike, first: int, second: int) -> FloatArray:
+    """Return the transform that turns one axis towards another."""
     angle = np.asarray(angle, dtype=np.float64)
     result = np.zeros((*angle.shape, 4, 4))
-    result[..., 0, 0] = result[..., 2, 2] = np.cos(angle)
-    result[..., 0, 2] = np.sin(angle)
-    result[..., 2, 0] = -result[..., 0, 2]
-    result[..., 1, 1] = result[..., 3, 3] = 1.0
+    result[..., range(4), range(4)] = 1.0
+    result[..., first, first] = result[..., second, second] = np.cos(angle)
+    result[..., second, first] = np.sin(angle)
+    result[..., first, second] = -result[..., second, first]
     return result
 
 

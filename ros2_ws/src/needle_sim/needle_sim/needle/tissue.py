@@ -39,11 +39,6 @@ class Torsion:
         self._tip: FloatArray = np.zeros(())
 
     @property
-    def base_angle(self) -> FloatArray:
-        """Rotation of the base so far [rad], shape (...)."""
-        return self._base
-
-    @property
     def tip_angle(self) -> FloatArray:
         """Rotation of the tip so far [rad], shape (...)."""
         return self._tip

@@ -43,7 +43,7 @@ class LockStep:
 
     @property
     def why_stuck(self) -> str:
-        """Why the needle will not go on; empty while it may."""
+        """Reason why the needle will not go on; empty while it may."""
         if self._without_step < MAX_WITHOUT_STEP:
             return ""
         tip = "no tip was found" if self._tip_lost else "no tip led to one"
@@ -98,17 +98,12 @@ class LockStep:
         """
         if under_way:
             return Action.TICK if may_move else Action.WAIT
-        if self._unanswered:
-            due = False
-        else:
-            due = (
-                self._step_ended
-                or (
-                    self._tip_wanted_after_ns is not None
-                    and self._tip_wanted_after_ns >= self._last_exposure_ns
-                )
-                or (self._tip_lost and self._state in _STEERING)
-            )
+        tip_wanted = (
+            self._tip_wanted_after_ns is not None
+            and self._tip_wanted_after_ns >= self._last_exposure_ns
+        )
+        lost = self._tip_lost and self._state in _STEERING
+        due = not self._unanswered and (self._step_ended or tip_wanted or lost)
         if due:
             return Action.EXPOSE
         silent = now - self._heard_at >= self._reexpose_after

@@ -1,4 +1,4 @@
-"""Which simulated time a SYNC belongs to: it does not say so itself."""
+"""Simulated times of SYNCs, which do not say so themselves."""
 
 from __future__ import annotations
 

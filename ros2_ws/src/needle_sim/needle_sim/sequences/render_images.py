@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import sys
@@ -186,7 +187,7 @@ def _write(
         pairs = render_insertion(rig, look, seed=options.seed, **way)
     else:
         columns, pairs = TRUTH_COLUMNS, trace_insertion(load_mitsuba(), rig, look, **way)
-    with ImageFolder(options.output, calibration, columns) as folder:
+    with contextlib.closing(ImageFolder(options.output, calibration, columns)) as folder:
         for pair in pairs:
             more: Sequence[float | str] = ()
             if isinstance(look, Appearance) and isinstance(pair, TracedPair):

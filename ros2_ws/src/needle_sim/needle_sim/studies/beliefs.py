@@ -1,4 +1,4 @@
-"""What a controller says of its needles, and how often that is true."""
+"""Claims of a controller about its needles, and how often they are true."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from needle_sim.needle.se3 import FloatArray
 
 @dataclasses.dataclass(frozen=True)
 class Belief:
-    """Where a controller takes its needles to be, and how sure it is.
+    """Place at which a controller takes each needle to be, and how sure it is.
 
     Attributes
     ----------
@@ -75,5 +75,5 @@ class BeliefTally:
 
     @property
     def doubtful(self) -> FloatArray:
-        """Whether the last step was called doubtful, shape (N,), 0 or 1; NaN if nothing is said."""
+        """1 where the last step was called doubtful, else 0, shape (N,); NaN if nothing is said."""
         return self._doubtful

@@ -127,7 +127,7 @@ def patch_factors(patches: float, seed: int, patch: int, first: int, count: int)
 def bumps(distance: float, seed: int, first: int, count: int) -> FloatArray:
     """Return by what the phantom of each needle is moved, (count, 3) [m]."""
     share = study_noise.uniform(seed, study_noise.BUMP, 0, first, count)
-    return np.asarray(distance * _directions(share))
+    return np.asarray(distance * study_noise.directions(share))
 
 
 class DelayLine:
@@ -186,13 +186,6 @@ def _outliers(
 ) -> FloatArray:
     share = study_noise.uniform(seed, study_noise.OUTLIER_DIRECTION, exposure, first, count)
     low, high = size
-    return np.asarray(_directions(share) * (low + (high - low) * share[:, 2:3].astype(np.float64)))
-
-
-def _directions(numbers: NDArray[np.float32]) -> FloatArray:
-    """Return unit vectors, uniform on the sphere, from the first two of some uniform numbers."""
-    share = numbers.astype(np.float64)
-    up = 2.0 * share[:, 0] - 1.0
-    across = np.sqrt(1.0 - up * up)
-    around = 2.0 * np.pi * share[:, 1]
-    return np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)
+    return np.asarray(
+        study_noise.directions(share) * (low + (high - low) * share[:, 2:3].astype(np.float64))
+    )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.beliefs import Belief, BeliefTally
+from needle_sim.studies.beliefs import BeliefTally
 
 BAND = 1e-3
 """Half width of what counts as in the plane [m]: the paper's +-1 mm."""
@@ -100,11 +100,11 @@ class Tally:
         self._step = 0
         self._settled: FloatArray = np.where(np.abs(x) <= BAND, 0.0, np.inf)
         self._rotation: FloatArray = np.zeros(len(x))
-        self._beliefs = BeliefTally(len(x))
+        self.beliefs = BeliefTally(len(x))
 
     @property
     def in_last_steps(self) -> bool:
-        """Whether the last step added is one of those over which a run is judged."""
+        """Tell whether the last step added is one of those over which a run is judged."""
         return self._step > self._skip
 
     def add(self, x: FloatArray, insertion: float, turned: FloatArray) -> None:
@@ -128,13 +128,9 @@ class Tally:
             self._last[self._step - self._skip] = x
         self._step += 1
 
-    def add_belief(self, belief: Belief | None, x: FloatArray, pitch: FloatArray) -> None:
-        """Take what the controller says after one of the last steps; see `BeliefTally.add`."""
-        self._beliefs.add(belief, x, pitch)
-
     def outcomes(self) -> Outcomes:
         """Return what became of the needles."""
-        inside_2_sigma, inside_3_sigma = self._beliefs.inside
+        inside_2_sigma, inside_3_sigma = self.beliefs.inside
         return Outcomes(
             x_start=self._start,
             x_last=self._last.T.copy(),
@@ -142,7 +138,7 @@ class Tally:
             rotation=self._rotation,
             inside_2_sigma=inside_2_sigma,
             inside_3_sigma=inside_3_sigma,
-            doubtful=self._beliefs.doubtful,
+            doubtful=self.beliefs.doubtful,
         )
 
 

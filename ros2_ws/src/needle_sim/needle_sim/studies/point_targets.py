@@ -49,22 +49,17 @@ class MovingTargets:
 
     def at(self, time: FloatArray | float) -> FloatArray:
         """Return where they are, (N, 3) [m], at a time of each or of all [s]."""
-        key, count = (self.seed, self.first), len(self.places)
+        count = len(self.places)
         passed = np.broadcast_to(np.asarray(time, dtype=float), (count,))[:, None]
-        drift, _ = _directions(study_noise.DRIFT, *key, count)
-        breath, phase = _directions(study_noise.BREATH, *key, count)
+        drifts, breaths = (
+            study_noise.uniform(self.seed, purpose, 0, self.first, count)
+            for purpose in (study_noise.DRIFT, study_noise.BREATH)
+        )
+        drift, breath = study_noise.directions(drifts), study_noise.directions(breaths)
+        phase = breaths[:, 2:3].astype(np.float64)
         share = passed * INSERTION_SPEED / FARTHEST
         swing = np.sin(2.0 * np.pi * (BREATHING_RATE * passed + phase))
         return np.asarray(self.places + self.drift * share * drift + self.breath * swing * breath)
-
-
-def _directions(purpose: int, seed: int, first: int, count: int) -> tuple[FloatArray, FloatArray]:
-    """Return unit vectors that point anywhere, (N, 3), and numbers in [0, 1), (N, 1)."""
-    share = study_noise.uniform(seed, purpose, 0, first, count).astype(np.float64)
-    height, around = 2.0 * share[:, 0] - 1.0, 2.0 * np.pi * share[:, 1]
-    across = np.sqrt(1.0 - height**2)
-    vectors = np.stack([across * np.cos(around), across * np.sin(around), height], axis=-1)
-    return vectors, share[:, 2:3]
 
 
 def random_targets(starts: FloatArray, curvature: float, seed: int) -> FloatArray:

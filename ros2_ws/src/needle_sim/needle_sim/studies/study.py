@@ -163,5 +163,5 @@ def _steer(
         tips, age = needles.seen(insertion)
         rate = controller.step(length, turned, tips, age)
         if tally.in_last_steps:
-            tally.add_belief(controller.belief(), true.x, true.pitch)
+            tally.beliefs.add(controller.belief(), true.x, true.pitch)
     return tally.outcomes()

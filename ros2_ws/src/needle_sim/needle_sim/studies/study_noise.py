@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_sim.needle.se3 import FloatArray
+
 START, NOISE, OUTLIER, OUTLIER_DIRECTION, MISSED, CURVATURE, BUMP, TARGET, DRIFT, BREATH = range(10)
 """Purposes of random numbers."""
 PER_NEEDLE = 4
@@ -37,3 +39,12 @@ def uniform(seed: int, purpose: int, step: int, first: int, count: int) -> NDArr
     bits = np.random.Philox(key=seed, counter=[block, step, purpose, 0])
     rows = np.random.Generator(bits).random((count + skip, PER_NEEDLE), dtype=np.float32)
     return rows[skip:]
+
+
+def directions(numbers: NDArray[np.float32]) -> FloatArray:
+    """Return unit vectors, uniform on the sphere, from the first two of some uniform numbers."""
+    share = numbers.astype(np.float64)
+    up = 2.0 * share[:, 0] - 1.0
+    across = np.sqrt(1.0 - up * up)
+    around = 2.0 * np.pi * share[:, 1]
+    return np.stack([across * np.cos(around), across * np.sin(around), up], axis=-1)

@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from needle_sim.needle.plant import NeedlePlant, bicycle_curvature, initial_pose
+from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
 
 CURVATURE = 1.0 / 0.122
@@ -256,11 +256,6 @@ def test_bicycle_tip_rides_ahead_of_the_rear_wheel() -> None:
     for _ in range(100):
         tip.advance(0.001, rng.uniform(-0.5, 0.5))
     np.testing.assert_allclose(tip.T_rig_tip, rear.T_rig_tip @ ahead, rtol=0, atol=1e-13)
-
-
-def test_bicycle_curvature_is_that_of_the_rear_wheel_s_circle() -> None:
-    # The rear wheel's circle is centred on the front wheel's axle, too: radius l1 / tan(phi).
-    assert bicycle_curvature(np.deg2rad(45.0), 0.122) == pytest.approx(CURVATURE)
 
 
 def test_torsion_keeps_the_tip_behind_the_base() -> None:

@@ -29,7 +29,7 @@ def test_outside_the_dead_band_the_tip_follows_at_its_distance_both_ways() -> No
     assert float(torsion.tip_angle) == pytest.approx(0.8)
     torsion.advance(0.001, -0.1)
     assert float(torsion.tip_angle) == pytest.approx(0.7)
-    assert float(torsion.base_angle) == pytest.approx(0.5)
+    assert float(torsion._base) == pytest.approx(0.5)
 
 
 def test_lag_leaves_one_over_e_after_its_length() -> None:
