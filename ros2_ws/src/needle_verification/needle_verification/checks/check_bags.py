@@ -1,4 +1,4 @@
-"""Step E: bags that lose nothing and open everywhere."""
+"""Step E: bags that lose nothing and open everywhere, and nodes that end in order."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from needle_verification.checking import (
     payloads,
     unreadable,
 )
-from needle_verification.checks import check_rerun, check_signals
+from needle_verification.checks import check_rerun
 from needle_verification.descendants import ran
 from needle_verification.trials.damage_trials import damage_trials
 from needle_verification.trials.recording_trials import (
@@ -34,6 +34,7 @@ from needle_verification.trials.recording_trials import (
     record_and_kill,
     record_full_rate,
 )
+from needle_verification.trials.signal_trials import Ended, signal_trials
 
 DURATION = 60.0
 MOMENTS = 50
@@ -42,6 +43,11 @@ PROCESSOR_SHARE = 0.35
 MEMORY_GROWTH_MB = 5.0
 LAST_SECONDS = 0.5
 SMALL_DISK = "40m"
+SIGNALS = 200
+# A bag is completed first: last words are heard for up to a second, and a disk may be slow.
+LONGEST_END = {"recorder": 10.0}
+LONGEST_END_OF_OTHERS = 1.0
+_END_CODES = (0, 130)
 _COMMANDS = "/device/joint_trajectory"
 _POLICIES = ("history", "reliability", "durability", "liveliness")
 _TEXTS = ("storage_identifier", "compression_format", "compression_mode", "ros_distro")
@@ -139,18 +145,17 @@ def disk_full(bench: Workbench) -> Iterator[Finding]:
         witness.terminate()
         witness.wait(30.0)
         reached = re.search(r"inserted ([\d.]+) mm in (\d+) steps", run.output)
-        commands = payloads(bench.folder / "witness", [_COMMANDS])[_COMMANDS]
-        wanted = payloads(usual.bag, [_COMMANDS])[_COMMANDS]
-        kept = payloads(run.bag, [_COMMANDS])[_COMMANDS]
+        commands, wanted, kept = (
+            payloads(bag, [_COMMANDS])[_COMMANDS]
+            for bag in (bench.folder / "witness", usual.bag, run.bag)
+        )
+        same = bool(commands) and commands == wanted[-len(commands) :]
         yield Finding(
             "disk_full_steering",
             f"a disk of {disk} that fills: steering goes on",
             f"120 mm, the same commands as ever (the witness' {len(commands)} last ones)",
-            f"{reached[1] if reached else '?'} mm, commands "
-            + ("the same" if commands and commands == wanted[-len(commands) :] else "differ"),
-            bool(reached and float(reached[1]) == 120.0)
-            and bool(commands)
-            and commands == wanted[-len(commands) :],
+            f"{reached[1] if reached else '?'} mm, commands " + ("the same" if same else "differ"),
+            bool(reached and float(reached[1]) == 120.0) and same,
         )
         why = unreadable(run.bag)
         yield Finding(
@@ -196,9 +201,7 @@ def bag_findings(key: str, bag: Path) -> Iterator[Finding]:
 
 def _breaks_of_rules(bag: Path) -> Iterator[str]:
     """Yield what rosbag2's reader of metadata.yaml would refuse."""
-    information: dict[str, Any] = yaml.safe_load((bag / "metadata.yaml").read_text("utf-8"))[
-        "rosbag2_bagfile_information"
-    ]
+    information = _information(bag)
     topics = information["topics_with_message_count"]
     spans = [information, *information["files"]]
     times = [span["starting_time"]["nanoseconds_since_epoch"] for span in spans]
@@ -226,6 +229,11 @@ def _breaks_of_rules(bag: Path) -> Iterator[str]:
             yield f"metadata.yaml: {metadata['name']}"
 
 
+def _information(bag: Path) -> dict[str, Any]:
+    content = yaml.safe_load((bag / "metadata.yaml").read_text("utf-8"))
+    return dict(content["rosbag2_bagfile_information"])
+
+
 def _wrong_types(bag: Path) -> Iterator[str]:
     store = get_typestore(Stores.ROS2_JAZZY)
     with Reader(bag) as reader:
@@ -235,15 +243,45 @@ def _wrong_types(bag: Path) -> Iterator[str]:
             assert isinstance(connection.ext, ConnectionExtRosbag2)
             if not connection.ext.offered_qos_profiles and connection.msgcount:
                 yield f"{connection.topic}: no QoS"
-        files = yaml.safe_load((bag / "metadata.yaml").read_text("utf-8"))
-        paths = files["rosbag2_bagfile_information"]["relative_file_paths"]
-    for name in paths:
+    for name in _information(bag)["relative_file_paths"]:
         # A file alone must say the same as the directory.
         with Reader(bag / name) as single, Reader(bag) as reader:
             known = {c.topic: c for c in reader.connections}
             for connection in single.connections:
                 if connection.ext != known[connection.topic].ext:
                     yield f"{connection.topic}: QoS differs between metadata.yaml and {name}"
+
+
+def signals(bench: Workbench, trials: int = SIGNALS) -> Iterator[Finding]:
+    """Send SIGINT, SIGINT twice, SIGTERM or SIGHUP to all nodes at random moments."""
+    for burners, key in ((0, "signals"), (2, "signals_busy")):
+        folder = bench.folder / key
+        folder.mkdir()
+        found = list(signal_trials(folder, trials // 2, seed=burners, burners=burners))
+        shutil.rmtree(folder)
+        yield _signal_finding(key, found, "both cores busy" if burners else "otherwise idle")
+
+
+def _signal_finding(key: str, found: list[Ended], load: str) -> Finding:
+    slowest = {
+        node: max(one.seconds for one in found if one.node == node)
+        for node in sorted({one.node for one in found})
+    }
+    wrong = [
+        f"{one.node} after {one.kind}: {one.wrong or f'exit code {one.code}'}"
+        for one in found
+        if one.wrong or one.code not in _END_CODES
+    ]
+    late = [node for node, s in slowest.items() if s > LONGEST_END.get(node, LONGEST_END_OF_OTHERS)]
+    times = ", ".join(f"{node} {seconds:.2f} s" for node, seconds in slowest.items())
+    return Finding(
+        key,
+        f"signals at random moments at 2 x 30 Hz, {load}: {len(found)} ends",
+        f"exit code 0 or 130, no traceback, within {LONGEST_END_OF_OTHERS:g} s "
+        f"(recorder {LONGEST_END['recorder']:g} s, its bag whole)",
+        f"{len(wrong)} otherwise; slowest: {times} " + "; ".join(wrong[:3]),
+        not wrong and not late,
+    )
 
 
 @contextlib.contextmanager
@@ -277,5 +315,5 @@ CHECKS: tuple[Check, ...] = (
     disk_full,
     bag_format,
     *check_rerun.CHECKS,
-    *check_signals.CHECKS,
+    signals,
 )

@@ -76,7 +76,7 @@ def camera(bench: Workbench) -> Iterator[Finding]:
 
 
 def open_loop(bench: Workbench) -> Iterator[Finding]:
-    """Not steered, the needle ends where its constant curvature takes it."""
+    """End where the constant curvature takes the needle, not steered."""
     arguments = ("--controller", "open_loop", "--level", "tip", "--noise-mm", "0")
     run = bench.run("open_loop", *arguments)
     r1 = run.summary.get("r1_final_mm")
@@ -249,14 +249,11 @@ def _differences(one: Path, other: Path, topics: Sequence[str] = SAME_TOPICS) ->
 def _run_with(bench: Workbench, name: str, kind: str, *arguments: str) -> SimulateRun:
     """Run `simulate` with a second publisher of bad data in its graph."""
     started = bench.start(name, *arguments)
-    command = [sys.executable, "-m", "needle_verification.ros.bad_input", "--ros-args"]
-    command += ["-p", f"kind:={kind}", "--disable-external-lib-logs"]
+    command = [sys.executable, "-m", "needle_verification.ros.bad_input", kind]
     environment = {**os.environ, "ROS_DOMAIN_ID": str(started.domain())}
-    with subprocess.Popen(command, env=environment) as intruder:
-        try:
-            run = started.wait()
-        finally:
-            intruder.send_signal(signal.SIGINT)
+    # It ends with its input.
+    with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE):
+        run = started.wait()
     if run.code not in (EXIT_DONE, EXIT_MISSED):
         raise UserError(f"{name} ended with exit code {run.code}: {run.last_line}")
     return run

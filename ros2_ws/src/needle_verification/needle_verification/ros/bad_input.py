@@ -1,51 +1,39 @@
-"""Sends bad data into a running graph, for the checks that nothing moves from it."""
+"""Sends bad data into a running graph, for the checks that nothing moves from it.
+
+`python -m needle_verification.ros.bad_input KIND`: bad tips or lonely images beside the good ones,
+stamped like joint_states, until its input ends.
+"""
 
 from __future__ import annotations
 
 import array
-import dataclasses
 import math
+import select
 import sys
 
+import rclpy
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import Image, JointState
 
-from needle_common.ros.base_node import run_node
 from needle_common.ros.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_verification.ros.listening_node import ListeningNode
 
-HELP = """\
-bad_input: publishes bad tips or lonely images beside the good ones, stamped like joint_states.
-"""
-TIPS = ("not_finite", "frame", "millimetres")
 LEFT_IMAGE = "left_image"
 # Joint states from one bad message to the next.
 _EVERY = 40
 
 
-@dataclasses.dataclass(frozen=True)
-class BadInputParameters:
-    """Parameters of the publisher."""
-
-    kind: str = fixed_parameter("not_finite", "-", "What is bad.", choices=(*TIPS, LEFT_IMAGE))
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-
-
-class BadInput(WholeNode):
+class BadInput(ListeningNode):
     """Answers every so many joint states with a bad tip or a left image alone."""
 
-    def __init__(self) -> None:
+    def __init__(self, kind: str) -> None:
         super().__init__("bad_input")
-        self._kind = NodeParameters(self, BadInputParameters).values.kind
+        self._kind = kind
         self._seen = 0
         self._bad = (
             self.create_publisher(Image, "stereo/left/image_raw", IMAGES)
-            if self._kind == LEFT_IMAGE
+            if kind == LEFT_IMAGE
             else self.create_publisher(PointStamped, "needle/tip", RELIABLE)
         )
         self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
@@ -80,8 +68,15 @@ def _image(stamp: Time) -> Image:
 
 
 def main() -> int:
-    """Run the node; returns its exit code."""
-    return run_node(BadInput, help_text=HELP, parameters=BadInputParameters)
+    """Send one kind of bad data; returns the exit code."""
+    (kind,) = sys.argv[1:]
+    rclpy.init()
+    node = BadInput(kind)
+    while not select.select([sys.stdin], [], [], 0.0)[0]:
+        node.look(0.05)
+    node.close()
+    rclpy.try_shutdown()
+    return 0
 
 
 if __name__ == "__main__":

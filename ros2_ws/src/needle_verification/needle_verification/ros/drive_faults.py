@@ -55,9 +55,11 @@ def fault_trials(
     driver = {"retraction_speed": _FAST}
     if watchdog is not None:
         driver |= {"watchdog": watchdog, "reply_age_limit": watchdog}
-    processes = TrialProcesses(folder, domain, drives_and_driver({}, driver))
-    hand = DriveHand()
-    try:
+    parameters = drives_and_driver({}, driver)
+    with (
+        contextlib.closing(DriveHand()) as hand,
+        contextlib.closing(TrialProcesses(folder, domain, parameters)) as processes,
+    ):
         hand.until(hand.ready, "the driver", 60.0)
         _get_ready(hand)
         for kind in kinds:
@@ -65,9 +67,6 @@ def fault_trials(
             for number in range(count):
                 yield {"fault": kind, "number": number, **_fault(processes, hand, kind, rng)}
                 processes.check()
-    finally:
-        processes.stop()
-        hand.close()
 
 
 def _start_over(hand: DriveHand) -> None:
@@ -118,8 +117,6 @@ def _fault(
     """Let it happen at a random moment of a random motion, watch, recover."""
     words = _words(kind, rng)
     stream = _move_until_moment(hand, rng)
-    before = hand.motors[-1]
-    seen = len(hand.motors)
     logged = len(processes.log("device_driver"))
     faults = processes.log("drive_emulator").count(": fault 0x")
     begun_at = _happen(processes, hand, kind, words)
@@ -134,11 +131,6 @@ def _fault(
         if time.monotonic() > give_up_at + _LONGEST:
             raise UserError("the drives tell no positions any more")
     stopped = hand.motors[-1]
-    moving = [
-        at
-        for at in hand.motors[seen:]
-        if (at.insertion, at.rotation) != (stopped.insertion, stopped.rotation)
-    ]
     state, reason = hand.status.get("state", ""), hand.status.get("fault", "")
     log = processes.log("device_driver")[logged:]
     still_from = len(hand.motors)
@@ -166,8 +158,6 @@ def _fault(
         "speed_mm_s": stream.speed * 1e3,
         "turn_rate_rad_s": stream.turn_rate,
         "distance_mm": (stopped.insertion - begun_at) * 1e3,
-        "rotation_rad": abs(stopped.rotation - before.rotation),
-        "stopped_after_s": moving[-1].heard_at - before.heard_at if moving else 0.0,
         "state": state,
         "reason": reason,
         "logged": bool(reason) and reason in log,

@@ -37,10 +37,9 @@ _HOLD_PERIOD = 0.05
 
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """True places of the motors [m], [rad], at their time [ns], heard at steady time [s]."""
+    """True places of the motors [m], [rad], at their time [ns]."""
 
     stamp_ns: int
-    heard_at: float
     insertion: float
     rotation: float
 
@@ -63,7 +62,6 @@ class DriveHand(ListeningNode):
         self.status: dict[str, str] = {}
         self.real_states: set[str] = set()
         self.pressed = False
-        self.scale = 1.0
         # What commands are stamped with.
         self.now_ns: Callable[[], int] = lambda: self.get_clock().now().nanoseconds
         self._last_hold = 0
@@ -165,7 +163,7 @@ class DriveHand(ListeningNode):
     def send_hold(self) -> None:
         """Say what the hold is."""
         self._last_hold = max(time.time_ns(), self._last_hold + 1)
-        message = Joy(axes=[self.scale if self.pressed else 0.0], buttons=[int(self.pressed)])
+        message = Joy(axes=[float(self.pressed)], buttons=[int(self.pressed)])
         message.header.frame_id = self.get_name()
         message.header.stamp = to_stamp(self._last_hold)
         self._holds.publish(message)
@@ -179,7 +177,7 @@ class DriveHand(ListeningNode):
     def _on_positions(self, message: JointState) -> None:
         at = dict(zip(message.name, message.position, strict=True))
         stamp_ns = to_nanoseconds(message.header.stamp)
-        self.motors.append(Motors(stamp_ns, time.monotonic(), at[JOINTS[0]], at[JOINTS[1]]))
+        self.motors.append(Motors(stamp_ns, at[JOINTS[0]], at[JOINTS[1]]))
 
     def _on_result(self, message: Header) -> None:
         self.results[to_nanoseconds(message.stamp)] = message.frame_id

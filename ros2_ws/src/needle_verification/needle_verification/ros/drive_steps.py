@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import random
 import time
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +91,12 @@ def random_steps(folder: Path, domain: int, count: int, seed: int) -> dict[str, 
         "reply_age_limit": PATIENT_WATCHDOG,
         "retraction_speed": _FAST,
     }
-    processes = TrialProcesses(folder, domain, drives_and_driver(emulator, driver))
-    hand = DriveHand()
+    parameters = drives_and_driver(emulator, driver)
     begin = time.monotonic()
-    try:
+    with (
+        closing(DriveHand()) as hand,
+        closing(TrialProcesses(folder, domain, parameters)) as processes,
+    ):
         steps = _RandomSteps(hand, rng)
         steps.prepare()
         memory: list[int] = []
@@ -104,16 +107,12 @@ def random_steps(folder: Path, domain: int, count: int, seed: int) -> dict[str, 
         hand.release()
         steps.time.tick()
         processes.check()
-    finally:
-        processes.stop()
-    outcome = {
+    return {
         "steps": count,
         **steps.figures(),
         "memory_growth_MB": (memory[-1] - memory[0]) / 1e6,
         "wall_s": time.monotonic() - begin,
     }
-    hand.close()
-    return outcome
 
 
 class _RandomSteps:
@@ -125,7 +124,6 @@ class _RandomSteps:
         self.time = _LockStep(hand)
         hand.now_ns = lambda: self.time.time_ns
         self._at = (0.0, 0.0)
-        self._worst = (0.0, 0.0)
         self._failures: list[str] = []
         self._retractions = 0
 
@@ -174,8 +172,6 @@ class _RandomSteps:
                 self.time.tick()
         if hand.results[stamp] != "succeeded":
             self._failures.append(hand.results[stamp])
-        off = self._off()
-        self._worst = (max(self._worst[0], abs(off[0])), max(self._worst[1], abs(off[1])))
 
     def figures(self) -> dict[str, Any]:
         """Return what came of it; distances in counts."""
@@ -187,8 +183,6 @@ class _RandomSteps:
             "results": len(hand.results),
             "final_off_insertion_counts": off[0],
             "final_off_rotation_counts": off[1],
-            "worst_off_insertion_counts": self._worst[0],
-            "worst_off_rotation_counts": self._worst[1],
             "ticks": self.time.ticks,
             "joint_states_of_ticks": len(set(hand.joint_stamps)),
             "drive_positions": len(hand.motors),

@@ -25,12 +25,12 @@ from needle_verification.ros.drive_faults import FAULTS, fault_trials
 from needle_verification.ros.drive_steps import random_steps
 from needle_verification.ros.fuzz_trials import fuzz_trials
 from needle_verification.ros.graph_kills import KILLED, kill_trials
-from needle_verification.ros.nuisance import NUISANCES
+from needle_verification.ros.nuisance import NUISANCE_KINDS
 from needle_verification.ros.nuisance_trials import nuisance_trials
 from needle_verification.ros.two_rigs import two_rigs_trials
 
 TRIALS = ("steps", "faults", "kills", "two_rigs", "nuisances", "fuzz")
-KINDS = {"faults": FAULTS, "kills": KILLED, "nuisances": NUISANCES}
+KINDS = {"faults": FAULTS, "kills": KILLED, "nuisances": NUISANCE_KINDS}
 
 
 def main() -> int:

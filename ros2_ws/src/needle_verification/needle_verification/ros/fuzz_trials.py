@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -56,10 +57,11 @@ def fuzz_trials(folder: Path, domain: int, seconds: float, seed: int) -> Iterato
     for name in _LEFT_OUT:
         parameters.pop(name)
     parameters["recorder"] = {"bag": str(folder / "bag")}
-    processes = TrialProcesses(folder, domain, parameters)
-    witness = _Witness()
     rng = random.Random(seed)
-    try:
+    with (
+        closing(_Witness()) as witness,
+        closing(TrialProcesses(folder, domain, parameters)) as processes,
+    ):
         witness.until(lambda: witness.state == "DISABLED", "a driver", _READY)
         nodes = {name.lstrip("/") for name in parameters}
         fuzzer = _Fuzzer(witness, nodes, rng)
@@ -69,9 +71,6 @@ def fuzz_trials(folder: Path, domain: int, seconds: float, seed: int) -> Iterato
                 fuzzer.left_out = ()
                 fuzzer.look_around()
             yield {"fuzz": half, **_half(processes, witness, fuzzer, seconds / 2.0)}
-    finally:
-        processes.stop()
-        witness.close()
 
 
 def _half(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -44,13 +45,12 @@ def kill_trials(
         for number in range(count):
             place = folder / f"{kind}_{number}"
             place.mkdir()
-            graph = TrialProcesses(place, domain, graph_in_real_time(rng.randrange(1000)))
-            hand = DriveHand(steers=False)
-            try:
+            parameters = graph_in_real_time(rng.randrange(1000))
+            with (
+                closing(DriveHand(steers=False)) as hand,
+                closing(TrialProcesses(place, domain, parameters)) as graph,
+            ):
                 yield {"fault": kind, "number": number, **_kill(graph, hand, kind, rng)}
-            finally:
-                graph.stop()
-                hand.close()
 
 
 def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random) -> dict[str, Any]:
@@ -65,11 +65,10 @@ def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random)
     )
     graph.check()
     hand.pause(rng.uniform(0.0, 2.0))
-    before, seen = hand.motors[-1], len(hand.motors)
+    before = hand.motors[-1]
     graph.kill(kind)
     hand.pause(_WATCHED)
     stopped = hand.motors[-1]
-    moving = [at for at in hand.motors[seen:] if at.insertion != stopped.insertion]
     distance = stopped.insertion - before.insertion
     state, reason = hand.status.get("state", ""), hand.status.get("reason", "")
     controller_says = f"{controller.get('state')}: {controller.get('reason')}"
@@ -97,7 +96,6 @@ def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random)
     )
     return {
         "distance_mm": distance * 1e3,
-        "stopped_after_s": moving[-1].heard_at - before.heard_at if moving else 0.0,
         "state": state,
         "reason": reason,
         "controller": controller_says,

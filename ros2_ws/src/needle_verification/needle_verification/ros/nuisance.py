@@ -28,7 +28,7 @@ POINTS = 1_000_000
 NAME = 1_000_000
 NAMES = 20_000
 PER_SECOND = 10_000
-NUISANCES = ("points", "name", "parameters", "flood")
+NUISANCE_KINDS = ("points", "name", "parameters", "flood")
 _LIMIT = 20.0
 # Long ones go out one after the other: what is sent at once would be several at once.
 _PAUSE = 0.5
@@ -82,7 +82,7 @@ def _prepared(node: Node, kind: str) -> tuple[Callable[[], None], float]:
                     sender()
 
         return flood, 10.0 / PER_SECOND
-    raise UserError(f"nuisance {kind!r} is not one of {', '.join(NUISANCES)}")
+    raise UserError(f"nuisance {kind!r} is not one of {', '.join(NUISANCE_KINDS)}")
 
 
 def _sender(node: Node, kind: type, topic: str, qos: Any, message: Any) -> Callable[[], None]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -35,43 +36,37 @@ def nuisance_trials(
     domain : int
         ROS_DOMAIN_ID.
     kinds : sequence of str
-        Which of `NUISANCES`.
+        Which of `NUISANCE_KINDS`.
     duration : float
         How long each goes on [s], within one step.
     """
     # A machine under load is no reason to stop: how long a cycle takes is what is looked at.
     patient = {"watchdog": LONGEST_WATCHDOG, "reply_age_limit": LONGEST_WATCHDOG}
-    processes = TrialProcesses(folder, domain, drives_and_driver({}, patient))
-    trial = _Trial(processes, domain)
-    try:
+    parameters = drives_and_driver({}, patient)
+    with closing(DriveHand()) as hand, closing(TrialProcesses(folder, domain, parameters)) as nodes:
+        trial = _Trial(hand, nodes, domain)
         for kind in kinds:
             yield {"nuisance": kind, **trial.run(kind, duration)}
-            processes.check()
-    finally:
-        processes.stop()
-        trial.hand.close()
+            nodes.check()
 
 
 class _Trial:
     """A hand that steps, and what the driver says of its cycles meanwhile."""
 
-    def __init__(self, processes: TrialProcesses, domain: int) -> None:
-        self.hand = DriveHand()
+    def __init__(self, hand: DriveHand, processes: TrialProcesses, domain: int) -> None:
+        self._hand = hand
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
         self._longest: list[float] = []
         self._memory = processes.memory
-        self._estops = self.hand.create_publisher(Bool, "device/estop", RELIABLE)
-        self.hand.create_subscription(
-            DiagnosticArray, "/diagnostics", self._on_diagnostics, RELIABLE
-        )
-        hand = self.hand
+        self._estops = hand.create_publisher(Bool, "device/estop", RELIABLE)
+        hand.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, RELIABLE)
         hand.until(hand.ready, "the driver", 60.0)
         hand.until(lambda: self._estops.get_subscription_count() > 0, "the emergency stop's ear")
         hand.home()
 
     def run(self, kind: str, duration: float) -> dict[str, Any]:
         """Begin a step, be a nuisance, press the emergency stop in the middle of it."""
-        hand = self.hand
+        hand = self._hand
         hand.insist("enable", True)
         hand.press()
         hand.until(lambda: hand.status.get("needs_time") == "false", "power")

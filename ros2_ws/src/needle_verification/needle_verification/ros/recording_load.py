@@ -101,13 +101,10 @@ class RecordingLoad(WholeNode):
             if self.values.images or stream[1] is not Image
         ]
 
-    def waits_for_recorder(self) -> bool:
-        """Tell whether a topic is not recorded yet."""
-        return bool(unrecorded(self, (stream.publisher for stream in self.streams)))
-
     def run(self, end: EndRequest) -> None:
         """Send until the time is over and everything has arrived, then print the counts."""
-        while self.waits_for_recorder() and not end.wanted:
+        publishers = [stream.publisher for stream in self.streams]
+        while unrecorded(self, publishers) and not end.wanted:
             time.sleep(0.05)
         begin = time.monotonic()
         while (elapsed := time.monotonic() - begin) < self.values.duration and not end.wanted:
@@ -116,8 +113,8 @@ class RecordingLoad(WholeNode):
                 if elapsed >= stream.count * stream.period:
                     stream.send()
             time.sleep(_SPIN)
-        for stream in self.streams:
-            stream.publisher.wait_for_all_acked(Duration(seconds=10))
+        for publisher in publishers:
+            publisher.wait_for_all_acked(Duration(seconds=10))
         counts = {stream.publisher.topic_name: stream.count for stream in self.streams}
         print(json.dumps(counts), flush=True)
 

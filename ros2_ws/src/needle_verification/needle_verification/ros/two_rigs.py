@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +55,12 @@ def _trial(place: Path, domain: int, rng: random.Random) -> dict[str, Any]:
     rng.shuffle(order)
     # Some at once, some when the others have long been there.
     delays = {name: rng.choice((0.0, rng.uniform(0.0, _LONGEST_DELAY))) for name in order}
-    hand = DriveHand(steers=False)
-    processes = TrialProcesses(place, domain, _parameters(), started=["drive_emulator"])
-    try:
+    with (
+        closing(DriveHand(steers=False)) as hand,
+        closing(
+            TrialProcesses(place, domain, _parameters(), started=["drive_emulator"])
+        ) as processes,
+    ):
         hand.until(lambda: hand.count_publishers("sim/drive_positions") > 0, "the drives")
         for name in order:
             hand.pause(delays[name])
@@ -69,9 +73,6 @@ def _trial(place: Path, domain: int, rng: random.Random) -> dict[str, Any]:
         hand.pause(_AFTERWARDS)
         ends = {name: processes.exit_code(name) for name in order}
         said = {name: processes.log(name) for name in order}
-    finally:
-        processes.stop()
-        hand.close()
     motors = hand.motors
     refused = [name for name in order if ends[name] == EXIT_BAD_INPUT]
     return {

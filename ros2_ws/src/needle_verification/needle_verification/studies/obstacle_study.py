@@ -51,7 +51,7 @@ LABELS = {
 
 @dataclasses.dataclass(frozen=True)
 class SceneOutcome:
-    """How a scene ended.
+    """End of a scene.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Whether a scene can be solved at all: a search at leisure, by other code than the planner's.
+"""Search at leisure whether a scene can be solved at all, by other code than the planner's.
 
 A tree of needles that are driven in steps of 1 mm, the bevel turned at its greatest rate towards a
 random point, each from the nearest needle that has it within reach and for a random length; from

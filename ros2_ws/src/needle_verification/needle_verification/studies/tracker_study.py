@@ -79,7 +79,6 @@ def track_run(
     tracker: TipTracker,
     exposures: Iterable[Exposure],
     *,
-    insertion_known: bool = True,
     searching: bool = False,
 ) -> TrackedRun:
     """Run a tracker over an insertion.
@@ -90,8 +89,6 @@ def track_run(
         Forgets what it knew.
     exposures : iterable of Exposure
         The insertion.
-    insertion_known : bool
-        Whether the tracker is told the insertion.
     searching : bool
         Whether it forgets again before every pair.
     """
@@ -101,9 +98,7 @@ def track_run(
         if searching:
             tracker.reset()
         begin = time.thread_time()
-        measured = tracker.process(
-            exposure.left, exposure.right, exposure.insertion if insertion_known else None
-        )
+        measured = tracker.process(exposure.left, exposure.right, exposure.insertion)
         seconds.append(time.thread_time() - begin)
         states.append(measured.state)
         seen.append(min(exposure.seen) >= _SEEN)

@@ -121,14 +121,15 @@ def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator
     altered = sum(not extent.checked for extent in hurt)
     before = _read(bag)
     faults: list[str] = []
-    if before is not None:
-        faults += _compare("read before", before, recorded, altered)
+    if before is not None and (
+        before.total() != recorded.total() or (before - recorded).total() > altered
+    ):
+        faults.append(f"read before: {before.total()} of {recorded.total()} messages, in silence")
     files = _contents(bag)
     try:
-        recovery = recover_bag(bag)
+        recovery, after = recover_bag(bag), _read(bag)
     except UserError as error:
         return DamageTrial(what, [f"not recovered: {error}"], 0, before is not None)
-    after = _read(bag)
     if after is None:
         return DamageTrial(what, ["not read after recover"], 0, before is not None)
     if gone := readable - after:
@@ -146,12 +147,6 @@ def _trial(bag: Path, kind: str, extents: list[Extent], rng: np.random.Generator
     if not recover_bag(bag).was_whole:
         faults.append("not whole after recover")
     return DamageTrial(what, faults, lost.total(), before is not None)
-
-
-def _compare(what: str, seen: Counter[Key], wanted: Counter[Key], altered: int) -> list[str]:
-    if seen.total() != wanted.total() or (seen - wanted).total() > altered:
-        return [f"{what}: {seen.total()} of {wanted.total()} messages, in silence"]
-    return []
 
 
 def _damage(bag: Path, damage: str, place: str, rng: np.random.Generator) -> tuple[str, int, int]:

@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import os
 import random
 import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from needle_bringup.simulation.installed import find_executable
-from needle_bringup.simulation.node_process import NodeProcess, stop
-from needle_bringup.simulation.rig_configuration import (
-    PACKAGES,
-    command_line_parameters,
-    nodes_of,
-    write_parameters,
-)
+from needle_bringup.simulation.node_process import NodeProcess
+from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_verification.checking import unreadable
 from needle_verification.descendants import busy
+from needle_verification.trials.trial_processes import TrialProcesses
 
 # From the start-up to the middle of the insertion [s].
 LATEST = 12.0
@@ -97,18 +92,8 @@ def _trial(
     bag = folder / "bag"
     parameters = command_line_parameters(options, bag)
     parameters["sim_rig"]["camera_rate"] = 30.0
-    file = folder / "parameters.yaml"
-    write_parameters(file, parameters)
-    nodes = [
-        NodeProcess(
-            name,
-            [find_executable(PACKAGES[name], name), "--ros-args", "--params-file", str(file)],
-            environment={**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"},
-            log=folder / f"{name}.log",
-        )
-        for name in nodes_of(options)
-    ]
-    try:
+    with contextlib.closing(TrialProcesses(folder, domain, parameters)) as graph:
+        nodes = list(graph.processes.values())
         _wait_until_begun(nodes)
         time.sleep(moment)
         number = signal.Signals[kind.split(maxsplit=1)[0]]
@@ -124,8 +109,6 @@ def _trial(
             if node.name == "recorder" and bag.exists():
                 wrong = wrong or unreadable(bag)
             yield Ended(node.name, kind, moment, ended_at - sent_at, code, wrong)
-    finally:
-        stop(nodes)
 
 
 def _wait_until_begun(nodes: list[NodeProcess]) -> None:

@@ -37,6 +37,11 @@ class TrialProcesses:
         Node -> parameter -> value.
     started : iterable of str, optional
         Nodes that are started at once; all of them by default.
+
+    Attributes
+    ----------
+    processes : dict of str to NodeProcess
+        The nodes, by name.
     """
 
     def __init__(
@@ -51,13 +56,13 @@ class TrialProcesses:
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
         self._file = folder / "parameters.yaml"
         write_parameters(self._file, parameters)
-        self._processes: dict[str, NodeProcess] = {}
+        self.processes: dict[str, NodeProcess] = {}
         for name in parameters if started is None else started:
             self.start(name)
 
     def start(self, name: str) -> None:
         """Start a node, also again."""
-        self._processes[name] = NodeProcess(
+        self.processes[name] = NodeProcess(
             name,
             [
                 find_executable(PACKAGES[name], name),
@@ -70,26 +75,26 @@ class TrialProcesses:
 
     def restart(self, name: str) -> None:
         """End a node in order, and start it again."""
-        stop([self._processes[name]])
+        stop([self.processes[name]])
         self.start(name)
 
     def kill(self, name: str) -> None:
         """End a node as a crash does, and wait until it is gone."""
-        process = self._processes[name]
+        process = self.processes[name]
         os.kill(process.pid, signal.SIGKILL)
         wait_for([process], _KILL_GRACE)
 
     def say(self, fault: str) -> None:
         """Give the emulator a fault on command."""
-        self._processes[_TAKES_COMMANDS].say(fault)
+        self.processes[_TAKES_COMMANDS].say(fault)
 
     def exit_code(self, name: str) -> int | None:
         """Return how a node ended; None while it runs."""
-        return self._processes[name].exit_code
+        return self.processes[name].exit_code
 
     def check(self) -> None:
         """Raise `UserError` if a node has ended."""
-        for process in self._processes.values():
+        for process in self.processes.values():
             if process.exit_code is not None:
                 raise UserError(process.describe_end())
 
@@ -106,13 +111,13 @@ class TrialProcesses:
         page = os.sysconf("SC_PAGE_SIZE")
         return {
             name: page * int(Path(f"/proc/{process.pid}/statm").read_text("ascii").split()[1])
-            for name, process in self._processes.items()
+            for name, process in self.processes.items()
         }
 
-    def stop(self) -> None:
+    def close(self) -> None:
         """End the driver, then the rest."""
-        stop(process for name, process in self._processes.items() if name == "device_driver")
-        stop(self._processes.values())
+        stop(process for name, process in self.processes.items() if name == "device_driver")
+        stop(self.processes.values())
 
 
 def drives_and_driver(emulator: Mapping[str, object], driver: Mapping[str, object]) -> Parameters:
