@@ -17,6 +17,8 @@ first corner, T_rig_board = [exp(rotation) R0 | t0 + translation].
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -148,7 +150,10 @@ class RigModel:
     def board_poses(self, parameters: Array) -> Array:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
         steps = parameters[self.shared :].reshape(-1, 6)
-        return np.stack([moved(b, s) for b, s in zip(self._boards, steps, strict=True)])
+        poses = self._boards.copy()
+        poses[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ poses[:, :3, :3]
+        poses[:, :3, 3] += steps[:, 3:]
+        return poses
 
     def residuals(self, parameters: Array) -> Array:
         """Return seen minus expected pixels, left then right, shape (2 * corners,) [px]."""
@@ -157,14 +162,29 @@ class RigModel:
 
     def project(self, parameters: Array, side: str) -> Array:
         """Return where one camera should see its corners, shape (n, 2) [px]."""
-        boards = self.board_poses(parameters)[self.view_of[side]]
-        points = np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side]) + boards[:, :3, 3]
+        return self._of_corners(parameters, side, self._corners(parameters, side))
+
+    def _of_corners(self, parameters: Array, side: str, corners: Array) -> Array:
         camera = self._camera(parameters, side)
+        return project_optical(camera, self._seen(camera, side, corners))
+
+    def _through_lens(self, parameters: Array, side: str, seen: Array) -> Array:
+        return project_optical(self._camera(parameters, side), seen)
+
+    def _corners(self, parameters: Array, side: str) -> Array:
+        """Return where the corners are that one camera saw, in `rig`, shape (n, 3) [m]."""
+        boards = self.board_poses(parameters)[self.view_of[side]]
+        return np.asarray(
+            np.einsum("nij,nj->ni", boards[:, :3, :3], self._points[side]) + boards[:, :3, 3]
+        )
+
+    def _seen(self, camera: Camera, side: str, corners: Array) -> Array:
+        """Return where a camera sees corners of `rig`, in its optical frame, shape (n, 3) [m]."""
         transform, under = camera.T_optical_rig, self._under[side]
-        pixels = project_optical(camera, points @ transform[:3, :3].T + transform[:3, 3])
+        seen = corners @ transform[:3, :3].T + transform[:3, 3]
         if np.any(under):
-            pixels[under] = RefractedCamera(camera).project(points[under])
-        return pixels
+            seen[under] = RefractedCamera(camera).seen_through(corners[under])
+        return np.asarray(seen)
 
     def jacobian(self, parameters: Array, free: Mask) -> Array:
         """Return d(residuals)/d(free parameters), shape (2 * corners, free).
@@ -182,27 +202,35 @@ class RigModel:
             first = 0 if side == "left" else count["left"]
             rows = slice(first, first + count[side])
             own = camera_slice(side)
-            shared = [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, self.shared)]
-            for column in shared:
+            # What a parameter does not move is found once: where corners are, where they are seen.
+            corners = self._corners(parameters, side)
+            seen = self._seen(self._camera(parameters, side), side, corners)
+            through_lens = functools.partial(self._through_lens, side=side, seen=seen)
+            of_corners = functools.partial(self._of_corners, side=side, corners=corners)
+            of_boards = functools.partial(self.project, side=side)
+            for column in [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, self.shared)]:
                 if free[column]:
-                    result[rows, column] = -self._slope(parameters, side, [column]).ravel()
+                    pixels = through_lens if column - own.start in range(len(LENS)) else of_corners
+                    result[rows, column] = -self._slope(pixels, parameters, [column]).ravel()
             # One board's pose moves that board's corners only: all boards at once.
             boards = self.view_of[side]
             for k in range(6):
                 columns = np.arange(self.shared + k, len(parameters), 6)
                 if not np.any(free[columns]):
                     continue
-                slope = self._slope(parameters, side, list(columns))
+                slope = self._slope(of_boards, parameters, list(columns))
                 lines = first + 2 * np.arange(len(boards))
                 for axis in range(2):
                     result[lines + axis, columns[boards]] = -slope[:, axis]
         return result[:, free]
 
-    def _slope(self, parameters: Array, side: str, columns: list[int]) -> Array:
+    def _slope(
+        self, pixels: Callable[[Array], Array], parameters: Array, columns: list[int]
+    ) -> Array:
         step = np.zeros_like(parameters)
         step[columns] = self._steps[columns]
         width = 2.0 * self._steps[columns[0]]
-        above, below = (self.project(parameters + s * step, side) for s in (1.0, -1.0))
+        above, below = (pixels(parameters + s * step) for s in (1.0, -1.0))
         return np.asarray((above - below) / width)
 
     def _camera(self, parameters: Array, side: str) -> Camera:
@@ -228,14 +256,6 @@ class RigModel:
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
-
-
-def moved(transform: Array, step: Array) -> Array:
-    """Return [exp(step[:3]) R | t + step[3:]] for a transform [R | t], shape (4, 4)."""
-    result = np.array(transform)
-    result[:3, :3] = Rotation.from_rotvec(step[:3]).as_matrix() @ transform[:3, :3]
-    result[:3, 3] = transform[:3, 3] + step[3:]
-    return result
 
 
 def _join(arrays: list[Array], width: int) -> Array:

@@ -86,6 +86,21 @@ class RefractedCamera:
         ndarray, shape (..., 2)
             Pixel coordinates, also outside the image; NaN behind the camera.
         """
+        return project_optical(self.camera, self.seen_through(points))
+
+    def seen_through(self, points: Array) -> Array:
+        """Return where points are seen on the outer face, in the optical frame: whatever the lens.
+
+        Parameters
+        ----------
+        points : ndarray, shape (..., 3)
+            Points in `rig` [m]; those before the window are returned themselves.
+
+        Returns
+        -------
+        ndarray, shape (..., 3)
+            Points of the optical frame [m].
+        """
         points = np.asarray(points, dtype=np.float64)
         normal = self.camera.window.normal
         offset = points - self._foot
@@ -97,7 +112,7 @@ class RefractedCamera:
         # The point of the outer face through which the camera sees the point.
         target = self._foot + along * ratio[..., None]
         target = np.where((depth > 0.0)[..., None], target, points)
-        return project_optical(self.camera, target @ self._rotation.T + self._translation)
+        return np.asarray(target @ self._rotation.T + self._translation)
 
     def jacobian(self, point: Array) -> Array:
         """Return d(pixel)/d(point) [px/m], shape (2, 3), at one point in `rig` [m]."""
