@@ -59,7 +59,8 @@ class Scene:
             parts |= self._bubbles(world.bubbles, refractive_index(world.rig))
         for name, mesh in (needle or {}).items():
             parts[name] = self._mesh(name, mesh, self._metal(world, name))
-        self.tracer = self._mi.load_dict(parts)
+        # Optimised, the order of shapes and with it the noise is another from time to time.
+        self.tracer = self._mi.load_dict(parts, optimize=False)
         self._parameters = self._mi.traverse(self.tracer)
 
     def bend(self, needle: dict[str, Mesh]) -> None:
