@@ -129,7 +129,12 @@ class Health:
             "left_without_right": str(counts.unpaired_left),
             "right_without_left": str(counts.unpaired_right),
             "pairs_refused": str(self.refused.total()),
+            "pair_tolerance_ms": f"{1e-6 * matcher.tolerance:.2f}",
         }
+        if matcher.skew is not None:
+            median, largest = matcher.skew
+            values["skew_median_ms"] = f"{1e-6 * median:.2f}"
+            values["skew_max_ms"] = f"{1e-6 * largest:.2f}"
         values.update({f"refused: {reason}": str(n) for reason, n in self.refused.items()})
         return Diagnostic(*self._images_level(now, matcher), values)
 

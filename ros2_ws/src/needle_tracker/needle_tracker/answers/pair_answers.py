@@ -51,15 +51,15 @@ class PairingSettings:
 
     Attributes
     ----------
-    pair_tolerance_ns : int
-        Largest difference of the stamps of a pair [ns].
+    pair_tolerance_ns : int or None
+        Largest difference of the stamps of a pair [ns]; None of cameras that run freely.
     joint_timeout : float
         How long a pair waits for the joint state that follows it [s], steady clock.
     lean : float
         Angle between heading and visible end [rad].
     """
 
-    pair_tolerance_ns: int
+    pair_tolerance_ns: int | None
     joint_timeout: float
     lean: float
 

@@ -38,6 +38,12 @@ class StereoTrackerParameters:
         0.0,
         0.1,
     )
+    free_running: bool = fixed_parameter(
+        False,
+        "-",
+        "Each camera runs by itself: images pair up to half a frame apart, as their stamps say, "
+        "and pair_tolerance does not count.",
+    )
     joint_timeout: float = fixed_parameter(
         1.0,
         "s",
@@ -168,7 +174,7 @@ class StereoTrackerParameters:
     def answering_settings(self) -> PairingSettings:
         """Return how pairs are made and answered."""
         return PairingSettings(
-            pair_tolerance_ns=round(self.pair_tolerance * 1e9),
+            pair_tolerance_ns=None if self.free_running else round(self.pair_tolerance * 1e9),
             joint_timeout=self.joint_timeout,
             lean=self.lean,
         )

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import OrderedDict
+import statistics
+from collections import OrderedDict, deque
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
 _WAITING_LIMIT = 3
+_SKEWS = 100  # the latest pairs, whose stamps' difference is told
+_PERIODS, _FEWEST_PERIODS = 15, 3  # the latest, and those without which none is known
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -42,17 +45,34 @@ class PairMatcher(Generic[T]):
 
     Parameters
     ----------
-    tolerance : int
-        Largest difference of the stamps of a pair [ns]; 0 for cameras on one trigger.
+    tolerance : int or None
+        Largest difference of the stamps of a pair [ns]; 0 for cameras on one trigger. None for
+        cameras that run freely: half the time from one image of a camera to its next.
     """
 
-    def __init__(self, tolerance: int) -> None:
+    def __init__(self, tolerance: int | None) -> None:
         self._tolerance = tolerance
+        self._last: dict[str, int] = {}
+        self._periods: deque[int] = deque(maxlen=_PERIODS)
+        self._skews: deque[int] = deque(maxlen=_SKEWS)
         self._waiting: dict[str, OrderedDict[int, T]] = {
             "left": OrderedDict(),
             "right": OrderedDict(),
         }
         self.counts = PairCounts()
+
+    @property
+    def tolerance(self) -> int:
+        """Largest difference of the stamps of a pair, as given or measured [ns]."""
+        if self._tolerance is not None:
+            return self._tolerance
+        known = len(self._periods) >= _FEWEST_PERIODS
+        return round(statistics.median(self._periods) / 2.0) if known else 0
+
+    @property
+    def skew(self) -> tuple[float, int] | None:
+        """Median and largest difference of the stamps of the latest pairs [ns]; None without."""
+        return (statistics.median(self._skews), max(self._skews)) if self._skews else None
 
     def add(self, side: str, stamp: int, image: T) -> Pair[T] | None:
         """Take an image; return the pair that it completes, None where its partner is missing.
@@ -71,9 +91,12 @@ class PairMatcher(Generic[T]):
         Pair or None
             The completed pair.
         """
+        if side in self._last:
+            self._periods.append(abs(stamp - self._last[side]))
+        self._last[side] = stamp
         others = self._waiting[OTHER_SIDE[side]]
         partner = min(others, key=lambda other: (abs(other - stamp), other), default=None)
-        if partner is None or abs(partner - stamp) > self._tolerance:
+        if partner is None or abs(partner - stamp) > self.tolerance:
             waiting = self._waiting[side]
             if waiting.pop(stamp, None) is not None:
                 self._count(side)
@@ -86,6 +109,7 @@ class PairMatcher(Generic[T]):
         self._drop_older(OTHER_SIDE[side], partner)
         self._drop_older(side, stamp)
         self.counts.pairs += 1
+        self._skews.append(abs(partner - stamp))
         if side == "left":
             return Pair(stamp, image, other_image)
         return Pair(partner, other_image, image)
