@@ -69,6 +69,7 @@ def trace_insertion(
     step: float = 0.001,
     begin: float = 0.0,
     curvature: float = CURVATURE,
+    empty_first: bool = False,
 ) -> Iterator[TracedPair]:
     """Render a random insertion; the stage rests at its end if more frames are wanted.
 
@@ -93,6 +94,8 @@ def trace_insertion(
         Insertion of the first exposure [m].
     curvature : float
         Of the needle's path [1/m].
+    empty_first : bool
+        Whether one exposure without the needle comes before the others.
 
     Returns
     -------
@@ -110,8 +113,8 @@ def trace_insertion(
 
     def pairs() -> Iterator[TracedPair]:
         renderer = PathTracedRenderer(mitsuba, rig, look)
-        for number in range(frames):
-            insertion = min(begin + number * step, depth)
+        insertions = [min(begin + number * step, depth) for number in range(frames)]
+        for number, insertion in enumerate([0.0, *insertions] if empty_first else insertions):
             advance_to(plant, insertion, path.rotation)
             truth = meshes = None
             seen = (0.0, 0.0)

@@ -79,6 +79,7 @@ class PathTracedRenderer:
         self._tracer = PathTracer(mitsuba)
         self._still = Scene(mitsuba, self._world)
         self._moving: Scene | None = None
+        self._bent: NeedleMesh | None = None
         self._light: dict[Backdrop, FloatImage] = {}
         for behind in dict.fromkeys(self._world.backdrops):
             (light,) = self._tracer.floor_light(
@@ -133,8 +134,9 @@ class PathTracedRenderer:
     def _scene_with(self, needle: NeedleMesh) -> Scene:
         if self._moving is None:
             self._moving = Scene(self._mitsuba, self._world, needle.parts)
-        else:
+        elif needle is not self._bent:
             self._moving.bend(needle.parts)
+        self._bent = needle
         return self._moving
 
     def _shadow(self, scene: Scene, behind: Backdrop, key: list[int]) -> FloatImage:
