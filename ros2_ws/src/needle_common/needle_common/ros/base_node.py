@@ -220,13 +220,10 @@ def executor_of(
 
 
 def _spin(node: Node, end: EndRequest) -> int:
-    executor = executor_of(node)
-    try:
+    # An executor that outlives the context complains when it is collected.
+    with executor_of(node) as executor:
         while not end.wanted:
             executor.spin_once(timeout_sec=LOOK_PERIOD)
-    finally:
-        # An executor that outlives the context complains when it is collected.
-        executor.shutdown()
     return EXIT_DONE
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import logging
 import sys
@@ -363,20 +364,18 @@ def main() -> int:
 
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DeviceDriverNode)
-        executor = executor_of(node, node.fail)
-        desk = ParameterDesk(node, PARAMETERS)
-        # What is there stays: no collection need look through it while the drives wait.
-        gc.freeze()
-        try:
+        with (
+            contextlib.closing(ParameterDesk(node, PARAMETERS)) as desk,
+            executor_of(node, node.fail) as executor,
+            contextlib.closing(node),
+        ):
+            # What is there stays: no collection need look through it while the drives wait.
+            gc.freeze()
             # Its start takes the processor: not once the drives wait for a heartbeat.
             while not (end.wanted or desk.ready(_DESK_LOOK)):
                 pass
             while not (end.wanted or node.ended):
                 executor.spin_once(timeout_sec=0.1)
-        finally:
-            node.close()
-            executor.shutdown()
-            desk.close()
         return EXIT_DONE
 
     return run_node(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
@@ -179,10 +180,9 @@ def main() -> int:
 
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DriveEmulatorNode)
-        executor = executor_of(node)
         commands = _CommandInput()
         looked_at = 0.0
-        try:
+        with executor_of(node) as executor, contextlib.closing(node):
             while not end.wanted:
                 waits = node.turn()
                 for line in commands.lines():
@@ -196,9 +196,6 @@ def main() -> int:
                         # All that is there counts: a stamp that came late must not be taken twice.
                         times = node.new_times
                         executor.spin_once(timeout_sec=_WAIT if waits and times == 0 else 0.0)
-        finally:
-            node.close()
-            executor.shutdown()
         return EXIT_DONE
 
     return run_node(

@@ -373,13 +373,10 @@ def main() -> int:
 
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, SimRigNode)
-        executor = executor_of(node)
-        try:
+        with executor_of(node) as executor:
             while not end.wanted:
                 executor.spin_once(timeout_sec=node.turns())
             node.close()
-        finally:
-            executor.shutdown()
         return EXIT_DONE
 
     return run_node(
