@@ -150,7 +150,6 @@ def study(
     roll_bound: float,
     entry_angle_std: float,
     noise: float,
-    on_progress: Callable[[int], None] = lambda _: None,
 ) -> dict[str, float | None]:
     """Return the figures of some scenes, by the names of `LABELS`.
 
@@ -164,8 +163,6 @@ def study(
         What the controller is told of that [rad].
     noise : float
         Largest error of a measured coordinate, as it is told [m].
-    on_progress : callable
-        Told after each scene how many are done.
     """
     settings = SteeringSettings(
         depth=DEPTH,
@@ -182,7 +179,6 @@ def study(
         )
         rng = np.random.default_rng([seed, n, 1])
         outcomes.append(steer(scene, judge(scene, settings), settings, rng, times))
-        on_progress(n + 1)
     return figures(outcomes, times)
 
 
