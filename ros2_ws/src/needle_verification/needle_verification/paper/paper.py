@@ -53,7 +53,7 @@ def _paper(arguments: Sequence[str]) -> int:
     from needle_analysis.report.figure_style import save  # noqa: PLC0415
     from needle_verification.paper.paper_figures import figures_of  # noqa: PLC0415
     from needle_verification.paper.paper_page import as_text, key_figures, page, table  # noqa: PLC0415
-    from needle_verification.paper.paper_results import collect  # noqa: PLC0415
+    from needle_verification.paper.paper_results import PaperRuns  # noqa: PLC0415
     from needle_verification.paper.paper_runs import Laboratory  # noqa: PLC0415
 
     runs = given.runs and make_folder("--runs", given.runs)
@@ -62,7 +62,7 @@ def _paper(arguments: Sequence[str]) -> int:
         ending_descendants(),
     ):
         laboratory = Laboratory([str(root / "scripts" / "simulate")], folder)
-        results = collect(laboratory, int(given.seed), quick=given.quick)
+        results = PaperRuns(laboratory, int(given.seed), quick=given.quick)
     for name, figure in figures_of(results).items():
         save(figure, out / IMAGES / f"{name}.png")
     (out / PAGE).write_text(page(results), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""PaperRuns of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
+"""Results of [KC09] section IV, run again: the trials, the studies, and the figures from them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import numpy.typing as npt
 
 from needle_analysis.run.run_summary import reduced_states, target_offset
 from needle_bags.reading.bag_reader import Run, Series
-from needle_common.commands.cli import JsonValue
 from needle_verification.paper.paper_runs import Columns, Laboratory
-from needle_verification.studies.pure_insertions import ARC, CurvatureErrors, curvature_errors
+from needle_verification.studies.pure_insertions import ARC, curvature_errors
 
 Floats = npt.NDArray[np.float64]
 
@@ -51,9 +50,17 @@ class SteeringTrial:
     rotation_deg: Floats
 
 
-@dataclasses.dataclass(frozen=True)
 class PaperRuns:
-    """Runs of the paper's section IV.
+    """Runs of the paper's section IV, all of which are made here.
+
+    Parameters
+    ----------
+    laboratory : Laboratory
+        Makes them.
+    seed : int
+        Of all noise.
+    quick : bool
+        Fewer trials, and one draw in place of ten.
 
     Attributes
     ----------
@@ -80,83 +87,52 @@ class PaperRuns:
         What many pure insertions with the paper's noise give.
     """
 
-    open_loop: SteeringTrial
-    closed_loop: SteeringTrial
-    trials: list[SteeringTrial]
-    start: dict[str, JsonValue]
-    grids: dict[str, dict[str, JsonValue]]
-    runs: dict[str, Columns]
-    longer: dict[str, Columns]
-    scales: dict[float, dict[str, JsonValue]]
-    scales_longer: dict[float, dict[str, JsonValue]]
-    domain_pitch: Columns
-    domain_roll: Columns
-    best: dict[str, JsonValue]
-    curvature: dict[str, JsonValue]
-    curvature_errors: CurvatureErrors
-
-
-def collect(laboratory: Laboratory, seed: int, *, quick: bool) -> PaperRuns:
-    """Run everything; `quick` means fewer trials and one draw in place of ten."""
-    at = ("--controller", "paper", "--seed", str(seed))
-    draws = ("--draws", "1" if quick else "10")
-    trials = [
-        read_trial(
-            laboratory.trial(
-                f"trial_{number}",
-                *("--level", "camera", "--controller", "paper", *TORSION),
-                *(f"--initial=-3,{start}", "--seed", str(seed + number - 1)),
+    def __init__(self, laboratory: Laboratory, seed: int, *, quick: bool) -> None:
+        trial, study = laboratory.trial, laboratory.study
+        at = ("--controller", "paper", "--seed", str(seed))
+        draws = ("--draws", "1" if quick else "10")
+        self.trials = [
+            read_trial(
+                trial(
+                    f"trial_{number}",
+                    *("--level", "camera", "--controller", "paper", *TORSION),
+                    *(f"--initial=-3,{start}", "--seed", str(seed + number - 1)),
+                )
             )
+            for number, start in enumerate(TRIALS[: QUICK_TRIALS if quick else None], 1)
+        ]
+        tip = ("--level", "tip", f"--initial={INITIAL}", "--seed", str(seed))
+        open_loop = (*tip, "--controller", "open_loop", "--noise-mm", "0")
+        self.open_loop = read_trial(trial("open_loop", *open_loop))
+        closed_loop = (*tip, "--controller", "paper", "--noise-mm", "0.5")
+        self.closed_loop = read_trial(trial("closed_loop", *closed_loop))
+        trial(
+            "pure_insertion",
+            *("--level", "camera", "--controller", "open_loop", "--seed", str(seed)),
+            *("--initial=0,0,90", "--depth-mm", f"{ARC * 1e3:g}"),
         )
-        for number, start in enumerate(TRIALS[: QUICK_TRIALS if quick else None], 1)
-    ]
-    tip = ("--level", "tip", f"--initial={INITIAL}", "--seed", str(seed))
-    open_loop = laboratory.trial("open_loop", *tip, "--controller", "open_loop", "--noise-mm", "0")
-    closed_loop = laboratory.trial(
-        "closed_loop", *tip, "--controller", "paper", "--noise-mm", "0.5"
-    )
-    laboratory.trial(
-        "pure_insertion",
-        *("--level", "camera", "--controller", "open_loop", "--seed", str(seed)),
-        *("--initial=0,0,90", "--depth-mm", f"{ARC * 1e3:g}"),
-    )
-    grids, runs, longer = {}, {}, {}
-    for grid in GRIDS:
-        grids[grid], runs[grid] = laboratory.study(f"study_{grid}", *at, *draws, "--grid", grid)
-        _, longer[grid] = laboratory.study(
-            f"longer_{grid}", *at, *draws, "--grid", grid, "--depth-mm", f"{LONGER_MM:g}"
-        )
-    anywhere = (*at, "--grid", "random", "--x-mm", f"{DOMAIN_X_MM:g}", *draws)
-    _, domain_pitch = laboratory.study(
-        "domain_pitch", *anywhere, "--pitch-deg", f"{DOMAIN_PITCH_DEG:g}", "--roll-deg", "0"
-    )
-    _, domain_roll = laboratory.study(
-        "domain_roll", *anywhere, "--pitch-deg", "0", "--roll-deg", f"{DOMAIN_ROLL_DEG:g}"
-    )
-    scales, scales_longer = {}, {}
-    for scale in SCALES:
-        wrong = (*at, *draws, "--kappa-scale", str(scale))
-        scales[scale], _ = laboratory.study(f"scale_{scale:g}", *wrong)
-        scales_longer[scale], _ = laboratory.study(
-            f"scale_{scale:g}_longer", *wrong, "--depth-mm", f"{LONGER_MM:g}"
-        )
-    return PaperRuns(
-        open_loop=read_trial(open_loop),
-        closed_loop=read_trial(closed_loop),
-        trials=trials,
-        start=laboratory.study("start", *at, f"--initial={INITIAL}", "--noise-mm", "0.5")[0],
-        grids=grids,
-        runs=runs,
-        longer=longer,
-        scales=scales,
-        scales_longer=scales_longer,
-        domain_pitch=domain_pitch,
-        domain_roll=domain_roll,
-        best=laboratory.study("best", "--controller", "best", "--seed", str(seed), *draws)[0],
+        far = ("--depth-mm", f"{LONGER_MM:g}")
+        self.grids, self.runs, self.longer = {}, {}, {}
+        for grid in GRIDS:
+            on = (*at, *draws, "--grid", grid)
+            self.grids[grid], self.runs[grid] = study(f"study_{grid}", *on)
+            _, self.longer[grid] = study(f"longer_{grid}", *on, *far)
+        anywhere = (*at, "--grid", "random", "--x-mm", f"{DOMAIN_X_MM:g}", *draws)
+        pitched = ("--pitch-deg", f"{DOMAIN_PITCH_DEG:g}", "--roll-deg", "0")
+        _, self.domain_pitch = study("domain_pitch", *anywhere, *pitched)
+        rolled = ("--pitch-deg", "0", "--roll-deg", f"{DOMAIN_ROLL_DEG:g}")
+        _, self.domain_roll = study("domain_roll", *anywhere, *rolled)
+        self.scales, self.scales_longer = {}, {}
+        for scale in SCALES:
+            wrong = (*at, *draws, "--kappa-scale", str(scale))
+            self.scales[scale], _ = study(f"scale_{scale:g}", *wrong)
+            self.scales_longer[scale], _ = study(f"scale_{scale:g}_longer", *wrong, *far)
+        self.start, _ = study("start", *at, f"--initial={INITIAL}", "--noise-mm", "0.5")
+        self.best, _ = study("best", "--controller", "best", "--seed", str(seed), *draws)
         # What the tracker says before it sees the needle is no measurement.
-        curvature=laboratory.identify("curvature", "pure_insertion", "--from-mm", "5"),
-        curvature_errors=curvature_errors(300 if quick else 3000, np.random.default_rng(seed)),
-    )
+        self.curvature = laboratory.identify("curvature", "pure_insertion", "--from-mm", "5")
+        many = 300 if quick else 3000
+        self.curvature_errors = curvature_errors(many, np.random.default_rng(seed))
 
 
 def read_trial(run: Run) -> SteeringTrial:
