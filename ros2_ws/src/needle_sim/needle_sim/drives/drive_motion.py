@@ -282,11 +282,7 @@ class DriveMotion:
         return None
 
     def _check_target(self, target: int) -> None:
-        if self._limit_action is not LimitAction.ABORT or not self._homed:
-            return
-        lower, upper = self._objects.value(0x607D, 1), self._objects.value(0x607D, 2)
-        self._limited = not lower <= target <= upper
-        if target > upper:
-            raise SdoAbortError(Abort.VALUE_TOO_HIGH)
-        if target < lower:
-            raise SdoAbortError(Abort.VALUE_TOO_LOW)
+        aborts = self._limit_action is LimitAction.ABORT and self._homed
+        if aborts and self._within_limits(target) is None:
+            above = target > self._objects.value(0x607D, 2)
+            raise SdoAbortError(Abort.VALUE_TOO_HIGH if above else Abort.VALUE_TOO_LOW)

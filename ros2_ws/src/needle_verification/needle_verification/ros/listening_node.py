@@ -6,6 +6,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from rclpy.executors import SingleThreadedExecutor
+
 from needle_common.errors import UserError
 from needle_common.ros.base_node import executor_of
 from needle_common.ros.whole_node import WholeNode
@@ -14,11 +16,21 @@ PATIENCE = 20.0
 
 
 class ListeningNode(WholeNode):
-    """A node whose callbacks run where a trial waits for something."""
+    """A node whose callbacks run where a trial waits for something.
 
-    def __init__(self, name: str) -> None:
+    Parameters
+    ----------
+    name : str
+        The node's.
+    careful : bool
+        Whether a message that a callback fails on is refused, as the rig's nodes do; in a trial it
+        ends the trial.
+    """
+
+    def __init__(self, name: str, *, careful: bool = False) -> None:
         super().__init__(name)
-        self._executor = executor_of(self)
+        self._executor = executor_of(self) if careful else SingleThreadedExecutor()
+        self._executor.add_node(self)
 
     def look(self, timeout: float = 0.0) -> None:
         """Take one message, waiting for it at most `timeout` [s]."""
