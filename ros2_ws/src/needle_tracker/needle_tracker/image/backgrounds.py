@@ -9,7 +9,7 @@ from needle_tracker.image.detection import Image
 from needle_tracker.optics.refraction import RefractedCamera
 
 _ROOM = 0.5e-3  # the needle may have been so much farther than the insertion says [m]
-_LEAST_NEW = 1.5e-3  # so much of the needle must be new for its end to be plain of it [m]
+_LEAST_NEW = 2.2  # so much of the needle must be new for its end to be plain of it [widths]
 
 Pair = tuple[Background, Background]
 
@@ -26,6 +26,8 @@ class Backgrounds:
         Left and right.
     hole_clearance : float
         Radius around the entry that is not looked at: so short a needle is none [m].
+    needle_width : float
+        The needle's diameter [m].
     empty : pair of ndarray of uint8, shape (height, width), or None
         Left and right image without needle, to begin with.
     """
@@ -34,10 +36,12 @@ class Backgrounds:
         self,
         views: tuple[RefractedCamera, RefractedCamera],
         hole_clearance: float,
+        needle_width: float,
         empty: tuple[Image, Image] | None,
     ) -> None:
         self._views = views
         self._hole_clearance = hole_clearance
+        self._least_new = _LEAST_NEW * needle_width
         self._kept: Pair | None = None
         self._insertion = np.inf
         if empty is not None:
@@ -59,7 +63,7 @@ class Backgrounds:
             self._insertion = insertion
         if self._kept is None or self._kept[0].is_empty:
             return self._kept
-        if insertion is None or insertion < self._insertion + _LEAST_NEW:
+        if insertion is None or insertion < self._insertion + self._least_new:
             return None
         return self._kept
 

@@ -383,4 +383,5 @@ def of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:
         sum(max((p.evidence for p in side if p.bright is bright), default=0.0) for side in paths)
         for bright in (False, True)
     ]
-    return [[path for path in side if path.bright is (best[1] > best[0])] for side in paths]
+    bright = bool(best[1] > best[0])  # evidence may be a number of numpy's, and so would this
+    return [[path for path in side if path.bright is bright] for side in paths]

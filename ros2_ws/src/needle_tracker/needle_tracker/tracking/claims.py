@@ -9,6 +9,7 @@ lost in that way is a share of the needle's width.
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,8 +98,8 @@ class StagedEnd:
     """What the stage says of an end that is seen badly: the needle is as long as it was pushed in.
 
     A stage's zero is off by as much in all pairs of a run. The end that was seen best in it says by
-    how much, as far as it knows better than what a zero is worth; ends that lie short because a
-    face is unseen do so again and again, and are not averaged.
+    how much, as far as it knows better than what a zero is worth. Faces that are unseen make ends
+    lie short again and again: they are not averaged, and an end farther out says more.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ class StagedEnd:
         seen = float(ahead @ tip.covariance @ ahead)
         now = _Offset(shaft_length(self._shaft) - insertion, seen, insertion)
         best = self._best
-        if best is None or seen <= best.variance_at(insertion):
+        if best is None or now.is_better_than(best):
             self._best = best = now
         variance = best.variance_at(insertion)
         # A zero that is plainly off is worth less.
@@ -168,6 +169,12 @@ class _Offset:
     value: float
     variance: float
     insertion: float
+
+    def is_better_than(self, other: _Offset) -> bool:
+        """Return whether this says more than one of another pair of the run."""
+        before = other.variance_at(self.insertion)
+        farther = self.value - other.value
+        return self.variance <= before or farther > math.sqrt(self.variance + before)
 
     def variance_at(self, insertion: float) -> float:
         """Return the variance at another insertion [m^2]: the needle slips."""

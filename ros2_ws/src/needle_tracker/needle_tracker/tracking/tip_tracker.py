@@ -52,7 +52,7 @@ class TipTracker:
         self._staged = StagedEnd(0.5 * settings.gates.reach.hole_tolerance)
         left, right = self._looks = (MapLook(widths[0]), MapLook(widths[1]))
         self._backgrounds = Backgrounds(
-            self._lines.views, settings.hole_clearance, settings.reference
+            self._lines.views, settings.hole_clearance, settings.needle_width, settings.reference
         )
         # A tip that is known badly is better than none: maps know what they do not see.
         gates = dataclasses.replace(

@@ -7,7 +7,13 @@ import itertools
 import numpy as np
 import pytest
 
-from needle_tracker.image.detection import DetectionSettings, Path, cut_path, find_paths
+from needle_tracker.image.detection import (
+    DetectionSettings,
+    Path,
+    cut_path,
+    find_paths,
+    of_one_polarity,
+)
 from needle_tracker.image.search_grid import SearchGrid, make_search_grid
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -134,3 +140,15 @@ def test_a_line_is_measured_against_the_noise(
     if found:
         # Near the entry the grid's columns are less than a pixel apart.
         np.testing.assert_allclose(grid.angles[paths[0].columns[10:]], 0.0, atol=0.02)
+
+
+@pytest.mark.parametrize("number", [float, np.float64])
+def test_paths_of_the_polarity_that_stands_out_are_kept(number: type[float]) -> None:
+    rows = np.arange(3)
+    dark, bright = (
+        Path(rows, rows, np.zeros((3, 2)), 50.0, is_bright, 1.0, number(evidence))
+        for is_bright, evidence in ((False, 3.0), (True, 5.0))
+    )
+    left, right = of_one_polarity([[bright, dark], [bright]])
+    assert left == [bright]
+    assert right == [bright]

@@ -18,7 +18,7 @@ from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 Views = tuple[RefractedCamera, RefractedCamera]
 Pair = tuple[Image, Image]
-CLEARANCE = 2e-3
+CLEARANCE, WIDTH = 2e-3, 0.7e-3
 SHAPE = (768, 1024)
 
 
@@ -36,7 +36,7 @@ def contents(backgrounds: Backgrounds, insertion: float | None) -> bool | None:
 
 
 def test_nothing_is_known_before_there_is_less_of_the_needle(views: Views) -> None:
-    backgrounds = Backgrounds(views, CLEARANCE, None)
+    backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
     assert contents(backgrounds, None) is None
     assert contents(backgrounds, 0.060) is None
     assert contents(backgrounds, 0.061) is None
@@ -46,14 +46,14 @@ def test_nothing_is_known_before_there_is_less_of_the_needle(views: Views) -> No
 
 
 def test_a_pair_without_needle_holds_for_all_that_follow(views: Views) -> None:
-    backgrounds = Backgrounds(views, CLEARANCE, None)
+    backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
     assert contents(backgrounds, 0.001) is True
     assert contents(backgrounds, 0.060) is True
     assert contents(backgrounds, None) is True
 
 
 def test_the_latest_pair_without_needle_counts(views: Views) -> None:
-    backgrounds = Backgrounds(views, CLEARANCE, marked(40))
+    backgrounds = Backgrounds(views, CLEARANCE, WIDTH, marked(40))
     now = marked(80)
     kept = backgrounds.see(now, 0.06)
     assert kept is not None

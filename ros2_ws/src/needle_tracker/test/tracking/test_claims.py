@@ -83,7 +83,10 @@ def test_the_end_that_was_seen_best_says_where_the_stage_has_its_zero() -> None:
     staged.placed(_along(0.05e-3, 0.9e-3, 0.05), _shaft(0.05), 0.05)
     hidden = staged.placed(_along(0.4e-3, 1.4e-3, 0.052), None, 0.052)
     assert 0.052 - hidden.position[2] == pytest.approx(0.9e-3, abs=0.02e-3)
-    # Its next run begins with another zero.
+    # One that is seen less well, but plainly farther out, shows that the first lay short.
+    farther = staged.placed(_along(0.2e-3, 0.1e-3, 0.054), None, 0.054)
+    assert 0.054 - farther.position[2] < 0.1e-3
+    # The next run begins with another zero.
     staged.forget()
     other = staged.placed(_along(0.05e-3, 0.0, 0.05), _shaft(0.05), 0.05)
     assert other.position[2] == pytest.approx(0.05, abs=0.01e-3)
