@@ -7,11 +7,11 @@ from bisect import bisect_right
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from needle_analysis.run.run_summary import target_offset
 from needle_bags.reading.bag_reader import Run, Stamps
 from needle_controller.model.arc_motion import arc, cross_matrix
+from needle_controller.model.kinematics import rotation_from_quaternion
 
 Floats = npt.NDArray[np.float64]
 
@@ -73,7 +73,10 @@ def innovations(run: Run) -> Innovations | None:
     if not isinstance(curvature, (int, float)) or len(here) < 2 or not len(run.joints):
         return None
     stamps = run.estimate.stamps[here]
-    position, rotation = run.estimate.values[here, :3], _matrices(run.estimate.values[here, 3:])
+    position, rotation = (
+        run.estimate.values[here, :3],
+        rotation_from_quaternion(run.estimate.values[here, 3:]),
+    )
     covariance = run.estimate_covariances.values[here].reshape(-1, 6, 6)
     inserted, turned = np.diff(_joints_at(run, stamps), axis=0).T
     shift = arc(np.maximum(inserted, 0.0), turned, curvature).shift
@@ -156,9 +159,4 @@ def _measurement_covariances(run: Run, stamps: Stamps) -> Floats:
     matrices: Floats = np.tile(np.eye(3) * sigma**2, (len(stamps), 1, 1))
     here, there = run.tip_covariances.at(stamps)
     matrices[there] = run.tip_covariances.values[here].reshape(-1, 3, 3)
-    return matrices
-
-
-def _matrices(quaternions: Floats) -> Floats:
-    matrices: Floats = Rotation.from_quat(quaternions).as_matrix()
     return matrices

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import Quaternion
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from needle_common.diagnostics import Diagnostic
@@ -43,6 +47,25 @@ def to_stamp(nanoseconds: int) -> Time:
     sec = min(max(nanoseconds // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
     nanosec = min(max(nanoseconds - sec * NANOSECONDS, 0), _LAST_NANOSEC)
     return Time(sec=sec, nanosec=nanosec)
+
+
+def to_quaternion(rotation: Sequence[Sequence[float]]) -> Quaternion:
+    """Return the unit quaternion of a rotation matrix, given as three rows.
+
+    Of the four ways the one whose divisor is largest. scipy does the same, but takes a node that
+    needs no more of it a quarter of a second to import.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    trace = xx + yy + zz
+    _, (x, y, z, w) = max(
+        (xx, (1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz)),
+        (yy, (xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx)),
+        (zz, (xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy)),
+        (trace, (zy - yz, xz - zx, yx - xy, 1.0 + trace)),
+        key=lambda way: way[0],
+    )
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    return Quaternion(x=x / norm, y=y / norm, z=z / norm, w=w / norm)
 
 
 def to_diagnostic_status(name: str, hardware_id: str, diagnostic: Diagnostic) -> DiagnosticStatus:

@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.reachability import check_offset
 
 _UNIT_TOLERANCE = 1e-3
@@ -89,7 +90,7 @@ def plane_from_pose(
     if abs(norm - 1.0) > _UNIT_TOLERANCE:
         raise UserError(f"target_plane's quaternion has length {norm:g}, wants 1")
     transform = np.eye(4)
-    transform[:3, :3] = _rotation_from_quaternion(q / norm)
+    transform[:3, :3] = rotation_from_quaternion(q / norm)
     transform[:3, 3] = origin
     plane = TargetPlane(transform)
     # The entering needle's sine of pitch in the plane's coordinates.
@@ -121,14 +122,3 @@ def check_within_reach(plane: TargetPlane, curvature: float, depth: float) -> No
     """
     pitch = float(np.arcsin(np.clip(plane.T_plane_rig[0, 2], -1.0, 1.0)))
     check_offset(plane.offset, curvature, max(depth, SHORTEST_JUDGED_DEPTH), pitch)
-
-
-def _rotation_from_quaternion(q: Array) -> Array:
-    x, y, z, w = q
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

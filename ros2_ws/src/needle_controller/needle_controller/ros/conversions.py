@@ -13,14 +13,13 @@ from geometry_msgs.msg import (
     Vector3,
     Vector3Stamped,
 )
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
-from needle_common.ros.conversions import to_nanoseconds, to_stamp, values_of
+from needle_common.ros.conversions import to_nanoseconds, to_quaternion, to_stamp, values_of
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
@@ -127,9 +126,7 @@ def to_pose(estimate: Estimate, stamp_ns: int) -> PoseWithCovarianceStamped:
     message = PoseWithCovarianceStamped(header=to_header(stamp_ns))
     pose = message.pose.pose
     pose.position.x, pose.position.y, pose.position.z = (float(c) for c in estimate.position)
-    quaternion = Rotation.from_matrix(estimate.rotation).as_quat()
-    orientation = pose.orientation
-    orientation.x, orientation.y, orientation.z, orientation.w = (float(c) for c in quaternion)
+    pose.orientation = to_quaternion(estimate.rotation.tolist())
     turn = np.eye(6)
     turn[3:, 3:] = angle_axes(estimate.coordinates[3:])
     message.pose.covariance = (turn @ estimate.covariance @ turn.T).ravel()

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 from visualization_msgs.msg import Marker, MarkerArray
 
 from needle_common.errors import UserError
+from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.target_plane import RIG
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 
@@ -51,7 +51,7 @@ def _obstacle(name: str, marker: Marker) -> Obstacle:
         length = float(np.linalg.norm(quaternion))
         if not abs(length - 1.0) <= _ROUND:
             raise UserError(f"{name}'s quaternion has length {length:g}, wants 1")
-        half = 0.5 * sizes[2] * Rotation.from_quat(quaternion).as_matrix()[:, 2]
+        half = 0.5 * sizes[2] * rotation_from_quaternion(quaternion / length)[:, 2]
         across = sizes[:2]
     if np.ptp(across) > _ROUND * float(np.max(np.abs(across))):
         raise UserError(f"{name} is not round: scale {sizes} m")

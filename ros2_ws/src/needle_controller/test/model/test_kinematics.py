@@ -29,6 +29,7 @@ from needle_controller.model.kinematics import (
     coordinate_rates,
     reduced_rates,
     rotation_from_angles,
+    rotation_from_quaternion,
 )
 
 CURVATURE = 1.0 / 0.122
@@ -58,6 +59,13 @@ def test_rotation_is_that_of_intrinsic_xyz_angles() -> None:
     angles = some_coordinates(50)[:, 3:]
     expected = Rotation.from_euler("XYZ", angles).as_matrix()
     np.testing.assert_allclose(rotation_from_angles(angles), expected, atol=1e-14)
+
+
+def test_rotation_is_that_of_quaternions() -> None:
+    rotations = Rotation.random(50, random_state=2)
+    np.testing.assert_allclose(
+        rotation_from_quaternion(rotations.as_quat()), rotations.as_matrix(), atol=1e-14
+    )
 
 
 def test_angles_round_trip() -> None:

@@ -8,10 +8,10 @@ import numpy as np
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped, PoseStamped, PoseWithCovarianceStamped
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
+from needle_common.ros.conversions import to_quaternion
 from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 
@@ -25,10 +25,9 @@ _LEAST_POSITION_VARIANCE = 1e-12
 def to_truth(T_rig_tip: FloatArray, stamp: Time) -> PoseStamped:  # noqa: N803
     """Return the true pose of the tip, shape (4, 4), as a message."""
     message = PoseStamped(header=Header(stamp=stamp, frame_id=RIG_FRAME))
-    position, orientation = message.pose.position, message.pose.orientation
+    position = message.pose.position
     position.x, position.y, position.z = map(float, T_rig_tip[:3, 3])
-    quaternion = Rotation.from_matrix(T_rig_tip[:3, :3]).as_quat()
-    orientation.x, orientation.y, orientation.z, orientation.w = map(float, quaternion)
+    message.pose.orientation = to_quaternion(T_rig_tip[:3, :3].tolist())
     return message
 
 
