@@ -280,7 +280,8 @@ class SteeringSettings:
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
                 "coordinates end at roll +-90 deg); best can"
             )
-        self.gains()
+        if self.preset in ONE_SIDED_PRESETS:
+            self.gains()
 
     def gains(self) -> Gains:
         """Return the gains the weights give; raises UserError as `gains.design_gains` does."""
