@@ -145,11 +145,6 @@ class TransitionWatch:
         self._sent: deque[DriveCommand] = deque(maxlen=6)
         self._seen: DriveState | None = None
 
-    def forget(self) -> None:
-        """Begin anew, after a reset or set-up."""
-        self._sent.clear()
-        self._seen = None
-
     def sent(self, command: DriveCommand) -> None:
         """Take a command that goes out."""
         self._sent.append(command)

@@ -145,5 +145,3 @@ def test_the_watch_names_what_nobody_ordered_but_not_a_fault() -> None:
     )
     assert watch.unexplained(DriveState.FAULT_REACTION_ACTIVE) == ""
     assert watch.unexplained(DriveState.FAULT) == ""
-    watch.forget()
-    assert watch.unexplained(DriveState.OPERATION_ENABLED) == ""
