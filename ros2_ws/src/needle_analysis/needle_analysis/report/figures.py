@@ -25,6 +25,7 @@ from needle_analysis.report.figure_style import (
 from needle_analysis.run.run_summary import (
     GOAL,
     commanded_rotation,
+    estimate_error,
     finite_tips,
     reduced_states,
     rerun_of,
@@ -153,17 +154,15 @@ def error_figure(run: Run) -> Figure:
         tip.plot(insertion, norm, color=TRUTH, lw=1.6, label="3D distance")
         tip.set(title="Measured tip minus truth", ylabel="mm")
         tip.legend(loc="best", ncols=4)
-        here, there = run.reduced_state.at(run.truth.stamps)
-        truth = reduced_states(run.truth, target_offset(run))[there]
-        off = run.reduced_state.values[here] - truth
-        insertion = run.insertion_at(run.reduced_state.stamps[here]) * MM
+        stamps, off = estimate_error(run, run.reduced_state)
+        insertion = run.insertion_at(stamps) * MM
         angles = difference.twinx()
         angles.grid(visible=False)
         angles.spines["right"].set_visible(True)
         lines = difference.plot(insertion, off[:, 0] * MM, color=ESTIMATE, lw=1.6, label="r1 [mm]")
-        wrapped = np.degrees((off[:, 1:] + np.pi) % (2 * np.pi) - np.pi)
-        lines += angles.plot(insertion, wrapped[:, 0], color=VIOLET, lw=1.1, label="r2 [deg]")
-        lines += angles.plot(insertion, wrapped[:, 1], color=TEAL, lw=1.1, label="r3 [deg]")
+        turned = np.degrees(off)
+        lines += angles.plot(insertion, turned[:, 1], color=VIOLET, lw=1.1, label="r2 [deg]")
+        lines += angles.plot(insertion, turned[:, 2], color=TEAL, lw=1.1, label="r3 [deg]")
         difference.set(title="Estimate minus truth", ylabel="mm", xlabel="insertion [mm]")
         angles.set_ylabel("deg")
         difference.legend(lines, [str(line.get_label()) for line in lines], loc="best", ncols=3)

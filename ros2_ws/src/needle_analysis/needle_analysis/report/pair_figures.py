@@ -22,6 +22,7 @@ from needle_analysis.report.figure_style import (
 from needle_analysis.run.run_summary import (
     GOAL,
     commanded_rotation,
+    estimate_error,
     finite_tips,
     reduced_states,
     rerun_of,
@@ -136,13 +137,10 @@ def _errors(runs: tuple[Run, Run]) -> Figure:
             insertion = run.insertion_at(tips.stamps[here]) * MM
             distance = np.linalg.norm(tip_error(run), axis=1) * MM
             tip.plot(insertion, distance, color=color, lw=1.2, label=letter)
-            here, there = run.reduced_state.at(run.truth.stamps)
-            off = run.reduced_state.values[here]
-            off = off - reduced_states(run.truth, target_offset(run))[there]
-            insertion = run.insertion_at(run.reduced_state.stamps[here]) * MM
+            stamps, off = estimate_error(run, run.reduced_state)
+            insertion = run.insertion_at(stamps) * MM
             r1.plot(insertion, off[:, 0] * MM, color=color, lw=1.2)
-            wrapped = np.degrees((off[:, 2] + np.pi) % (2.0 * np.pi) - np.pi)
-            roll.plot(insertion, wrapped, color=color, lw=1.2)
+            roll.plot(insertion, np.degrees(off[:, 2]), color=color, lw=1.2)
         for axes in (r1, roll):
             axes.axhline(0.0, color=GREY, lw=0.8)
         tip.set(title="Measured tip: 3D distance from the truth", ylabel="mm")

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from needle_analysis.rerun.comparison import Record, members
 from needle_analysis.rerun.reception_order import in_reception_order
-from needle_analysis.run.run_summary import reduced_states, target_offset
+from needle_analysis.run.run_summary import estimate_error
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_order import Reorder, SentMessage, messages_as_sent
 from needle_bags.reading.bag_reader import Run, Series, nanoseconds
@@ -238,11 +238,9 @@ def estimate_errors(run: Run, outputs: Sequence[Output] | None) -> npt.NDArray[n
         rows = [(v.x, v.y, v.z) for v in (output.message.vector for output in found)]
         stamps = np.array([output.stamp for output in found], np.int64)
         series = Series(stamps, np.array(rows, np.float64).reshape(-1, 3), stamps)
-    here, there = series.at(run.truth.stamps)
-    if not len(here):
+    _, error = estimate_error(run, series)
+    if not len(error):
         return None
-    error = series.values[here] - reduced_states(run.truth, target_offset(run))[there]
-    error[:, 1:] = (error[:, 1:] + np.pi) % (2.0 * np.pi) - np.pi
     rms: npt.NDArray[np.float64] = np.sqrt(np.mean(error**2, axis=0))
     return rms
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from needle_bags.reading.bag_reader import Run, Series
+from needle_bags.reading.bag_reader import Run, Series, Stamps
 from needle_common.commands.cli import JsonValue, finite_or_none
 
 GOAL = 1e-3
@@ -139,6 +139,22 @@ def reduced_states(poses: Series, offset: float = 0.0) -> Floats:
     r13 = 2 * (x * z + y * w)
     beta = np.arcsin(np.clip(r13, -1.0, 1.0))
     return np.stack([poses.values[:, 0] - offset, beta, np.arctan2(-r12, r11)], axis=1)
+
+
+def estimate_error(run: Run, estimate: Series) -> tuple[Stamps, Floats]:
+    """Return stamps and estimate minus truth of r = (x [m], beta, gamma [rad]), (N, 3).
+
+    Parameters
+    ----------
+    run : Run
+        The run, with its truth.
+    estimate : Series
+        r by stamp, (N, 3): `run.reduced_state`, or today's.
+    """
+    here, there = estimate.at(run.truth.stamps)
+    error = estimate.values[here] - reduced_states(run.truth, target_offset(run))[there]
+    error[:, 1:] = (error[:, 1:] + np.pi) % (2.0 * np.pi) - np.pi
+    return estimate.stamps[here], error
 
 
 def commanded_rotation(run: Run) -> Floats:

@@ -82,11 +82,6 @@ class BagWriter:
             raise UserError(f"cannot record into {directory}: {error.strerror}") from error
 
     @property
-    def message_count(self) -> int:
-        """Messages written so far."""
-        return sum(file.message_count for file in self._files)
-
-    @property
     def data_file(self) -> Path:
         """The file that is written now."""
         return self.directory / self._files[-1].name

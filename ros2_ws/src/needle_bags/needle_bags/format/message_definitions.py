@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import importlib
-import os
 import re
-from collections.abc import Iterable
-from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_common.errors import UserError
+from needle_common.files.installed import find_shared
 
 _SEPARATOR = "=" * 80
 _BUILT_IN_TEXT = """
@@ -22,34 +20,26 @@ _BUILT_IN = frozenset(_BUILT_IN_TEXT.split())
 _FIELD = re.compile(r"^\s*([A-Za-z]\w*(?:/\w+)*)(?:<=\d+)?(?:\[[^\]]*\])?\s+\w")
 
 
-def share_prefixes() -> list[Path]:
-    """Return the prefixes of the ROS environment (AMENT_PREFIX_PATH), first wins."""
-    return [Path(p) for p in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if p]
-
-
-def full_definition(type_name: str, prefixes: Iterable[Path] | None = None) -> str:
+def full_definition(type_name: str) -> str:
     """Return a type's definition with those of all types it contains, as MCAP's `ros2msg` has it.
 
     Parameters
     ----------
     type_name : str
         `package/msg/Name`.
-    prefixes : iterable of Path, optional
-        Installation prefixes to search; the ROS environment's by default.
 
     Raises
     ------
     UserError
         If the .msg file of the type, or of one it contains, is not installed.
     """
-    where = list(share_prefixes() if prefixes is None else prefixes)
     texts: dict[str, str] = {}
     waiting = [type_name]
     while waiting:
         name = waiting.pop(0)
         if name in texts:
             continue
-        texts[name] = _read(name, where)
+        texts[name] = _read(name)
         waiting += _contained(name, texts[name])
     parts: list[str] = []
     for name, text in texts.items():
@@ -86,16 +76,15 @@ def message_class(type_name: str) -> Any:
     return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
 
-def _read(type_name: str, prefixes: list[Path]) -> str:
+def _read(type_name: str) -> str:
     try:
         package, kind, name = type_name.split("/")
+        return find_shared(package, f"{kind}/{name}.msg").read_text(encoding="utf-8")
     except ValueError:
         raise UserError(f"{type_name!r} is not a message type: wants package/msg/Name") from None
-    for prefix in prefixes:
-        path = prefix / "share" / package / kind / f"{name}.msg"
-        if path.is_file():
-            return path.read_text(encoding="utf-8")
-    raise UserError(f"the definition of {type_name} is not installed (AMENT_PREFIX_PATH)")
+    except UserError:
+        why = f"the definition of {type_name} is not installed (AMENT_PREFIX_PATH)"
+        raise UserError(why) from None
 
 
 def _contained(type_name: str, text: str) -> list[str]:

@@ -35,7 +35,10 @@ def messages_as_sent(
     is_large: Callable[[str], bool],
     reorder: Reorder | None = None,
 ) -> Iterator[tuple[SentMessage, Any]]:
-    """Yield messages as they are and deserialized, in the order of `raw_as_sent`."""
+    """Yield messages as they are and deserialized, in the order of `raw_as_sent`.
+
+    `reorder` gives the messages that are not large another order, where senders' clocks agree.
+    """
     with BagDirectory(path) as bag:
         store = bag.typestore()
         for sent in _as_sent(bag, wanted, is_large, reorder):
@@ -43,10 +46,7 @@ def messages_as_sent(
 
 
 def raw_as_sent(
-    path: Path,
-    wanted: Callable[[str], bool],
-    is_large: Callable[[str], bool],
-    reorder: Reorder | None = None,
+    path: Path, wanted: Callable[[str], bool], is_large: Callable[[str], bool]
 ) -> Iterator[SentMessage]:
     """Yield the messages of the wanted topics in the order of sending.
 
@@ -59,8 +59,6 @@ def raw_as_sent(
     is_large : callable
         Whether a topic's messages are not to be kept in memory, such as images; such topics are
         expected in order.
-    reorder : callable, optional
-        Gives the messages that are not large another order, where senders' clocks agree.
 
     Raises
     ------
@@ -68,7 +66,7 @@ def raw_as_sent(
         If the bag cannot be read.
     """
     with BagDirectory(path) as bag:
-        yield from _as_sent(bag, wanted, is_large, reorder)
+        yield from _as_sent(bag, wanted, is_large, None)
 
 
 def _as_sent(

@@ -20,6 +20,11 @@ Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]
 
 _NANOSECONDS = 1_000_000_000
+# Numbers in a row of each series.
+_WIDTHS = {
+    **{"tips": 3, "tip_covariances": 9, "truth": 7, "estimate": 7, "estimate_covariances": 36},
+    **{"reduced_state": 3, "joints": 2, "control_input": 3, "commands": 2, "holds": 2},
+}
 RECORDING = ("recording_ended", "recovered", "messages_lost", "parameter_changes")
 
 
@@ -173,12 +178,12 @@ class Run:
         )
         return insertion
 
-    def last_status(self, key: str, default: str = "") -> str:
-        """Return the last value of a key of the controller's status."""
+    def last_status(self, key: str) -> str:
+        """Return the last value of a key of the controller's status; empty where it has none."""
         for status in reversed(self.controller_status):
             if key in status.values:
                 return status.values[key]
-        return default
+        return ""
 
     def parameter(self, node: str, name: str) -> Any:
         """Return a node's parameter, None if it is not recorded.
@@ -230,16 +235,7 @@ def read_run(path: Path, namespace: str | None = None) -> Run:
             ) from error
     return Run(
         path=path,
-        tips=collected.series("tips", 3),
-        tip_covariances=collected.series("tip_covariances", 9),
-        truth=collected.series("truth", 7),
-        estimate=collected.series("estimate", 7),
-        estimate_covariances=collected.series("estimate_covariances", 36),
-        reduced_state=collected.series("reduced_state", 3),
-        joints=collected.series("joints", 2),
-        control_input=collected.series("control_input", 3),
-        commands=collected.series("commands", 2),
-        holds=collected.series("holds", 2),
+        **{name: collected.series(name, width) for name, width in _WIDTHS.items()},
         controller_status=collected.controller_status,
         device_status=collected.device_status,
         results=collected.results,

@@ -36,15 +36,10 @@ def versions() -> dict[str, str]:
     return found
 
 
-def commit(source: Path = Path(__file__)) -> str:
-    """Return the git commit of the sources, `-dirty` where they differ, or `unknown`.
-
-    Parameters
-    ----------
-    source : Path
-        A file of the sources; links are followed, so that an installed link names its checkout.
-    """
-    folder = str(source.resolve().parent)
+def commit() -> str:
+    """Return the git commit of the sources, `-dirty` where they differ, or `unknown`."""
+    # Links are followed, so that an installed link names its checkout.
+    folder = str(Path(__file__).resolve().parent)
     try:
         answer = subprocess.run(
             ["git", "-C", folder, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"],

@@ -5,25 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from rcl_interfaces.msg import ParameterEvent, ParameterType, ParameterValue
+import numpy as np
+from rcl_interfaces.msg import ParameterEvent, ParameterValue
 from rcl_interfaces.srv import GetParameters, ListParameters
 from rclpy.client import Client
 from rclpy.node import Node
+from rclpy.parameter import parameter_value_to_python
 
 from needle_common.ros import discovery
 from needle_common.ros.question import Question
-
-_FIELDS = {
-    ParameterType.PARAMETER_BOOL: "bool_value",
-    ParameterType.PARAMETER_INTEGER: "integer_value",
-    ParameterType.PARAMETER_DOUBLE: "double_value",
-    ParameterType.PARAMETER_STRING: "string_value",
-    ParameterType.PARAMETER_BYTE_ARRAY: "byte_array_value",
-    ParameterType.PARAMETER_BOOL_ARRAY: "bool_array_value",
-    ParameterType.PARAMETER_INTEGER_ARRAY: "integer_array_value",
-    ParameterType.PARAMETER_DOUBLE_ARRAY: "double_array_value",
-    ParameterType.PARAMETER_STRING_ARRAY: "string_array_value",
-}
 
 
 def plain_value(value: ParameterValue) -> Any:
@@ -34,14 +24,17 @@ def plain_value(value: ParameterValue) -> Any:
     value : ParameterValue
         rclpy's, or a bag's as rosbags has it.
     """
-    field = _FIELDS.get(value.type)
-    if field is None:
+    try:
+        plain = parameter_value_to_python(value)
+    except RuntimeError:  # of no type that there is
         return None
-    plain = getattr(value, field)
-    if isinstance(plain, (bool, int, float, str)):
-        return plain
-    items = plain if isinstance(plain, list) else plain.tolist()
-    return [int.from_bytes(x, "little") if isinstance(x, bytes) else x for x in items]
+    return [_plain_element(element) for element in plain] if isinstance(plain, list) else plain
+
+
+def _plain_element(element: Any) -> Any:
+    if isinstance(element, bytes):
+        return int.from_bytes(element, "little")
+    return element.item() if isinstance(element, np.generic) else element
 
 
 class ParameterSnapshots:

@@ -91,11 +91,8 @@ class NodeProcess:
     @property
     def last_line(self) -> str:
         """Last line that it wrote, or an empty text."""
-        try:
-            lines = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-        except OSError:
-            return ""
-        return lines[-1].strip() if lines else ""
+        said = [line.strip() for line in self.tail(20) if line.strip()]
+        return said[-1] if said else ""
 
     def tail(self, count: int) -> list[str]:
         """Return the last `count` lines that it wrote."""

@@ -15,7 +15,6 @@ from pathlib import Path
 from types import ModuleType
 
 from needle_bringup.operator.progress import PROGRESS_FD
-from needle_bringup.simulation.installed import find_executable
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
     NODES,
@@ -36,6 +35,7 @@ from needle_common.commands.cli import (
     write_json,
 )
 from needle_common.errors import UserError
+from needle_common.files.installed import find_executable
 from needle_common.process.end_request import EndRequest
 from needle_common.process.ros_domain import own_domain
 from needle_common.settings.parameter_files import Parameters, read_parameters

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from needle_bringup.simulation.installed import find_executable
 from needle_bringup.simulation.node_process import NodeProcess, stop
+from needle_common.files.installed import find_executable
 from needle_common.process.reach import DISCOVERY_RANGE, PROFILES
 from needle_common.process.ros_domain import own_domain, ports_of
 

@@ -15,7 +15,7 @@ from rclpy.node import Node
 from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
-from needle_bringup.simulation.installed import find_executable
+from needle_common.files.installed import find_executable
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import HOLD, LATCHED, to_nanoseconds
 

@@ -8,13 +8,13 @@ from typing import Any
 import pytest
 import yaml
 
-from needle_bringup.simulation.installed import find_shared
 from needle_bringup.simulation.launch_nodes import (
     nodes_beside_rig,
     refuse_misspelt,
     simulated_nodes,
 )
 from needle_common.errors import UserError
+from needle_common.files.installed import find_shared
 from needle_common.settings.parameter_files import Parameters
 
 

@@ -15,22 +15,14 @@ SHARED_MEMORY = Path("/dev/shm")
 _PREFIX = "fastrtps_"
 
 
-def make_private(folder: Path = SHARED_MEMORY, maps: Path = Path("/proc/self/maps")) -> None:
+def make_private() -> None:
     """Keep other users from reading the shared memory that this process has open.
 
     It holds every image. Fast DDS opens it to all readers, whatever the umask (mode 0644).
-
-    Parameters
-    ----------
-    folder : Path
-        Where shared memory is mounted.
-    maps : Path
-        What the process has mapped.
     """
+    maps = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace")
     open_here = {
-        line.split()[-1]
-        for line in maps.read_text(encoding="utf-8", errors="replace").splitlines()
-        if f" {folder}/{_PREFIX}" in line
+        line.split()[-1] for line in maps.splitlines() if f" {SHARED_MEMORY}/{_PREFIX}" in line
     }
     for path in open_here:
         # Another user's, or gone.

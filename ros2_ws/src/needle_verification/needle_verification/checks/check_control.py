@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from needle_bringup.simulation.installed import find_executable
 from needle_bringup.simulation.node_process import NodeProcess, stop
 from needle_common.errors import UserError
+from needle_common.files.installed import find_executable
 from needle_common.process.ros_domain import own_domain
 from needle_controller.model.gains import design_gains
 from needle_controller.model.reachability import reachability

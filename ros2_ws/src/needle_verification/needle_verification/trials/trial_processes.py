@@ -7,7 +7,6 @@ import signal
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from needle_bringup.simulation.installed import find_executable
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
@@ -17,6 +16,7 @@ from needle_bringup.simulation.rig_configuration import (
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
+from needle_common.files.installed import find_executable
 
 _KILL_GRACE = 5.0
 _TAKES_COMMANDS = "drive_emulator"
