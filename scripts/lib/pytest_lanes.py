@@ -8,6 +8,7 @@ not hear those of another.
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import signal
 import time
@@ -50,6 +51,11 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected."""
     places = {file: place for place, file in enumerate(LONG_FILES)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+
+
+def pytest_collection_finish() -> None:
+    """Leave what has come up to here out of all searches for garbage: it stays, and it is much."""
+    gc.freeze()
 
 
 def in_lane(config: pytest.Config) -> bool:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import importlib
 import os
 import shutil
 import signal
@@ -34,6 +33,7 @@ from needle_common.commands.cli import (
     run_command,
     write_json,
 )
+from needle_common.commands.executables import loaded
 from needle_common.errors import UserError
 from needle_common.files.installed import find_executable
 from needle_common.process.end_request import EndRequest
@@ -230,7 +230,7 @@ def _import_report() -> tuple[ModuleType, ...]:
         "needle_bags.reading.bag_reader",
         "needle_analysis.run.run_summary",
     )
-    return tuple(importlib.import_module(name) for name in names)
+    return tuple(loaded(name) for name in names)
 
 
 def describe(summary: Mapping[str, JsonValue], bag: Path) -> str:

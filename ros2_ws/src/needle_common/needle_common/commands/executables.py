@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import gc
 import importlib
 import os
 import sys
 from collections.abc import Callable
+from types import ModuleType
 from typing import NoReturn
 
 from needle_common.process.end_request import LeaveAtOnce
@@ -31,7 +33,7 @@ def node(module: str) -> Callable[[], NoReturn]:
 
     def enter() -> NoReturn:
         LeaveAtOnce(_EXIT_DONE)
-        code: int = importlib.import_module(module).main()
+        code: int = loaded(module).main()
         # No way back through the interpreter: what DDS and numerical code left there has its own
         # ideas of an end, and a signal finds no handler any more.
         for stream in (sys.stdout, sys.stderr):
@@ -54,6 +56,20 @@ def command(module: str) -> Callable[[], NoReturn]:
 
     def enter() -> NoReturn:
         LeaveAtOnce(_EXIT_INTERRUPTED)
-        sys.exit(importlib.import_module(module).main())
+        sys.exit(loaded(module).main())
 
     return enter
+
+
+def loaded(module: str) -> ModuleType:
+    """Return a module, imported with all that it needs.
+
+    What is made meanwhile is there to stay: to look for garbage in it would take a tenth of the
+    time now, and every later search would go through all of it again.
+    """
+    gc.disable()
+    try:
+        return importlib.import_module(module)
+    finally:
+        gc.freeze()
+        gc.enable()
