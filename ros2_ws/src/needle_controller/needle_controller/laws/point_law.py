@@ -46,7 +46,12 @@ class PointLaw:
             raise OutOfBoundsError("last_turns_from", settings.last_turns_from, least, 1.0, "m")
         self.settings = settings
 
-    def __call__(self, estimate: Estimate, target: npt.ArrayLike) -> SteeringCommand:
+    def __call__(
+        self,
+        estimate: Estimate,
+        target: npt.ArrayLike,
+        rotation_left: npt.ArrayLike = math.inf,
+    ) -> SteeringCommand:
         """Return the rotation rate to hold over the next step, and the insertion left.
 
         Parameters
@@ -56,6 +61,8 @@ class PointLaw:
             hypothesis without torsion.
         target : array_like, shape (..., 3)
             Where the tip is to go, in the estimate's frame [m]. It may move between calls.
+        rotation_left : array_like, shape (...)
+            What the base may still turn, either way [rad]: it turns as seldom as that takes.
         """
         hypotheses = hypotheses_of(estimate)
         shape = hypotheses.base.shape
@@ -72,6 +79,7 @@ class PointLaw:
             np.ascontiguousarray(hypotheses.wound.reshape(-1)),
             np.ascontiguousarray(hypotheses.uncertainty.reshape(-1, 3)),
             np.array(points.reshape(-1, 3)),
+            np.array(np.broadcast_to(np.asarray(rotation_left, dtype=float), shape).reshape(-1)),
             self.settings,
             turn,
             left,

@@ -87,6 +87,7 @@ def point_turns(
     wound: Array,
     uncertainty: Array,
     target: Array,
+    rotation_left: Array,
     settings: PointLawSettings,
     turn: Array,
     left: Array,
@@ -103,6 +104,8 @@ def point_turns(
         See `Hypotheses`; likewise `base` and `wound`, shape (N,), and `uncertainty`, (N, 3).
     target : ndarray, shape (N, 3)
         Where the tip is to go [m].
+    rotation_left : ndarray, shape (N,)
+        What the base may still turn, either way; infinite where that is not limited [rad].
     settings : PointLawSettings
         The settings.
     turn, left : ndarray, shape (N,), written
@@ -121,7 +124,7 @@ def point_turns(
         variance += way * (2.0 * uncertainty[n, 1] + way * uncertainty[n, 2])
         std = math.sqrt(max(variance, 0.0))
         slack = mean_slack(table[n], settings.max_rotation_per_length)
-        wanted = wanted_turn(need, way, curvature[n], std, slack, settings)
+        wanted = wanted_turn(need, way, curvature[n], std, slack, rotation_left[n], settings)
         heaviest = np.max(table[n, :, T_WEIGHT])
         turns = weights = 0.0
         for k in range(table.shape[1]):
@@ -137,7 +140,8 @@ def point_turns(
             asked = base_turn(row, tip_turn, base[n], settings.step_length)
             turns += row[T_WEIGHT] * min(max(asked, -settings.largest_turn), settings.largest_turn)
             weights += row[T_WEIGHT]
-        turn[n] = min(max(turns / weights, -limit), limit)
+        most = min(limit, rotation_left[n])
+        turn[n] = min(max(turns / weights, -most), most)
 
 
 @compiled
@@ -217,6 +221,7 @@ def wanted_turn(
     curvature: float,
     std: float,
     slack: float,
+    rotation_left: float,
     settings: PointLawSettings,
 ) -> float:
     """Return the turn of the tip that leads it to the target [rad]; 0 where it is to be left alone.
@@ -233,6 +238,8 @@ def wanted_turn(
         Standard deviation of where the tip would be at the target, across its heading [m].
     slack : float
         See `mean_slack` [m].
+    rotation_left : float
+        See `point_turns` [rad].
     settings : PointLawSettings
         The settings.
     """
@@ -261,9 +268,31 @@ def wanted_turn(
     early = min(max(early, 0.0), 1.0)
     # As a share of what bending all the way would do.
     unsure = std / (0.5 * curvature * left * left)
-    if share_then + early * settings.doubt * unsure < 1.0 - early * settings.reserve:
+    kept = early * (settings.reserve + settings.doubt * unsure)
+    kept = min(kept, affordable_reserve(left, rotation_left - abs(turn), settings.last_turn))
+    return 0.0 if share_then + kept < 1.0 else turn
+
+
+@compiled
+def affordable_reserve(left: float, rotation_left: float, last_turn: float) -> float:
+    """Return the share of the curvature that can be kept back without too many turns to come.
+
+    With a share r kept back, the needle bends to the target and as far past that direction: what is
+    left falls to sqrt(r / (2 - r)) of itself from one half turn to the next. So many half turns
+    as can be made shall bring it to the last one.
+
+    Parameters
+    ----------
+    left, last_turn : float
+        Insertion left, now and at the last turn [m].
+    rotation_left : float
+        What the base may turn after the turn that is to be made now [rad].
+    """
+    half_turns = rotation_left / math.pi
+    if half_turns <= 0.0 or left <= last_turn:
         return 0.0
-    return turn
+    square = (last_turn / left) ** (2.0 / half_turns)
+    return 2.0 * square / (1.0 + square)
 
 
 @compiled

@@ -59,6 +59,7 @@ class PointSteering:
         estimate: Estimate,
         time: Array | float,
         insertion: Array | float,
+        rotation_left: Array | float,
         from_rig: Callable[[Array], Array] = np.asarray,
     ) -> SteeringCommand:
         """Return the rotation rate to hold over the next step, and the insertion left.
@@ -71,6 +72,8 @@ class PointSteering:
             Of the tip that it is made from [s].
         insertion : float, or ndarray, shape (...)
             Then [m].
+        rotation_left : float, or ndarray, shape (...)
+            What the base may still turn, either way [rad].
         from_rig : callable
             Takes points of `rig` to the estimate's frame.
         """
@@ -78,14 +81,14 @@ class PointSteering:
         speed = self._speed(now, float(np.max(insertion)))
         if speed is None or not -_CLOCKS_APART <= now - self.motion.seen <= WINDOWS[0]:
             self._foretold = None
-            return self._law(estimate, from_rig(self.aim))
+            return self._law(estimate, from_rig(self.aim), rotation_left)
         if self._arrival is None:
             self._arrival = time + self._left(estimate, from_rig(self.aim)) / speed
         for _ in range(_LOOKS):
             self._foretold = self.motion.at(self._arrival)
             left = self._left(estimate, from_rig(self.aim))
             self._arrival = self._arrival + _CORRECTED * (time + left / speed - self._arrival)
-        return self._law(estimate, from_rig(self.aim))
+        return self._law(estimate, from_rig(self.aim), rotation_left)
 
     def _left(self, estimate: Estimate, target: npt.ArrayLike) -> Array:
         left = self._law(estimate, target).insertion_left

@@ -118,6 +118,14 @@ class SteeringSettings:
         lower=2.0 * math.pi,
         upper=1000.0,
     )
+    rotation_budget: float = parameter(
+        1e6,
+        unit="rad",
+        description="Most the base turns, either way, from the first tip to a point: with less it "
+        "turns more seldom, and corrects less. Not past obstacles.",
+        lower=0.0,
+        upper=1e6,
+    )
     tip_timeout: float = parameter(
         2.0,
         unit="s",

@@ -88,6 +88,7 @@ class PlaneControl:
         self._estimator, self._law = _new_controller(settings, plane)
         self._joints: JointSample | None = None
         self._first_joints: JointSample | None = None
+        self._rotation = 0.0
         self._warm_up()
 
     @property
@@ -158,6 +159,7 @@ class PlaneControl:
         """Forget the needle: the next tip is the first."""
         self._estimator, self._law = _new_controller(self._settings, self._plane)
         self._joints = self._first_joints = None
+        self._rotation = 0.0
         if self._points is not None:
             self._points = PointSteering(self._settings, self._points.motion)
 
@@ -205,7 +207,9 @@ class PlaneControl:
         else:
             # An encoder at rest may read a count less; drawing out is the protocol's business.
             inserted = max(joints.insertion - self._joints.insertion, 0.0)
-            self._estimator.advance(inserted, joints.rotation - self._joints.rotation)
+            rotation = joints.rotation - self._joints.rotation
+            self._rotation += abs(rotation)
+            self._estimator.advance(inserted, rotation)
             self._correct(position, known)
         self._joints = joints
         estimate = self._estimator.estimate()
@@ -240,7 +244,11 @@ class PlaneControl:
                 estimate, self._plane, point, self.obstacles, joints.insertion
             )
         return self._points.command(
-            estimate, joints.stamp_ns * 1e-9, joints.insertion, self._plane.from_rig
+            estimate,
+            joints.stamp_ns * 1e-9,
+            joints.insertion,
+            self._settings.rotation_budget - self._rotation,
+            self._plane.from_rig,
         )
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy import integrate
 from scipy.linalg import expm
+from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from needle_common.errors import OutOfBoundsError
@@ -26,6 +28,7 @@ from needle_controller.bank.hypothesis_mixture import (
 from needle_controller.laws.point_law import PointLaw
 from needle_controller.laws.point_turns import (
     PointLawSettings,
+    affordable_reserve,
     rest_after,
     way_as_bent,
     write_need,
@@ -134,11 +137,11 @@ def test_turns_the_shorter_way_to_where_the_needle_bends_to_the_point(around: fl
     assert abs(float(command.rotation_rate) * STEP) <= np.pi + 1e-9
 
 
-def steered(pose: Array, target: npt.ArrayLike) -> tuple[float, float]:
+def steered(pose: Array, target: npt.ArrayLike, budget: float = math.inf) -> tuple[float, float]:
     """Steer an exact needle whose pose is known; return its miss [m] and rotation [rad]."""
     point_law, rotation = law(), 0.0
     for _ in range(200):
-        command = point_law(estimate(pose), target)
+        command = point_law(estimate(pose), target, budget - rotation)
         assert command.insertion_left is not None
         length = min(float(command.insertion_left), STEP)
         if length <= 1e-6:
@@ -159,6 +162,26 @@ def test_an_exact_needle_comes_to_the_point_with_few_turns(
     miss, rotation = steered(entry(roll_deg), np.array(target_mm) * 1e-3)
     assert miss < 0.0002
     assert rotation < np.deg2rad(800.0)
+
+
+@pytest.mark.parametrize("budget_deg", [0.0, 100.0, 360.0, 450.0])
+def test_a_budget_is_kept_and_two_half_turns_lead_to_the_point(budget_deg: float) -> None:
+    target = [0.01, -0.003, 0.09]
+    miss, rotation = steered(entry(), target, np.deg2rad(budget_deg))
+    assert rotation <= np.deg2rad(budget_deg) + 1e-9
+    assert (miss < 0.0002) == (budget_deg >= 360.0)
+
+
+@pytest.mark.parametrize("half_turns", [1, 2, 5])
+def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn(half_turns: int) -> None:
+    last_turn, left = 0.008, 0.1
+    for turns_left in range(half_turns, 0, -1):
+        kept = affordable_reserve(left, turns_left * np.pi, last_turn)
+        # Bends from 1 - kept of the curvature on one side to as much on the other.
+        left = brentq(lambda end, at=left: end**2 * (2.0 - kept) - kept * at**2, 0.0, left)
+    assert left == pytest.approx(last_turn)
+    assert affordable_reserve(0.1, 0.0, last_turn) == 0.0
+    assert affordable_reserve(0.1, math.inf, last_turn) == 1.0
 
 
 def test_a_needle_that_bends_to_the_point_is_left_alone() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -33,12 +34,13 @@ def steer(
     target_at: Callable[[int], Array] | None = None,
     seen_at: Callable[[float], Array] | None = None,
     clocks_apart: float | None = 0.0,
+    turns: list[float] | None = None,
 ) -> tuple[Array, list[bool], float]:
     """Steer an exact needle to the end.
 
     Returns its tip in `rig`, what it said of its reach, and the time [s]. `target_at` places the
     target before each step, `seen_at` tells where it was at a time, which is stamped by a clock so
-    far apart from the tips', or not at all.
+    far apart from the tips', or not at all. What the base turns at each step is added to `turns`.
     """
     plant = NeedlePlant(initial_pose(np.deg2rad(3.0), np.deg2rad(20.0)), curvature=1 / 0.122)
     control = PlaneControl(settings, offset_plane(offset))
@@ -60,6 +62,8 @@ def steer(
         if step is None:
             return np.array(plant.T_rig_tip[:3, 3]), reachable, time
         length = step.insertion - joints.insertion
+        if turns is not None:
+            turns.append(abs(step.rotation - joints.rotation))
         plant.advance(length, step.rotation - joints.rotation)
         took_ns = round(STEP_NS * length / settings.step_length)
         joints = JointSample(joints.stamp_ns + took_ns, step.insertion, step.rotation)
@@ -86,6 +90,17 @@ def test_a_point_that_moves_on_the_way_is_followed() -> None:
     moved = np.array([0.002, 0.001, 0.0])
     tip, _, _ = steer(SETTINGS, target_at=lambda k: np.array(TARGET) + moved * min(k / 40.0, 1.0))
     assert np.linalg.norm(tip - TARGET - moved) < 0.0006
+
+
+def test_the_base_turns_no_more_than_its_budget() -> None:
+    settings = dataclasses.replace(SETTINGS, rotation_budget=math.radians(600.0))
+    turns: list[float] = []
+    tip, _, _ = steer(settings, turns=turns)
+    assert np.linalg.norm(tip - TARGET) < 0.001
+    assert sum(turns) <= settings.rotation_budget + 1e-9
+    free: list[float] = []
+    steer(SETTINGS, turns=free)
+    assert sum(free) > settings.rotation_budget
 
 
 def breathing(time: float) -> Array:

@@ -55,6 +55,7 @@ examples:
   ros2 run needle_sim monte_carlo --controller paper --kappa-scale 0.8 --csv runs.csv
   ros2 run needle_sim monte_carlo --noise-mm 0.58 --noise-shape normal
   ros2 run needle_sim monte_carlo --targets 2000 --csv points.csv
+  ros2 run needle_sim monte_carlo --targets 2000 --rotation-deg 800
   ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm 2 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --targets 2000 --controller sliding_mode
   ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
@@ -80,6 +81,7 @@ class MonteCarloOptions:
     sigma_scale: float
     flips: int
     targets: int
+    rotation_budget: float
     target_drift: float
     target_breath: float
     seed: int
@@ -131,6 +133,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         sigma_scale=number("--sigma-scale", given.sigma_scale, 0.01, 100.0, "-"),
         flips=whole_number("--flips", given.flips, 0, 100),
         targets=whole_number("--targets", given.targets, 0, 1_000_000),
+        rotation_budget=math.radians(number("--rotation-deg", given.rotation_deg, 0.0, 1e6, "deg")),
         target_drift=number("--target-drift-mm", given.target_drift_mm, 0.0, 100.0, "mm") * 1e-3,
         target_breath=number("--target-breath-mm", given.target_breath_mm, 0.0, 100.0, "mm") * 1e-3,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
@@ -195,6 +198,7 @@ def _parser() -> CommandParser:
             "steer N needles to points in place of the plane: each from a random start within the "
             "bounds to a random point of its own, 60 to 120 mm ahead",
         ),
+        ("--rotation-deg", "1e6", "B", "most that each base may turn on the way to its point"),
         (
             "--target-drift-mm",
             "0",
