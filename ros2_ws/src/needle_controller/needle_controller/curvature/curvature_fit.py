@@ -9,7 +9,8 @@ with the entry p0, the heading d there and the direction n the needle bends to. 
 is found by Gauss-Newton on p0, two angles of d and the two components of kappa n across d: in these
 the problem is almost linear, has no singular point at kappa = 0, and the unknown roll needs no
 guess. What is known of heading and entry are priors. Tips that the arc explains badly lose weight,
-so that a few outliers do no harm.
+so that a few outliers do no harm. A stage may move farther than the needle goes in: how far the
+needle goes in for each unit of the recorded insertion is one more unknown.
 
 Leading axes broadcast.
 """
@@ -47,7 +48,9 @@ _ARBITRARY_START = 1e-3
 # about halfway between the two.
 _MEDIAN_SQUARED = {3: 2.6, 2: 1.5}
 # Units in which the unknowns are of one size.
-_SCALE: Array = np.array([1.0, 1.0, 1.0, 20.0, 20.0, 1e3, 1e3])
+_SIZES: Array = np.array([1.0, 1.0, 1.0, 20.0, 20.0, 1e3, 1e3, 20.0])
+_GAIN = UNKNOWNS
+"""Number of the last unknown: the needle's insertion per stage's, less 1."""
 _HEADING_STD = math.radians(5.0)
 
 
@@ -71,6 +74,8 @@ class CurvatureFitSettings:
     outlier_limit : float
         A tip farther from the arc than this many standard deviations of a coordinate loses weight,
         with the 4th power of its distance; infinite for plain least squares.
+    slip_std : float
+        How well it is known that the needle goes in as far as the stage moves, as a share.
     repeating_error : float
         What all tips may be off together, bowed along the arc (a calibration's error), which the
         residuals cannot show [m]. Bowed by e over a length l, an arc has 8 e / l^2 more curvature.
@@ -82,6 +87,7 @@ class CurvatureFitSettings:
     entry_std: Annotated[float, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = 0.0005
     measurement_std: Annotated[float | None, Bounds(ABOVE_0, math.inf, "m", unlimited=True)] = None
     outlier_limit: Annotated[float, Bounds(ABOVE_0, math.inf, "-", unlimited=True)] = 4.0
+    slip_std: Annotated[float, Bounds(ABOVE_0, 1.0, "-")] = 0.1
     repeating_error: Annotated[float, Bounds(0.0, math.inf, "m")] = 0.0
 
     def __post_init__(self) -> None:
@@ -117,6 +123,9 @@ class CurvatureFit:
         The direction there.
     heading_std : ndarray, shape (...)
         Its standard deviation about the worst axis [rad].
+    slip, slip_std : ndarray, shape (...)
+        Share by which the stage moves farther than the needle goes in, and its standard deviation;
+        0 and `CurvatureFitSettings.slip_std` where the insertion is not known.
     """
 
     curvature: Array
@@ -128,6 +137,8 @@ class CurvatureFit:
     entry_std: Array
     heading: Array
     heading_std: Array
+    slip: Array
+    slip_std: Array
 
     @property
     def radius(self) -> Array:
@@ -160,8 +171,8 @@ def fit_curvature(
     tips : array_like, shape (..., K, 3)
         Measured tips [m].
     insertion : array_like, shape (K,) or (..., K), or None
-        Length inserted since the entry at each of them [m]. None where it is not known: then each
-        tip belongs to the nearest point of the arc, and only its distance across counts.
+        How far the stage has moved since the entry at each of them [m]. None where it is not known:
+        then each tip belongs to the nearest point of the arc, and only its distance across counts.
     settings : CurvatureFitSettings, optional
         What is known beside them.
 
@@ -178,9 +189,10 @@ def fit_curvature(
     settings = CurvatureFitSettings() if settings is None else settings
     tips = checked_tips(tips)
     axes = frame(np.asarray(settings.heading, dtype=float))
-    precision = np.zeros(UNKNOWNS)
+    precision = np.zeros(UNKNOWNS + 1)
     precision[ENTRY] = settings.entry_std**-2.0
     precision[HEADING] = settings.heading_std**-2.0
+    precision[_GAIN] = settings.slip_std**-2.0
     # In the frame of the known heading, about the known entry.
     measured = (tips - np.asarray(settings.entry, dtype=float)) @ axes
     known = insertion is not None
@@ -191,11 +203,13 @@ def fit_curvature(
     else:
         length = np.broadcast_to(np.asarray(insertion, dtype=float), tips.shape[:-1])
     _check_length(length)
-    unknowns = np.zeros((*tips.shape[:-2], UNKNOWNS))
+    unknowns = np.zeros((*tips.shape[:-2], UNKNOWNS + 1))
     weights = np.ones(tips.shape[:-1])
     sigma = np.full(tips.shape[:-2], settings.measurement_std or 1e-3)
     for iteration in range(_ITERATIONS):
-        expected, slopes, tangent = arc_points(unknowns, length)
+        inserted = length * (1.0 + unknowns[..., _GAIN:])
+        expected, slopes, tangent = arc_points(unknowns[..., :_GAIN], inserted)
+        slopes = np.concatenate([slopes, (tangent * length[..., None])[..., None]], axis=-1)
         residual = measured - expected
         along = np.sum(residual * tangent, axis=-1, keepdims=True)
         if not known:
@@ -212,8 +226,8 @@ def fit_curvature(
         normal = np.einsum("...kij,...kil->...jl", scaled, slopes)
         gradient = np.einsum("...kij,...ki->...j", scaled, residual)
         weighed = precision * sigma[..., None] ** 2
-        normal = normal + np.eye(UNKNOWNS) * weighed[..., None, :]
-        inverse = np.linalg.inv(normal * _SCALE[:, None] * _SCALE) * _SCALE[:, None] * _SCALE
+        normal = normal + np.eye(UNKNOWNS + 1) * weighed[..., None, :]
+        inverse = np.linalg.inv(normal * _SIZES[:, None] * _SIZES) * _SIZES[:, None] * _SIZES
         change = np.einsum("...ij,...j->...i", inverse, gradient - weighed * unknowns)
         unknowns = unknowns + change
         if iteration > _ROBUST_ITERATIONS and np.all(np.abs(change[..., BEND]) < 1e-9):
@@ -233,6 +247,8 @@ def fit_curvature(
         entry_std=np.sqrt(np.max(variances[..., ENTRY], axis=-1)),
         heading=headings(unknowns[..., HEADING])[..., :, 2] @ axes.T,
         heading_std=np.sqrt(np.max(variances[..., HEADING], axis=-1)),
+        slip=1.0 / (1.0 + unknowns[..., _GAIN]) - 1.0,
+        slip_std=np.sqrt(variances[..., _GAIN]) / (1.0 + unknowns[..., _GAIN]) ** 2,
     )
 
 

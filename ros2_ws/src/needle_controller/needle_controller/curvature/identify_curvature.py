@@ -42,8 +42,9 @@ what to measure:
 
 input:
   a bag: the directory of a rosbag2 bag with needle/tip and joint_states
-  a CSV: columns x_m, y_m, z_m; with insertion_m the lengths are used, without it each tip is taken
-  to the nearest point of the arc. `ros2 run needle_tracker track_images` writes such a file: rows
+  a CSV: columns x_m, y_m, z_m; with insertion_m the lengths are used, but for how far the needle
+  goes in for each mm of the stage, which the tips tell; without it each tip is taken to the nearest
+  point of the arc. `ros2 run needle_tracker track_images` writes such a file: rows
   with valid 0 are left out, --insertion takes the same CSV (name,insertion_m) as there.
   A column rotation_rad, if there is one, is checked like a bag's rotation joint. Without it tips
   are refused that leave their arc in order, one after the other, by more than 0.05 mm (or 2.5 times
@@ -171,6 +172,8 @@ def summary(record: InsertionRecord, checked: CheckedFit) -> dict[str, JsonValue
         "tips": len(record.tips),
         "outliers": int(np.sum(fit.weights < _OUTLIER_WEIGHT)),
         "measurement_std_mm": 1e3 * float(fit.measurement_std),
+        "slip": float(fit.slip) if record.insertion is not None else None,
+        "slip_std": float(fit.slip_std) if record.insertion is not None else None,
         "insertion_known": record.insertion is not None,
         "rotation_known": record.rotation is not None,
         "warnings": "; ".join(checked.warnings),
@@ -208,6 +211,9 @@ def _run(arguments: Sequence[str]) -> int:
         f"{values['tips']} tips over {float(values['arc_mm'] or 0.0):.1f} mm, "
         f"{values['outliers']} of them outliers, noise {1e3 * float(fit.measurement_std):.3f} mm"
     )
+    if record.insertion is not None:
+        slip, std = 100.0 * float(fit.slip), 100.0 * float(fit.slip_std)
+        print(f"the stage moved {slip:.1f} % farther than the needle went in, +- {std:.1f} %")
     if not math.isfinite(high):
         print("the tips cannot tell this path from a straight line: insert deeper")
         return EXIT_MISSED

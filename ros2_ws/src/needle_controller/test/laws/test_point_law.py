@@ -172,13 +172,22 @@ def test_a_budget_is_kept_and_two_half_turns_lead_to_the_point(budget_deg: float
     assert (miss < 0.0002) == (budget_deg >= 360.0)
 
 
+def next_turn(left: float, kept: float) -> float:
+    """Return what is left after bending from 1 - kept of the curvature to as much across [m]."""
+    need = (1.0 - kept) * left**2
+
+    def beyond(end: float) -> float:
+        return need - (left**2 - end**2) + (1.0 - kept) * end**2
+
+    return float(brentq(beyond, 0.0, left))
+
+
 @pytest.mark.parametrize("half_turns", [1, 2, 5])
 def test_what_is_kept_back_takes_all_half_turns_to_the_last_turn(half_turns: int) -> None:
     last_turn, left = 0.008, 0.1
     for turns_left in range(half_turns, 0, -1):
         kept = affordable_reserve(left, turns_left * np.pi, last_turn)
-        # Bends from 1 - kept of the curvature on one side to as much on the other.
-        left = brentq(lambda end, at=left: end**2 * (2.0 - kept) - kept * at**2, 0.0, left)
+        left = next_turn(left, kept)
     assert left == pytest.approx(last_turn)
     assert affordable_reserve(0.1, 0.0, last_turn) == 0.0
     assert affordable_reserve(0.1, math.inf, last_turn) == 1.0
