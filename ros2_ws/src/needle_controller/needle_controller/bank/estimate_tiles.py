@@ -103,12 +103,24 @@ def tidied(tiles: Tiles) -> Tiles:
     count = _pick(tiles, picked, counts)
     if count == tiles.first[-1]:
         return tiles
-    filled = -(-count // LANES) * LANES
-    picked[count:filled] = picked[count - 1]
-    state = np.empty((filled // LANES, ROWS, LANES))
-    _gather(tiles.state, picked[:filled], state)
-    state[-1, WEIGHT, LANES - (filled - count) :] = 0.0
-    return Tiles(state, np.concatenate([[0], np.cumsum(counts)]), tiles.owner[picked[:filled]])
+    return _picked(tiles, picked[:count], counts)
+
+
+def repeated(tiles: Tiles, needles: int) -> Tiles:
+    """Return the estimates of the only needle as those of so many."""
+    count = int(tiles.first[-1])
+    return _picked(tiles, np.tile(np.arange(count), needles), np.full(needles, count))
+
+
+def _picked(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> Tiles:
+    """Return some estimates, (M,), as those of needles that have so many each, (N,)."""
+    filling = -len(picked) % LANES
+    owner = np.repeat(np.arange(len(counts)), counts)
+    picked, owner = (np.concatenate([of, np.repeat(of[-1:], filling)]) for of in (picked, owner))
+    state = np.empty((len(picked) // LANES, ROWS, LANES))
+    _gather(tiles.state, picked, state)
+    state[-1, WEIGHT, LANES - filling :] = 0.0
+    return Tiles(state, np.concatenate([[0], np.cumsum(counts)]), owner)
 
 
 def covariances(tiles: Tiles) -> Array:

@@ -22,6 +22,8 @@ from needle_controller.bank.estimate_tiles import (
     WEIGHT,
     R,
     X,
+    repeated,
+    set_rows,
     tiles_of,
 )
 from needle_controller.bank.filter_settings import FilterSettings
@@ -53,38 +55,40 @@ def start_bank(settings: FilterSettings, tip: Array, rotation: Array) -> Bank:
     ]
     # One that has ended, for a jump.
     every.append(every[0])
-    needles, count = len(tip), len(every)
-    found = np.all(np.isfinite(tip), axis=-1)
-    numbers = np.zeros((needles, count, ROWS))
-    numbers[..., X : X + 3] = np.where(found[:, None], tip, 0.0)[:, None]
-    rolls = np.array([[0.0, 0.0, roll.roll] for _, _, roll, _ in every])
-    turned = rotation[:, None] @ rotation_from_angles(rolls)
-    numbers[..., R : R + 9] = turned.reshape(needles, count, 9)
+    numbers = np.zeros((len(every), ROWS))
     weights = np.array([t.weight * roll.weight * noise.weight for _, t, roll, noise in every])
-    numbers[..., :-1, WEIGHT] = weights[:-1] / np.max(weights[:-1])
-    numbers[..., KIND] = [kind for kind, _, _, _ in every]
-    numbers[..., IS_UNIFORM] = [noise.is_uniform for _, _, _, noise in every]
+    numbers[:-1, WEIGHT] = weights[:-1] / np.max(weights[:-1])
+    numbers[:, KIND] = [kind for kind, _, _, _ in every]
+    numbers[:, IS_UNIFORM] = [noise.is_uniform for _, _, _, noise in every]
     for m in range(NOISES):
-        numbers[..., NOISE + m] = [sum(noise.shares[m : m + 1]) for _, _, _, noise in every]
-    numbers[..., KAPPA], numbers[..., SCALE] = settings.curvature, 1.0
-    numbers[..., PLAY] = [torsion.play for _, torsion, _, _ in every]
-    numbers[..., LAG] = [torsion.lag_length for _, torsion, _, _ in every]
-    for axis in range(3):
-        position = np.where(found, settings.believed_bound**2 / 3.0, UNKNOWN_POSITION_STD**2)
-        numbers[..., PLACE[axis, axis]] = position[:, None]
+        numbers[:, NOISE + m] = [sum(noise.shares[m : m + 1]) for _, _, _, noise in every]
+    numbers[:, KAPPA], numbers[:, SCALE] = settings.curvature, 1.0
+    numbers[:, PLAY] = [torsion.play for _, torsion, _, _ in every]
+    numbers[:, LAG] = [torsion.lag_length for _, torsion, _, _ in every]
+    curvature_std = settings.curvature_spread * settings.curvature
+    numbers[:, PLACE[E_KAPPA, E_KAPPA]] = curvature_std**2
+    numbers[:, PLACE[E_SIZE, E_SIZE]] = [torsion.size_std**2 for _, torsion, _, _ in every]
+    numbers[:, PLACE[E_SCALE, E_SCALE]] = settings.scale_spread**2
+    # What each needle has of its own.
+    needles = len(tip)
+    tiles = repeated(tiles_of(numbers, np.array([len(every)])), needles)
+    n, k = np.divmod(np.arange(tiles.first[-1]), len(every))
+    found = np.all(np.isfinite(tip), axis=-1)
+    set_rows(tiles, X, np.where(found[:, None], tip, 0.0)[n])
+    rolls = rotation_from_angles([[0.0, 0.0, roll.roll] for _, _, roll, _ in every])
+    set_rows(tiles, R, (rotation[:, None] @ rolls).reshape(-1, 9))
+    position = np.where(found, settings.believed_bound**2 / 3.0, UNKNOWN_POSITION_STD**2)
     # About the heading as uncertain as the roll, else as pitch and yaw.
     angle = settings.initial_angle_std**2
     more = np.array([roll.std**2 - angle for _, _, roll, _ in every])
     for a in range(3):
+        set_rows(tiles, PLACE[a, a], position[n, None])
         for b in range(a + 1):
-            along_heading = more * (rotation[:, a, 2] * rotation[:, b, 2])[:, None]
-            numbers[..., PLACE[E_TURN + a, E_TURN + b]] = along_heading + (angle if a == b else 0.0)
-    curvature_std = settings.curvature_spread * settings.curvature
-    numbers[..., PLACE[E_KAPPA, E_KAPPA]] = curvature_std**2
-    numbers[..., PLACE[E_SIZE, E_SIZE]] = [torsion.size_std**2 for _, torsion, _, _ in every]
-    numbers[..., PLACE[E_SCALE, E_SCALE]] = settings.scale_spread**2
+            along_heading = more[k] * (rotation[:, a, 2] * rotation[:, b, 2])[n]
+            turn = along_heading + (angle if a == b else 0.0)
+            set_rows(tiles, PLACE[E_TURN + a, E_TURN + b], turn[:, None])
     return Bank(
-        tiles_of(numbers.reshape(-1, ROWS), np.full(needles, count)),
+        tiles,
         base=np.zeros(needles),
         refused=np.zeros(needles),
         unexplained=np.zeros(needles),
