@@ -1,4 +1,4 @@
-"""The tracker on path-traced pairs: steel under lamps, over floors that trouble it."""
+"""The tracker on path-traced pairs: steel under lamps, over floors and before troublesome things."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import yaml
 
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.image.detection import Image
-from needle_tracker.optics.calibration import Camera, StereoCalibration
+from needle_tracker.optics.calibration import Camera, StereoCalibration, load_calibration
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -40,11 +40,13 @@ def read(folder: Path, name: str) -> tuple[Image, Image]:
 
 
 def tracked(
-    calibration: StereoCalibration, name: str, *, empty: bool
+    calibration: StereoCalibration, name: str, *, empty: bool, insertion: bool = True
 ) -> list[tuple[SpatialTip | None, np.ndarray]]:
-    """Return what is said of each pair of a scene, and the truth."""
+    """Return what is said of each pair of a scene, and the truth; a box has its own cameras."""
     folder = SCENES / name
     scene: dict[str, Any] = yaml.safe_load((folder / "scene.yaml").read_text(encoding="utf-8"))
+    if (folder / "calibration.yaml").is_file():
+        calibration = load_calibration(folder / "calibration.yaml")
     left, right = (cut(getattr(calibration, side), scene["crop"][side]) for side in SIDES)
     cut_out = StereoCalibration(left, right)
     settings = dataclasses.replace(
@@ -54,7 +56,12 @@ def tracked(
     )
     tracker = TipTracker(cut_out, settings)
     return [
-        (tracker.process(*read(folder, pair["name"]), pair["insertion"]).tip, np.array(pair["tip"]))
+        (
+            tracker.process(
+                *read(folder, pair["name"]), pair["insertion"] if insertion else None
+            ).tip,
+            np.array(pair.get("tip", [])),
+        )
         for pair in scene["pairs"]
     ]
 
@@ -83,3 +90,29 @@ def test_over_graph_paper_the_empty_phantom_is_what_helps(calibration: StereoCal
         tip is not None for tip, _ in tracked(calibration, "steel_on_graph_paper", empty=False)
     ]
     assert sum(found) < len(found) - 1
+
+
+TOLD = [
+    {"empty": True, "insertion": True},
+    {"empty": False, "insertion": True},
+    {"empty": False, "insertion": False},
+]
+
+
+@pytest.mark.parametrize("told", TOLD)
+@pytest.mark.parametrize("name", ["box_steel", "box_clutter"])
+def test_a_needle_in_a_box_before_clutter_is_found_through_its_walls(
+    calibration: StereoCalibration, name: str, told: dict[str, bool]
+) -> None:
+    for tip, truth in tracked(calibration, name, **told)[2:]:
+        assert tip is not None
+        off = tip.position - truth
+        assert np.linalg.norm(off) < 0.5e-3
+        assert off @ np.linalg.solve(tip.covariance, off) < _CHI_SQUARED_999
+
+
+@pytest.mark.parametrize("told", TOLD)
+def test_old_tracks_and_rails_behind_a_box_are_no_needle(
+    calibration: StereoCalibration, told: dict[str, bool]
+) -> None:
+    assert not any(tip for tip, _ in tracked(calibration, "box_empty", **told))

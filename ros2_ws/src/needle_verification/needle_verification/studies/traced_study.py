@@ -4,27 +4,20 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_sim.camera.stereo_rig import load_stereo_rig
-from needle_sim.path_traced.appearance import Appearance, draw_appearance
-from needle_sim.path_traced.insertion import TracedPair, trace_insertion
-from needle_sim.path_traced.tracer import load_mitsuba
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.triangulation import SpatialTip
+from needle_verification.studies.traced_set import DrawnSequence, TracedScene
 
-PAIRS, SETTLED = 6, 3
-"""Pairs of a sequence, and those of its begin that do not count: a tracker without the insertion
-wants to see a needle three times."""
-_STEP = 1e-3
-_BEGIN = (0.02, 0.085)  # insertion of the first pair [m]
-_STREAM = 23
+SETTLED = 3
+"""Pairs of a sequence's begin that do not count: a tracker without the insertion wants to see a
+needle three times."""
 
 
 class Told(enum.Enum):
@@ -41,8 +34,8 @@ class TracedAnswer:
 
     Attributes
     ----------
-    scene : Appearance
-        How it looked.
+    scene : TracedScene
+        What it showed.
     told : Told
         What the tracker was told.
     tip : SpatialTip or None
@@ -51,7 +44,7 @@ class TracedAnswer:
         The end of the shaft's axis in `rig` [m]; None where there is no needle.
     """
 
-    scene: Appearance
+    scene: TracedScene
     told: Told
     tip: SpatialTip | None
     truth: NDArray[np.float64] | None
@@ -74,52 +67,29 @@ class TracedAnswer:
         return np.asarray(self.tip.position - self.truth)
 
 
-def traced_looks(
-    calibration: Path, appearance: str, seeds: Sequence[int]
-) -> Iterator[TracedAnswer]:
-    """Trace a sequence for each seed; yield what is said of its pairs, whatever is told.
+def traced_looks(sequence: DrawnSequence) -> Iterator[TracedAnswer]:
+    """Yield what is said of a sequence's pairs, whatever is told.
 
-    Of a needle the first `SETTLED` pairs are shown and not yielded.
+    Of a needle the first `SETTLED` pairs are shown and not yielded, nor are pairs that have not all
+    of its last 10 mm in both images.
 
     Parameters
     ----------
-    calibration : Path
-        The rig's.
-    appearance : str
-        As `draw_appearance` takes it.
-    seeds : sequence of int
-        Each keys a scene, its path and its noise.
-
-    Raises
-    ------
-    UserError
-        If the path tracer is not installed.
+    sequence : DrawnSequence
+        The pairs.
     """
-    mitsuba, rig = load_mitsuba(), load_stereo_rig(calibration)
-    for seed in seeds:
-        scene = draw_appearance(appearance, seed)
-        begin = float(np.random.default_rng([seed, _STREAM]).uniform(*_BEGIN))
-        depth = begin + (PAIRS - 1) * _STEP
-        traced = trace_insertion(mitsuba, rig, scene, frames=PAIRS, depth=depth, begin=begin)
-        nothing = dataclasses.replace(scene, needle=False)
-        empty = trace_insertion(mitsuba, rig, nothing, frames=1, depth=depth, begin=begin)
-        yield from _tracked(calibration, scene, next(empty).images, list(traced))
-
-
-def _tracked(
-    calibration: Path,
-    scene: Appearance,
-    empty: tuple[NDArray[np.uint8], NDArray[np.uint8]],
-    pairs: Iterable[TracedPair],
-) -> Iterator[TracedAnswer]:
-    stereo = load_calibration(calibration)
-    settings = dataclasses.replace(default_settings(stereo), needle_width=scene.diameter)
+    stereo = load_calibration(sequence.calibration)
+    settings = dataclasses.replace(
+        default_settings(stereo), needle_width=sequence.scene.look.diameter
+    )
     for told in Told:
-        reference = empty if told is Told.EMPTY_PHANTOM else None
+        left, right = sequence.empty
+        reference = (left, right) if told is Told.EMPTY_PHANTOM else None
         tracker = TipTracker(stereo, dataclasses.replace(settings, reference=reference))
-        for pair in pairs:
-            insertion = None if told is Told.NOTHING else pair.insertion
-            tip = tracker.process(*pair.images, insertion).tip
-            truth = None if pair.truth is None else pair.truth.tip
-            if truth is None or pair.number >= SETTLED:
-                yield TracedAnswer(scene, told, tip, truth)
+        for number, (left, right) in enumerate(sequence.pairs):
+            insertion = None if told is Told.NOTHING else float(sequence.insertions[number])
+            tip, truth = tracker.process(left, right, insertion).tip, sequence.tips[number]
+            if not sequence.scene.look.needle:
+                yield TracedAnswer(sequence.scene, told, tip, None)
+            elif number >= SETTLED and sequence.seen[number].min() >= 1.0:
+                yield TracedAnswer(sequence.scene, told, tip, truth)
