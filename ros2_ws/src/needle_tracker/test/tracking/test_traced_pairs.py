@@ -1,4 +1,4 @@
-"""The tracker on path-traced pairs: steel under lamps, over floors and before troublesome things."""
+"""The tracker on path-traced pairs: steel under lamps, over floors and before clutter."""
 
 from __future__ import annotations
 

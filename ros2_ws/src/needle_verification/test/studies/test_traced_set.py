@@ -27,7 +27,7 @@ def test_what_is_there_is_read_and_looked_at(
 ) -> None:
     scene = next(scene for scene in scenes(LOOKED_AT) if scene.rig == "webcams")
     black = np.zeros((2, 480, 640), np.uint8)
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         "empty": black,
         "pairs": np.stack([black] * PAIRS),
         "insertions": np.linspace(0.03, 0.035, PAIRS),
