@@ -223,20 +223,6 @@ class Workbench:
         return self._runs[name]
 
 
-def checkout() -> Path:
-    """Return the folder of the checkout that this runs from.
-
-    Raises
-    ------
-    UserError
-        If it runs from elsewhere.
-    """
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "scripts" / "simulate").is_file():
-            return folder
-    raise UserError("verify runs from a checkout only: there is no scripts/simulate beside it")
-
-
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:
     """Return the messages of some topics, as they were sent, byte for byte.
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
-from needle_verification.checking import Check, Finding, Workbench, checkout
+from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.checks import (
     check_bags,
     check_control,
