@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 
 from needle_sim.bus.can_frame import CanFrame
-from needle_sim.bus.object_dictionary import Access, Kind, ObjectDictionary
+from needle_sim.bus.object_dictionary import Kind, ObjectDictionary
 from needle_sim.bus.process_data import INVALID, ReceivePdo, TransmitPdo
 from needle_sim.bus.sdo_server import SdoServer
 
@@ -171,7 +171,7 @@ class CanopenDevice:
 
     def _add_communication_objects(self) -> None:
         add = self.dictionary.add
-        writable = partial(add, access=Access.READ_WRITE)
+        writable = partial(add, writable=True)
         add(0x1001, 0, Kind.U8, mappable=True)
         writable(0x1003, 0, Kind.U8)
         for k in range(1, _ERRORS_KEPT + 1):

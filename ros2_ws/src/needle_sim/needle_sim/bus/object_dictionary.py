@@ -61,13 +61,6 @@ class Kind(enum.Enum):
         return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
 
 
-class Access(enum.Enum):
-    """Rights of an SDO client."""
-
-    READ = "ro"
-    READ_WRITE = "rw"
-
-
 @dataclasses.dataclass
 class StoredObject:
     """One value.
@@ -78,8 +71,8 @@ class StoredObject:
         Its type; None for a text.
     value : int
         The number; 0 for a text.
-    access : Access
-        What a client may do.
+    writable : bool
+        Whether a client may write it.
     mappable : bool
         Whether a PDO may carry it.
     text : bytes
@@ -90,7 +83,7 @@ class StoredObject:
 
     kind: Kind | None
     value: int
-    access: Access = Access.READ
+    writable: bool = False
     mappable: bool = False
     text: bytes = b""
     default: int = dataclasses.field(init=False)
@@ -116,12 +109,12 @@ class ObjectDictionary:
         kind: Kind | None,
         value: int = 0,
         *,
-        access: Access = Access.READ,
+        writable: bool = False,
         mappable: bool = False,
         text: bytes = b"",
     ) -> None:
         """Add an entry; the arguments are those of `StoredObject`."""
-        self._entries[index, subindex] = StoredObject(kind, value, access, mappable, text)
+        self._entries[index, subindex] = StoredObject(kind, value, writable, mappable, text)
         self._indices.add(index)
 
     def on_write(
@@ -194,7 +187,7 @@ class ObjectDictionary:
             If the device refuses it; the value stays as it was.
         """
         entry = self.entry(index, subindex)
-        if entry.access is Access.READ or entry.kind is None:
+        if not entry.writable or entry.kind is None:
             raise SdoAbortError(Abort.READ_ONLY)
         if len(data) != entry.kind.size:
             raise SdoAbortError(Abort.WRONG_LENGTH)

@@ -7,7 +7,6 @@ from functools import partial
 
 from needle_sim.bus.object_dictionary import (
     Abort,
-    Access,
     Kind,
     ObjectDictionary,
     SdoAbortError,
@@ -47,7 +46,7 @@ class _Pdo:
         self._parameters = parameters = self._first_parameters + number
         self._mapping = mapping = self._first_mapping + number
         add = dictionary.add
-        writable = partial(add, access=Access.READ_WRITE)
+        writable = partial(add, writable=True)
         add(parameters, 0, Kind.U8, max((2, *self._more_parameters)))
         writable(parameters, 1, Kind.U32, cob_id)
         writable(parameters, 2, Kind.U8, 255)

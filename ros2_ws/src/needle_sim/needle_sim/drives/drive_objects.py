@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from needle_sim.bus.object_dictionary import Access, Kind, ObjectDictionary
+from needle_sim.bus.object_dictionary import Kind, ObjectDictionary
 
 PROFILE_POSITION = 1
 HOMING = 6
@@ -51,9 +51,9 @@ def drive_dictionary(
         add(0x1018, k, Kind.U8 if k == 0 else Kind.U32, value)
 
     slow = max(round(1e-3 * counts_per_unit), 1)
-    read_write = partial(add, access=Access.READ_WRITE)
+    read_write = partial(add, writable=True)
     in_pdo = partial(add, mappable=True)
-    both = partial(add, access=Access.READ_WRITE, mappable=True)
+    both = partial(add, writable=True, mappable=True)
     in_pdo(ERROR_CODE, 0, Kind.U16)
     read_write(0x6007, 0, Kind.I16, 1)
     both(CONTROLWORD, 0, Kind.U16)

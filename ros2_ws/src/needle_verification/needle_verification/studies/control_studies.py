@@ -7,7 +7,7 @@ import json
 import math
 import os
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from needle_common.errors import UserError
@@ -232,7 +232,8 @@ def judge(study: Study, figures: Figures, draws: int) -> Iterator[Finding]:
     bound by three standard deviations of what that many runs would show.
     """
     runs = RUNS_A_DRAW * draws
-    for key, bound, is_least in _bounds(study):
+    bounds = [(*bound, True) for bound in study.at_least.items()]
+    for key, bound, is_least in (*bounds, *((*bound, False) for bound in study.at_most.items())):
         value = figures[key]
         slack = 3.0 * math.sqrt(bound * (1.0 - bound) / runs) if is_least and draws < 10 else 0.0
         passed = value is not None and (value >= bound - slack if is_least else value <= bound)
@@ -243,10 +244,3 @@ def judge(study: Study, figures: Figures, draws: int) -> Iterator[Finding]:
             "nothing" if value is None else f"{value:.4g} of {runs} runs",
             passed,
         )
-
-
-def _bounds(study: Study) -> Sequence[tuple[str, float, bool]]:
-    return [
-        *((key, bound, True) for key, bound in study.at_least.items()),
-        *((key, bound, False) for key, bound in study.at_most.items()),
-    ]

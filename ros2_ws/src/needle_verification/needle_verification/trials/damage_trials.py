@@ -205,10 +205,7 @@ def _read(bag: Path) -> Counter[Key] | None:
 
 
 def _by_topic(keys: Counter[Key]) -> Counter[str]:
-    found: Counter[str] = Counter()
-    for (topic, _, _), count in keys.items():
-        found[topic] += count
-    return found
+    return Counter(topic for topic, _, _ in keys.elements())
 
 
 def _contents(bag: Path) -> Counter[bytes]:
