@@ -292,7 +292,7 @@ def affordable_reserve(left: float, rotation_left: float, last_turn: float) -> f
     if half_turns <= 0.0 or left <= last_turn:
         return 0.0
     square = (last_turn / left) ** (2.0 / half_turns)
-    return 2.0 * square / (1.0 + square)
+    return float(2.0 * square / (1.0 + square))
 
 
 @compiled

@@ -109,21 +109,17 @@ class PointSteering:
 
 def point_law(settings: SteeringSettings) -> PointLaw:
     """Return the law for points; `SteeringSettings.check_steers_to_points` says who can."""
-    return PointLaw(_limited(settings))
+    return PointLaw(PointLawSettings(**settings.turning))
 
 
 def prompt_point_law(settings: SteeringSettings) -> PointLaw:
     """Return the law for points that turns the bevel at once: as paths are planned."""
     return PointLaw(
-        _limited(settings)._replace(
-            reserve=1.0, last_turn=0.0, last_turns_from=settings.step_length, dead_band=0.05
+        PointLawSettings(
+            **settings.turning,
+            reserve=1.0,
+            last_turn=0.0,
+            last_turns_from=settings.step_length,
+            dead_band=0.05,
         )
-    )
-
-
-def _limited(settings: SteeringSettings) -> PointLawSettings:
-    return PointLawSettings(
-        step_length=settings.step_length,
-        max_rotation_per_length=settings.max_rotation_per_length,
-        max_winding=settings.max_winding,
     )

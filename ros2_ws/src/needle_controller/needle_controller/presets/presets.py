@@ -10,10 +10,11 @@ from needle_controller.bank.hypothesis_filter import HypothesisFilter
 from needle_controller.bank.late_tips import LateTips
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.laws.law import Law, LinearizingLaw, OpenLoopLaw, StepLaw
+from needle_controller.laws.roll_law import RollLaw
+from needle_controller.laws.roll_turns import RollLawSettings
 from needle_controller.model.gains import Gains
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, LuenbergerSettings
-from needle_controller.presets.roll_steering import roll_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 
@@ -46,6 +47,14 @@ def observer_settings(settings: SteeringSettings, gains: Gains) -> LuenbergerSet
     )
 
 
+def roll_law(settings: SteeringSettings) -> StepLaw:
+    """Return the law of preset `best`; without flips it bends to whatever side is nearer."""
+    law, plan = RollLaw(RollLawSettings(**settings.turning)), FlipPlan(settings.flip_depths)
+    if not plan.depths:
+        return lambda estimate, _: law(estimate)
+    return lambda estimate, insertion: law(estimate, plan.bend_sign(insertion))
+
+
 def make_controller(
     settings: SteeringSettings,
     initial_rotation: npt.ArrayLike,
@@ -62,7 +71,6 @@ def make_controller(
     entry : array_like, shape (3,), optional
         Where it enters, in `target_plane` [m]; not known if none is given.
     """
-    plan = FlipPlan(settings.flip_depths)
     if settings.preset == "best":
         known = FilterSettings(
             curvature=settings.curvature,
@@ -71,7 +79,7 @@ def make_controller(
             initial_angle_std=settings.entry_angle_std,
         )
         estimator = LateTips(HypothesisFilter(known, initial_rotation), entry)
-        return estimator, roll_law(settings, plan)
+        return estimator, roll_law(settings)
     gains = settings.gains()
     paper_law = make_law(settings, gains)
     observer = LuenbergerObserver(observer_settings(settings, gains), initial_rotation)

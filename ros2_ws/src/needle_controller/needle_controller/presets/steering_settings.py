@@ -26,6 +26,7 @@ TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
 """Where a tip's covariance comes from."""
 PAPER_NOISE: dict[str, Any] = {
+    "tip_covariance": "configured",
     "tip_noise": "bounded",
     "tip_noise_bound": 0.001,
     "measurement_std": 0.001 / math.sqrt(3.0),
@@ -300,6 +301,12 @@ class SteeringSettings:
             measurement_std=self.measurement_std,
             step_length=self.step_length,
         )
+
+    @property
+    def turning(self) -> dict[str, float]:
+        """What every law that turns the bevel is told, by the names of its settings."""
+        names = ("step_length", "max_rotation_per_length", "max_winding")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def has_bounded_noise(self) -> bool:
