@@ -141,6 +141,13 @@ POINTS = (
         {"rms_point_mm": 0.20, "rotation_mean_deg": 1300.0},
     ),
     Study(
+        "points_budget",
+        "best",
+        ("--rotation-deg", "1300"),
+        {REACHED: 0.99},
+        {"rotation_p95_deg": 1300.0},
+    ),
+    Study(
         "points_seen_well",
         "best",
         ("--noise-mm", "0.05", "--claimed-mm", "0.05"),

@@ -142,7 +142,10 @@ def _to_points(
         starts,
         MovingTargets(places, options.target_drift, options.target_breath, options.seed),
         point_controller_factory(
-            options.controller, options.claimed_bound, sigma_scale=options.sigma_scale
+            options.controller,
+            options.claimed_bound,
+            sigma_scale=options.sigma_scale,
+            rotation_budget=options.rotation_budget,
         ),
         settings_of(options),
         on_progress=on_progress,

@@ -58,6 +58,7 @@ examples:
   ros2 run needle_sim monte_carlo --targets 2000 --rotation-deg 800
   ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm 2 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --targets 2000 --controller sliding_mode
+  ros2 run needle_sim monte_carlo --targets 2000 --controller rrt
   ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
@@ -149,8 +150,8 @@ def _parser() -> CommandParser:
         "--controller",
         default="best",
         metavar="NAME",
-        help="best, paper or open_loop; with --targets best or sliding_mode, a published law with "
-        "best's estimator (default: best)",
+        help="best, paper or open_loop; with --targets best, or the published sliding_mode or rrt "
+        "with best's estimator (default: best)",
     )
     add(
         "--grid",

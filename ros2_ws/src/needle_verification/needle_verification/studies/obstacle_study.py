@@ -16,7 +16,9 @@ import numpy as np
 
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, number, output_file, whole_number
+from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_plane import offset_plane
+from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
@@ -25,6 +27,7 @@ from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
 from needle_verification.studies.obstacle_scenes import ObstacleScene, clearance, make_scene
 from needle_verification.studies.path_judge import way_after
+from needle_verification.studies.study_controllers import NeedlesToPoints, rrt_law
 
 NEEDLE_RADIUS = 0.00035
 CURVATURE = SteeringSettings.curvature
@@ -32,6 +35,8 @@ SAMPLES = 4000
 """Points of the search that judges a scene."""
 DEPTH = 0.2
 _SUBSTEPS = 4
+Drive = Callable[[FloatArray, JointSample], SteeringCommand | None]
+"""Takes a tip and the joints at its exposure; None where there is no way on."""
 LABELS = {
     "scenes": "scenes",
     "solvable": "solvable with 90 % of the curvature, 0.75 mm clear",
@@ -99,6 +104,8 @@ def steer(
     settings: SteeringSettings,
     rng: np.random.Generator,
     times: list[float],
+    *,
+    rrt: bool = False,
 ) -> SceneOutcome:
     """Steer a needle through a scene as the node does; return how it ended.
 
@@ -112,13 +119,11 @@ def steer(
         Of the tips' noise.
     times : list of float
         What each update takes of the processor is added here [s].
+    rrt : bool
+        Whether the published planner leads it, which takes on whatever it is given.
     """
-    settings = dataclasses.replace(
-        settings, obstacles=tuple(float(value) for value in scene.obstacles.ravel())
-    )
-    control = PlaneControl(settings, offset_plane(0.0))
-    control.target_point = scene.target
-    if control.path_obstacle(0.0):
+    drive = _reference(scene, settings) if rrt else _best(scene, settings)
+    if drive is None:
         return judged
     plant = NeedlePlant(initial_pose(scene.pitch, scene.roll), curvature=CURVATURE)
     noise = settings.tip_noise_bound
@@ -126,13 +131,15 @@ def steer(
     for k in itertools.count(1):
         tip = _tip(plant) + rng.uniform(-noise, noise, 3)
         begin = time.thread_time()
-        update = control.update(tip, joints)
+        command = drive(tip, joints)
         times.append(time.thread_time() - begin)
-        step = next_step(k, joints, update.command, settings, slowly=False)
-        if update.blocked or step is None:
+        step = None
+        if command is not None:
+            step = next_step(k, joints, command, settings, slowly=False)
+        if step is None:
             miss = float(np.linalg.norm(_tip(plant) - scene.target))
             return dataclasses.replace(
-                judged, taken=True, stopped=update.blocked, miss=miss, least=least
+                judged, taken=True, stopped=command is None, miss=miss, least=least
             )
         length, turn = step.insertion - joints.insertion, step.rotation - joints.rotation
         for _ in range(_SUBSTEPS):
@@ -142,10 +149,49 @@ def steer(
     raise AssertionError
 
 
+def _best(scene: ObstacleScene, settings: SteeringSettings) -> Drive | None:
+    """Return what steers a needle as the node does, None where that refuses to start."""
+    obstacles = tuple(float(value) for value in scene.obstacles.ravel())
+    control = PlaneControl(dataclasses.replace(settings, obstacles=obstacles), offset_plane(0.0))
+    control.target_point = scene.target
+    if control.path_obstacle(0.0):
+        return None
+
+    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand | None:
+        update = control.update(tip, joints)
+        return None if update.blocked else update.command
+
+    return drive
+
+
+def _reference(scene: ObstacleScene, settings: SteeringSettings) -> Drive:
+    """Return what steers a needle by the published planner, with the estimator of `best`."""
+    needles = NeedlesToPoints(
+        make_controller(settings, np.eye(3), np.zeros(3))[0],
+        lambda motion: rrt_law(motion, settings, scene.obstacles),
+    )
+    needles.see_targets(0.0, scene.target[np.newaxis])
+    before: list[JointSample] = []
+
+    def drive(tip: FloatArray, joints: JointSample) -> SteeringCommand:
+        tips = tip[np.newaxis]
+        if before:
+            last = before.pop()
+            turned = np.array([joints.rotation - last.rotation])
+            rate = needles.step(joints.insertion - last.insertion, turned, tips, 0.0)
+        else:
+            rate = needles.start(tips)
+        before.append(joints)
+        return SteeringCommand(np.zeros(()), rate[0], needles.insertion_left()[0])
+
+    return drive
+
+
 def study(
     scenes: int,
     seed: int,
     *,
+    rrt: bool = False,
     pitch_bound: float,
     roll_bound: float,
     entry_angle_std: float,
@@ -163,10 +209,13 @@ def study(
         What the controller is told of that [rad].
     noise : float
         Largest error of a measured coordinate, as it is told [m].
+    rrt : bool
+        See `steer`.
     """
     settings = SteeringSettings(
         depth=DEPTH,
         entry_angle_std=entry_angle_std,
+        tip_covariance="configured",
         tip_noise="bounded",
         tip_noise_bound=noise,
         measurement_std=noise / math.sqrt(3.0),
@@ -178,7 +227,7 @@ def study(
             seed, n, curvature=CURVATURE, pitch_bound=pitch_bound, roll_bound=roll_bound
         )
         rng = np.random.default_rng([seed, n, 1])
-        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times))
+        outcomes.append(steer(scene, judge(scene, settings), settings, rng, times, rrt=rrt))
     return figures(outcomes, times)
 
 
@@ -231,12 +280,14 @@ def _run(words: Sequence[str]) -> int:
         parser.add_argument(
             option, default=default, metavar=metavar, help=f"{text} (default: {default})"
         )
+    parser.add_argument("--rrt", action="store_true", help="steer by the published RRT planner")
     parser.add_argument("--json", metavar="FILE", help="write the figures there too")
     given = parser.parse_args(words)
     path = output_file("--json", given.json)
     seen = study(
         whole_number("--scenes", given.scenes, 1, 100_000),
         whole_number("--seed", given.seed, 0, 2**31 - 1),
+        rrt=given.rrt,
         pitch_bound=math.radians(number("--pitch-deg", given.pitch_deg, 0.0, 20.0, "deg")),
         roll_bound=math.radians(number("--roll-deg", given.roll_deg, 0.0, 180.0, "deg")),
         entry_angle_std=math.radians(number("--told-deg", given.told_deg, 0.1, 45.0, "deg")),

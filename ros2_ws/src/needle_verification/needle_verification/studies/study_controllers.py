@@ -27,13 +27,16 @@ from needle_controller.presets.steering_settings import (
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.point_targets import INSERTION_SPEED
+from needle_sim.studies.rrt_replanning import SAMPLES, DutyCycle, plan
 from needle_sim.studies.sliding_mode import sliding_mode_rate
 from needle_sim.studies.study import CHUNK
 
-TimedLaw = Callable[[Estimate, FloatArray, FloatArray], SteeringCommand]
+TimedLaw = Callable[[Estimate, FloatArray, FloatArray, FloatArray], SteeringCommand]
 
-SLIDING_MODE = "sliding_mode"
-"""Name of the reference law for points."""
+SLIDING_MODE, RRT = "sliding_mode", "rrt"
+"""Names of the reference laws for points."""
+CLEAR = 0.00085
+"""What the published planner keeps from obstacles: the needle's radius and half a mm [m]."""
 CURVATURE = SteeringSettings.curvature
 STEP_LENGTH = SteeringSettings.step_length
 # What the linear observer knows of a needle is a twentieth of what the bank does.
@@ -60,6 +63,7 @@ class SteeredNeedles:
         self._law = law
         self._covariance = covariance
         self._insertion: FloatArray = np.zeros(())
+        self._turned: FloatArray = np.zeros(())
         self._estimate: Estimate | None = None
 
     def start(self, tips: FloatArray) -> FloatArray:
@@ -76,6 +80,7 @@ class SteeredNeedles:
     ) -> FloatArray:
         """Take a step and what was measured after it; see `study.Controller.step`."""
         self._insertion = self._insertion + d_insertion
+        self._turned = self._turned + np.abs(d_rotation)
         self._estimator.advance(d_insertion, d_rotation)
         self._estimator.correct(tips, self._covariance, age)
         return self._rate()
@@ -112,7 +117,9 @@ class NeedlesToPoints(SteeredNeedles):
         See `SteeredNeedles`.
     new_law : callable
         Returns the law for targets whose motion is told to a `TargetMotion`: it takes an estimate,
-        each needle's time [s] and its inserted length [m].
+        each needle's time [s], its inserted length [m] and what its base may still turn [rad].
+    rotation_budget : float
+        Most that each base may turn [rad].
     """
 
     def __init__(
@@ -120,9 +127,11 @@ class NeedlesToPoints(SteeredNeedles):
         estimator: Estimator,
         new_law: Callable[[TargetMotion], TimedLaw],
         covariance: Array | None = None,
+        rotation_budget: float = math.inf,
     ) -> None:
         self._motion = TargetMotion()
         self._point_law = new_law(self._motion)
+        self._rotation_budget = rotation_budget
         self._left: FloatArray = np.full((), np.nan)
         super().__init__(estimator, self._command, covariance)
 
@@ -135,7 +144,12 @@ class NeedlesToPoints(SteeredNeedles):
         return self._left
 
     def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
-        command = self._point_law(estimate, self._insertion / INSERTION_SPEED, self._insertion)
+        command = self._point_law(
+            estimate,
+            self._insertion / INSERTION_SPEED,
+            self._insertion,
+            self._rotation_budget - self._turned,
+        )
         assert command.insertion_left is not None
         self._left = command.insertion_left
         return command
@@ -153,12 +167,53 @@ def sliding_law(motion: TargetMotion, largest_rate: float) -> TimedLaw:
     """
 
     def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
-        off = (motion.last - estimate.position)[..., None]
-        target = (estimate.rotation.swapaxes(-1, -2) @ off)[..., 0]
+        target = _in_frames_of_tips(motion.last, estimate)
         rate = sliding_mode_rate(target, largest_rate)
         return SteeringCommand(np.zeros_like(rate), rate, target[..., 2])
 
     return command
+
+
+def rrt_law(
+    motion: TargetMotion, settings: SteeringSettings, obstacles: Array | None = None
+) -> TimedLaw:
+    """Return the published planner as a law that plans anew at every step; see `rrt_replanning`.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the targets.
+    settings : SteeringSettings
+        Of the needles.
+    obstacles : ndarray, shape (M, 7), optional
+        Ends of the axis and radius of each capsule [m]; none by default.
+    """
+    around = np.zeros((0, 7)) if obstacles is None else obstacles
+    rng = np.random.default_rng(1)
+    cycle = DutyCycle(settings.max_rotation_per_length, settings.step_length)
+
+    def command(estimate: Estimate, *_: FloatArray) -> SteeringCommand:
+        ahead = _in_frames_of_tips(motion.last, estimate)
+        places = np.ascontiguousarray(estimate.position.reshape(-1, 3))
+        turns = np.ascontiguousarray(estimate.rotation.reshape(-1, 3, 3))
+        targets = np.array(np.broadcast_to(motion.last, estimate.position.shape)).reshape(-1, 3)
+        # Where no path is found, the tightest arc towards the target.
+        arcs = np.array(ahead.reshape(-1, 3))
+        arcs[:, 2] = 1.0
+        for n in range(len(arcs)):
+            chance = rng.random((SAMPLES, 4))
+            plan(
+                places[n], turns[n], targets[n], around, settings.curvature, CLEAR, chance, arcs[n]
+            )
+        rate = cycle.rates(arcs).reshape(ahead.shape[:-1])
+        return SteeringCommand(np.zeros_like(rate), rate, ahead[..., 2])
+
+    return command
+
+
+def _in_frames_of_tips(points: Array, estimate: Estimate) -> Array:
+    off = (points - estimate.position)[..., None]
+    return np.asarray((estimate.rotation.swapaxes(-1, -2) @ off)[..., 0])
 
 
 def needles_at_a_time(name: str) -> int:
@@ -197,26 +252,28 @@ def controller_factory(
 
 
 def point_controller_factory(
-    name: str, claimed: float, *, sigma_scale: float = 1.0
+    name: str, claimed: float, *, sigma_scale: float = 1.0, rotation_budget: float = math.inf
 ) -> Callable[[], NeedlesToPoints]:
     """Return what makes the controller of some needles that are steered to points.
 
     Parameters, and what is raised, as of `controller_factory`; a preset that does not estimate the
-    whole pose is refused, and `SLIDING_MODE` has the estimator of `best`.
+    whole pose is refused, and the reference laws have the estimator of `best`. `rotation_budget` is
+    the most that each base may turn [rad]; those laws do not heed it.
     """
-    is_sliding = name == SLIDING_MODE
-    preset = "best" if is_sliding else name
+    preset = "best" if name in {SLIDING_MODE, RRT} else name
     settings, covariance = _what_is_told(preset, claimed, sigma_scale, ())
     settings.check_steers_to_points()
 
     def new_law(motion: TargetMotion) -> TimedLaw:
-        if is_sliding:
+        if name == RRT:
+            return rrt_law(motion, settings)
+        if name == SLIDING_MODE:
             return sliding_law(motion, settings.max_rotation_per_length)
         return PointSteering(settings, motion).command
 
     def needles() -> NeedlesToPoints:
         estimator, _ = make_controller(settings, np.eye(3), np.zeros(3))
-        return NeedlesToPoints(estimator, new_law, covariance)
+        return NeedlesToPoints(estimator, new_law, covariance, rotation_budget)
 
     return needles
 
