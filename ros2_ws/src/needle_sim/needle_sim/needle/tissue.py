@@ -39,6 +39,11 @@ class Torsion:
         self._tip: FloatArray = np.zeros(())
 
     @property
+    def behind_play(self) -> FloatArray:
+        """Rotation of what follows the play so far [rad], shape (...)."""
+        return self._behind_play
+
+    @property
     def tip_angle(self) -> FloatArray:
         """Rotation of the tip so far [rad], shape (...)."""
         return self._tip

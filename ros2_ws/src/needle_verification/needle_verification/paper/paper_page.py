@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -20,6 +21,7 @@ from needle_verification.paper.paper_results import (
     missed_later,
     settled_mm,
 )
+from needle_verification.studies.limit_study import Reached
 from needle_verification.studies.pure_insertions import RADIUS
 
 Row = tuple[str, str, str, str]
@@ -116,6 +118,15 @@ def table(results: PaperRuns) -> Iterator[Row]:
     yield from _study_rows(results)
     yield from _robustness_rows(results)
     yield from _curvature_rows(results)
+    for label, row in results.limits.items():
+        best, limit = row.best, row.limit
+        yield (
+            f"`best`, {label}, and the limit: plane, RMS of the last 20 mm; points, RMS and within "
+            "1 mm",
+            "-",
+            f"{_reached(best)}; limit {_reached(limit)}",
+            "the limit is a particle filter that knows the true model, with the laws of `best`",
+        )
 
 
 def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
@@ -142,6 +153,12 @@ def key_figures(results: PaperRuns) -> dict[str, JsonValue]:
             f"{grid}_missed": missed,
             f"{grid}_missed_also_later": still,
             f"{grid}_missed_worst_later_mm": worst,
+        }
+    for label, row in results.limits.items():
+        key = re.sub("[^a-z0-9]+", "_", label)
+        values |= {
+            f"limit_{key}_rms_mm": row.limit.rms_mm,
+            f"limit_{key}_point_rms_mm": row.limit.point_rms_mm,
         }
     for scale in SCALES:
         key = f"kappa_scale_{scale:g}_converged_at_end".replace(".", "_")
@@ -222,6 +239,11 @@ def _curvature_rows(results: PaperRuns) -> Iterator[Row]:
         f"arc: 1/kappa {100.0 * errors.bias:+.1f} ± {100.0 * errors.spread:.1f} %",
         "noise along a short arc looks like curvature to a plain fit",
     )
+
+
+def _reached(reached: Reached) -> str:
+    share = 100.0 * reached.point_share
+    return f"{reached.rms_mm:.2f} mm, {reached.point_rms_mm:.2f} mm, {share:.1f} %"
 
 
 def _percent(figures: dict[str, JsonValue], key: str) -> str:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from needle_analysis.run.run_summary import reduced_states, target_offset
 from needle_bags.reading.bag_reader import Run, Series
 from needle_verification.paper.paper_runs import Columns, Laboratory
+from needle_verification.studies.limit_study import NEEDLES, PARTICLES, limits
 from needle_verification.studies.pure_insertions import ARC, curvature_errors
 
 Floats = npt.NDArray[np.float64]
@@ -85,6 +86,8 @@ class PaperRuns:
         What `identify_curvature` finds in a pure insertion by cameras.
     curvature_errors : CurvatureErrors
         What many pure insertions with the paper's noise give.
+    limits : dict
+        What `best` reaches, and a filter that knows the true model, by the rows of `limit_study`.
     """
 
     def __init__(self, laboratory: Laboratory, seed: int, *, quick: bool) -> None:
@@ -133,6 +136,7 @@ class PaperRuns:
         self.curvature = laboratory.identify("curvature", "pure_insertion", "--from-mm", "5")
         many = 300 if quick else 3000
         self.curvature_errors = curvature_errors(many, np.random.default_rng(seed))
+        self.limits = limits(50 if quick else NEEDLES, PARTICLES, seed)
 
 
 def read_trial(run: Run) -> SteeringTrial:
