@@ -13,19 +13,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_controller.bank.hypothesis_mixture import (
-    COLUMNS,
-    T_AGREEMENT,
-    T_BEHIND_PLAY,
-    T_CURVATURE,
-    T_LAG,
-    T_PLAY,
-    T_ROLL,
-    T_TIP_ANGLE,
-    T_WEIGHT,
-    Hypotheses,
-    MixtureEstimate,
-)
+from needle_controller.bank.hypothesis_mixture import Hypotheses, MixtureEstimate
 from needle_controller.model.arc_motion import arc
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
@@ -199,19 +187,13 @@ class ParticleFilter:
         return np.asarray(np.log(both + 1e-6))
 
     def _as_hypothesis(self, angles: Array, known: Array) -> Hypotheses:
-        torsion, needles = self._torsion, len(angles)
-        table = np.zeros((needles, 1, COLUMNS))
-        table[:, 0, T_ROLL], table[:, 0, T_CURVATURE] = angles[:, 2], self._curvature
-        table[:, 0, T_AGREEMENT] = table[:, 0, T_WEIGHT] = 1.0
-        table[:, 0, T_PLAY], table[:, 0, T_LAG] = self._wrong.play, self._wrong.lag_length
-        table[:, 0, T_TIP_ANGLE] = torsion.tip_angle
-        table[:, 0, T_BEHIND_PLAY] = torsion.behind_play
-        return Hypotheses(
-            table.reshape(*self._shape, 1, COLUMNS),
-            self._base.reshape(self._shape),
-            self._base.reshape(self._shape),
-            known.reshape(*self._shape, 3),
-        )
+        torsion, wrong, shape = self._torsion, self._wrong, self._shape
+        roll, sure = angles[:, 2], 1.0
+        turned = torsion.tip_angle, torsion.behind_play, wrong.play, wrong.lag_length
+        # In the order of `Hypotheses.table`.
+        columns = np.broadcast_arrays(roll, sure, self._curvature, *turned, sure)
+        table, base = np.stack(columns, axis=-1), self._base.reshape(shape)
+        return Hypotheses(table.reshape(*shape, 1, -1), base, base, known.reshape(*shape, 3))
 
     def _flat(self, values: npt.ArrayLike) -> Array:
         shaped = np.broadcast_to(np.asarray(values, dtype=float), self._shape)
