@@ -92,7 +92,7 @@ class LateTips:
         if not np.any(late):
             return estimate
         return dataclasses.replace(
-            estimate, doubtful=estimate.doubtful | late, doubts=(*estimate.doubts, LATE)
+            estimate, doubtful=np.asarray(estimate.doubtful) | late, doubts=(*estimate.doubts, LATE)
         )
 
     def change_frame(self, T_new_old: npt.ArrayLike) -> None:  # noqa: N803

@@ -85,17 +85,6 @@ class LuenbergerObserver:
         self._covariance: Array = np.zeros((3, 3))
         self._saturated: npt.NDArray[np.bool_] = np.zeros((), dtype=bool)
 
-    @property
-    def settings(self) -> LuenbergerSettings:
-        """Gains and assumptions; a new value keeps the estimated pose."""
-        return self._settings
-
-    @settings.setter
-    def settings(self, settings: LuenbergerSettings) -> None:
-        reduced = reduced_from_linearized(self._s, self._settings.curvature)
-        self._settings = settings
-        self._take(linearized_from_reduced(reduced, settings.curvature))
-
     def reset(self, tip: npt.ArrayLike, joints: npt.ArrayLike) -> None:
         """Start at a first measurement; see `Estimator.reset`."""
         settings = self._settings

@@ -19,12 +19,9 @@ from needle_controller.presets.steering_settings import SteeringSettings
 
 
 def make_law(settings: SteeringSettings, gains: Gains) -> Law:
-    """Return the law of preset `paper` or `open_loop`."""
-    return OpenLoopLaw() if settings.preset == "open_loop" else linearizing_law(settings, gains)
-
-
-def linearizing_law(settings: SteeringSettings, gains: Gains) -> LinearizingLaw:
-    """Return the law (7), (10) with these gains."""
+    """Return the law of preset `paper`, (7) and (10) with these gains, or of `open_loop`."""
+    if settings.preset == "open_loop":
+        return OpenLoopLaw()
     return LinearizingLaw(
         feedback=gains.feedback,
         step_length=settings.step_length,

@@ -277,16 +277,6 @@ def test_saturation_is_said() -> None:
     assert one.estimate().warnings == ()
 
 
-def test_new_settings_keep_the_pose() -> None:
-    one = observer()
-    one.reset([0.001, 0.0, 0.0], [0.0, 0.4])
-    before = one.estimate().coordinates
-    settings = dataclasses.replace(SETTINGS, curvature=6.0)
-    one.settings = observer_settings(settings, settings.gains())
-    np.testing.assert_allclose(one.estimate().coordinates, before, atol=1e-12)
-    assert one.estimate().curvature == 6.0
-
-
 def test_a_new_frame_keeps_the_needle() -> None:
     one = observer()
     one.reset([0.001, 0.002, 0.003], [0.0, 0.4])

@@ -39,6 +39,7 @@ from needle_common.ros.conversions import (
     values_of,
 )
 from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.protocol.joint_history import CONFIRMED_BY
 from needle_controller.ros.conversions import to_tip_covariance
 from needle_controller.ros.plane_controller import PlaneControllerNode, main
 from own_context import own_context
@@ -232,6 +233,64 @@ def test_steers_step_by_step(bench: Bench) -> None:
     response = bench.call("stop")
     assert response.success
     bench.until(lambda: bench.status["state"] == "IDLE")
+
+
+def expose(bench: Bench, position: list[float]) -> bool:
+    """Publish a tip; carry out the command that it leads to, and tell whether there was one."""
+    before, refused = len(bench.commands), bench.status["tips_rejected"]
+    bench.tip(position)
+    bench.until(lambda: len(bench.commands) > before or bench.status["tips_rejected"] != refused)
+    if len(bench.commands) == before:
+        return False
+    bench.run(bench.commands[-1])
+    return True
+
+
+def stop_and_start(bench: Bench) -> None:
+    assert bench.call("stop").success
+    bench.until(lambda: bench.status["state"] == "IDLE")
+    bench.start()
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+@pytest.mark.parametrize("wrong", ["two bad tips", "frozen camera"])
+def test_after_bad_tips_five_good_ones_are_enough(
+    bench: Bench, wrong: str, restarted: bool
+) -> None:
+    bench.start()
+    for _ in range(8):
+        bench.run(bench.step())
+    frozen = [0.0, 0.0, bench.insertion]
+    if wrong == "frozen camera":
+        for _ in range(7):
+            expose(bench, frozen)
+    else:
+        for x in (0.0045, 0.009):
+            expose(bench, [x, 0.0, bench.insertion])
+    if restarted:
+        stop_and_start(bench)
+    assert any(expose(bench, [0.0, 0.0, bench.insertion]) for _ in range(5))
+    assert bench.status["state"] == "STEERING"
+    bench.run(bench.step())
+
+
+def test_joints_that_jump_say_what_to_do_and_go_on_once_they_are_back(bench: Bench) -> None:
+    bench.start()
+    for _ in range(8):
+        bench.run(bench.step())
+    deep, steering = bench.insertion, bench.node._steering
+    for place in (0.004, deep):
+        bench.insertion = place
+        for _ in range(CONFIRMED_BY):
+            bench.now += TICK
+            bench.joints()
+        bench.until(lambda: steering.intake.joints.latest.insertion == bench.insertion)
+        bench.until(lambda: bench.status["state"] == "IDLE")
+        assert "jumped from 0.008 m" in bench.status["reason"]
+        if place < deep:
+            assert "draw the needle out" in bench.call("start").message
+    bench.start()
+    assert any(expose(bench, [0.0, 0.0, bench.insertion]) for _ in range(5))
 
 
 @pytest.mark.parametrize(

@@ -172,6 +172,7 @@ POINTS = (
             ("play_40", ("--play-deg", "40")),
             ("lag_8", ("--lag-mm", "8")),
             ("bump", ("--bump-mm", "2")),
+            ("late_untold", ("--untold-delay", "3")),
         )
     ),
 )
