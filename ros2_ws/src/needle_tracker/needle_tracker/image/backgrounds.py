@@ -9,7 +9,7 @@ from needle_tracker.image.detection import Image
 from needle_tracker.optics.refraction import RefractedCamera
 
 _ROOM = 0.5e-3  # the needle may have been so much farther than the insertion says [m]
-_LEAST_NEW = 2.2  # so much of the needle must be new for its end to be plain of it [widths]
+_LEAST_NEW = 3.0  # so much of the needle must be new for its end to be plain of it [widths]
 
 Pair = tuple[Background, Background]
 

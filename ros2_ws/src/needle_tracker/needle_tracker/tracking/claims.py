@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 _PITCH = 2e-3  # of points along the shaft [m]
 _LEAST_POINTS = 4
+_PLAINLY = 3.0  # standard deviations
 _SLIP = 0.01  # of the insertion, between pairs of a run [-]
 
 
@@ -141,7 +142,7 @@ class StagedEnd:
             self._best = best = now
         variance = best.variance_at(insertion)
         # A zero that is plainly off is worth less.
-        zero = max(self._zero_variance, best.value * best.value - variance)
+        zero = max(self._zero_variance, (best.value / _PLAINLY) ** 2 - variance)
         offset = best.value * zero / (zero + variance)
         left = variance * zero / (zero + variance)
         beside = np.eye(3) - np.outer(ahead, ahead)

@@ -40,8 +40,9 @@ def test_nothing_is_known_before_there_is_less_of_the_needle(views: Views) -> No
     assert contents(backgrounds, None) is None
     assert contents(backgrounds, 0.060) is None
     assert contents(backgrounds, 0.061) is None
+    assert contents(backgrounds, 0.060 + 2.9 * WIDTH) is None
     # Farther on, the last of it is new.
-    assert contents(backgrounds, 0.0616) is False
+    assert contents(backgrounds, 0.060 + 3.1 * WIDTH) is False
     assert contents(backgrounds, None) is None
 
 

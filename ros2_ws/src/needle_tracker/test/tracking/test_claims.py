@@ -80,7 +80,7 @@ def test_an_end_that_is_seen_badly_lies_where_the_stage_has_it() -> None:
 
 def test_the_end_that_was_seen_best_says_where_the_stage_has_its_zero() -> None:
     staged = StagedEnd(0.25e-3)
-    staged.placed(_along(0.05e-3, 0.9e-3, 0.05), _shaft(0.05), 0.05)
+    staged.placed(_along(0.02e-3, 0.9e-3, 0.05), _shaft(0.05), 0.05)
     hidden = staged.placed(_along(0.4e-3, 1.4e-3, 0.052), None, 0.052)
     assert 0.052 - hidden.position[2] == pytest.approx(0.9e-3, abs=0.02e-3)
     # One that is seen less well, but plainly farther out, shows that the first lay short.
