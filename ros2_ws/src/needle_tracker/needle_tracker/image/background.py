@@ -18,6 +18,7 @@ _LEVEL = 128.0
 # Of rows and columns: so much is looked at to tell which image is rougher, and over so many pixels.
 _EVERY, _LAG = 8, 2
 _LEAST_LEVEL = 1.0
+_SURE = 128  # of 255: so much of a map is needle
 
 
 class Background:
@@ -29,18 +30,30 @@ class Background:
         An image with less of the needle, or none; kept, not copied.
     entry : ndarray, shape (2,)
         Where the camera sees the entry [px].
-    reached : float
-        So far from that the needle was there already [px]; 0: it was not.
+    reached : float or None
+        So far from that the needle was there already [px]; 0: it was not; None: not known.
+    least_new : float
+        So much of the needle must be new for its end to be plain of it [px].
+
+    Attributes
+    ----------
+    before : ndarray of uint8, shape (height, width)
+        As given.
     """
 
-    def __init__(self, before: Image, entry: Array, reached: float) -> None:
-        self._before = before
-        self._entry = entry
+    def __init__(
+        self, before: Image, entry: Array, reached: float | None, least_new: float
+    ) -> None:
+        self.before = before
         self._reached = reached
+        self._least_new = least_new
         self._mean = max(_mean(before), _LEAST_LEVEL)
         self._image: Image | None = None
         self._difference: Image | None = None
-        self._inside: NDArray[np.bool_] | None = None
+        rows, columns = np.ogrid[: before.shape[0], : before.shape[1]]
+        self._away = np.hypot(columns - entry[0], rows - entry[1]).astype(np.float32)
+        self._entry = entry
+        self._seam = reached
 
     def difference(self, image: Image) -> Image | None:
         """Return what an image has beside the background; None where it is smoother as it is.
@@ -58,32 +71,53 @@ class Background:
             # Lamps flicker: the floor, most of the image, tells by how much.
             gain = _mean(image) / self._mean
             difference = np.asarray(
-                cv2.addWeighted(image, 1.0, self._before, -gain, _LEVEL), dtype=np.uint8
+                cv2.addWeighted(image, 1.0, self.before, -gain, _LEVEL), dtype=np.uint8
             )
             smoother = _roughness(difference) < _roughness(image)
             self._image, self._difference = image, difference if smoother else None
         return self._difference
 
-    def joined(self, whole: Image, new: Image) -> Image:
+    def joined(self, whole: Image, new: Image, before: Image | None) -> Image:
         """Return a map of the needle from that of the image and that of the difference.
 
         Where the needle was before, it may hardly differ.
 
         Parameters
         ----------
-        whole, new : ndarray of uint8, shape (height, width)
-            Maps of the image and of the difference.
+        whole, new, before : ndarray of uint8, shape (height, width)
+            Maps of the image, of the difference, and of the image before; that only where it is not
+            known how far the needle was.
         """
-        if self._inside is None:
-            rows, columns = np.ogrid[: whole.shape[0], : whole.shape[1]]
-            off = np.hypot(columns - self._entry[0], rows - self._entry[1])
-            self._inside = np.asarray(off < self._reached)
-        return np.where(self._inside, np.maximum(whole, new), new)
+        self._seam = self._reached if before is None else self._begin(whole, new, before)
+        if self._seam is None:
+            return whole
+        return np.where(self._away < self._seam, np.maximum(whole, new), new)
+
+    def _begin(self, whole: Image, new: Image, before: Image) -> float | None:
+        """Return where the farthest part of the needle begins that is new; None where none is.
+
+        What the difference shows and the image before showed better is a needle that has gone.
+        """
+        there = new > _SURE
+        away = self._away[there].astype(np.int64)
+        come = whole[there].astype(np.int64) - before[there]
+        occupied = np.flatnonzero(np.bincount(away))
+        runs = np.split(occupied, np.flatnonzero(np.diff(occupied) > 0.5 * self._least_new) + 1)
+        for run in reversed(runs):
+            if len(run) and run[-1] - run[0] >= self._least_new:
+                inside = (away >= run[0]) & (away <= run[-1])
+                return float(run[0]) if come[inside].sum() > 0 else None
+        return None
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it is known how far the needle was."""
+        return self._reached is not None
 
     @property
     def is_empty(self) -> bool:
         """Whether there was no needle at all."""
-        return self._reached <= 0.0
+        return self._reached is not None and self._reached <= 0.0
 
     def is_seam(self, point: Array, room: float) -> bool:
         """Return whether a point is where both maps meet: a line that ends there may go on.
@@ -95,8 +129,9 @@ class Background:
         room : float
             How near is near [px].
         """
-        off = float(np.hypot(*(point - self._entry)))
-        return not self.is_empty and abs(off - self._reached) < room
+        if self.is_empty or self._seam is None:
+            return False
+        return abs(float(np.hypot(*(point - self._entry))) - self._seam) < room
 
 
 def _mean(image: Image) -> float:

@@ -1,4 +1,7 @@
-"""Which pair shows what stands behind the needle: the latest without it, or the one with least."""
+"""Which pair shows what stands behind the needle: the latest without it, or the one with least.
+
+Without the insertion that is the first pair: what has come since is the needle's.
+"""
 
 from __future__ import annotations
 
@@ -61,21 +64,30 @@ class Backgrounds:
             reached = 0.0 if insertion <= self._hole_clearance else insertion + _ROOM
             self._kept = self._backgrounds(images, reached)
             self._insertion = insertion
-        if self._kept is None or self._kept[0].is_empty:
+        elif insertion is None and self._kept is None:
+            self._kept = self._backgrounds(images, None)
+        if self._kept is None or self._kept[0].is_empty or not self._kept[0].is_known:
             return self._kept
         if insertion is None or insertion < self._insertion + self._least_new:
             return None
         return self._kept
 
-    def _backgrounds(self, images: tuple[Image, Image], reached: float) -> Pair:
+    def _backgrounds(self, images: tuple[Image, Image], reached: float | None) -> Pair:
         left, right = (
             self._background(view, image, reached)
             for view, image in zip(self._views, images, strict=True)
         )
         return left, right
 
-    @staticmethod
-    def _background(view: RefractedCamera, image: Image, reached: float) -> Background:
-        entry, end = view.project(np.zeros(3)), view.project(np.array([0.0, 0.0, reached]))
+    def _background(self, view: RefractedCamera, image: Image, reached: float | None) -> Background:
+        def along(depth: float) -> float:
+            return float(np.linalg.norm(view.project(np.array([0.0, 0.0, depth])) - entry))
+
+        entry = view.project(np.zeros(3))
         # A camera's driver may use the array again.
-        return Background(image.copy(), entry, float(np.linalg.norm(end - entry)))
+        return Background(
+            image.copy(),
+            entry,
+            None if reached is None else along(reached),
+            along(self._least_new),
+        )

@@ -33,7 +33,7 @@ CLEAR_WIDTHS = 1.2
 """Standard deviation along the shaft of an end that a map shows [needle widths]."""
 _ALLOWANCE = 0.54  # for each pixel of the needle's width
 # In needle widths: what shape and light leave in line and end.
-_LINE_SYSTEMATIC, _END_SYSTEMATIC = 0.043, 0.15
+_LINE_SYSTEMATIC, _END_SYSTEMATIC = 0.06, 0.15
 # Likewise: beyond such a gap may be another thing, and beyond such a one there is.
 _GAP_WIDTHS, _HIDDEN_WIDTHS = 1.5, 8.0
 _ROOM_WIDTHS = 6.0  # drawn around an end that is fitted
@@ -99,6 +99,7 @@ class MapLook:
     def __init__(self, needle_width_px: float) -> None:
         self._map = NeedleMap(needle_width_px)
         self._map_of_difference = NeedleMap(needle_width_px)
+        self._map_before = NeedleMap(needle_width_px)
         self.background: Background | None = None
 
     def _draw(self, image: Image, box: Box) -> Image:
@@ -110,7 +111,9 @@ class MapLook:
         new = self._map_of_difference.draw(difference, box)
         if background.is_empty:
             return new
-        return background.joined(self._map.draw(image, box), new)
+        known = background.is_known
+        before = None if known else self._map_before.draw(background.before, box)
+        return background.joined(self._map.draw(image, box), new, before)
 
     def _is_seam(self, image: Image, point: NDArray[np.float64], room: float) -> bool:
         """Return whether the map is put together near a point [px]: no end is believed there."""

@@ -37,13 +37,21 @@ def contents(backgrounds: Backgrounds, insertion: float | None) -> bool | None:
 
 def test_nothing_is_known_before_there_is_less_of_the_needle(views: Views) -> None:
     backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
-    assert contents(backgrounds, None) is None
     assert contents(backgrounds, 0.060) is None
     assert contents(backgrounds, 0.061) is None
     assert contents(backgrounds, 0.060 + 2.9 * WIDTH) is None
     # Farther on, the last of it is new.
     assert contents(backgrounds, 0.060 + 3.1 * WIDTH) is False
     assert contents(backgrounds, None) is None
+
+
+def test_without_the_insertion_the_first_pair_is_kept_until_one_is_known(views: Views) -> None:
+    backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
+    first = backgrounds.see(marked(9), None)
+    assert first is not None
+    assert not first[0].is_known
+    assert backgrounds.see(marked(30), None) is first
+    assert contents(backgrounds, 0.060) is None
 
 
 def test_a_pair_without_needle_holds_for_all_that_follow(views: Views) -> None:
