@@ -150,7 +150,7 @@ class RigModel:
     def board_poses(self, parameters: Array) -> Array:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
         steps = parameters[self.shared :].reshape(-1, 6)
-        poses = self._boards.copy()
+        poses: Array = self._boards.copy()
         poses[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ poses[:, :3, :3]
         poses[:, :3, 3] += steps[:, 3:]
         return poses
