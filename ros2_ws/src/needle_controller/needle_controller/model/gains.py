@@ -15,6 +15,7 @@ import functools
 
 import numpy as np
 import numpy.typing as npt
+from scipy import linalg
 
 from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
@@ -192,9 +193,6 @@ def _observer_gain(process_noise: Array, measurement_density: float) -> Array:
 
 
 def _riccati_gain(a: Array, b: Array, weights: Array, names: str) -> Array:
-    # Not every preset needs it, and it takes a fifth of a second to import.
-    from scipy import linalg  # noqa: PLC0415
-
     try:
         solution = linalg.solve_continuous_are(a, b, weights, np.eye(1))
     except (np.linalg.LinAlgError, ValueError) as error:

@@ -289,8 +289,7 @@ class SteeringSettings:
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
                 "coordinates end at roll +-90 deg); best can"
             )
-        if self.preset in ONE_SIDED_PRESETS:
-            self.gains()
+        self.gains()
 
     def gains(self) -> Gains:
         """Return the gains the weights give; raises UserError as `gains.design_gains` does."""
