@@ -30,10 +30,8 @@ class Background:
         An image with less of the needle, or none; kept, not copied.
     entry : ndarray, shape (2,)
         Where the camera sees the entry [px].
-    reached : float or None
-        So far from that the needle was there already [px]; 0: it was not; None: not known.
-    least_new : float
-        So much of the needle must be new for its end to be plain of it [px].
+    least_new : float or None
+        So much of the needle must be new for its end to be plain of it [px]; None: all is new.
 
     Attributes
     ----------
@@ -41,11 +39,8 @@ class Background:
         As given.
     """
 
-    def __init__(
-        self, before: Image, entry: Array, reached: float | None, least_new: float
-    ) -> None:
+    def __init__(self, before: Image, entry: Array, least_new: float | None) -> None:
         self.before = before
-        self._reached = reached
         self._least_new = least_new
         self._mean = max(_mean(before), _LEAST_LEVEL)
         self._image: Image | None = None
@@ -53,7 +48,7 @@ class Background:
         rows, columns = np.ogrid[: before.shape[0], : before.shape[1]]
         self._away = np.hypot(columns - entry[0], rows - entry[1]).astype(np.float32)
         self._entry = entry
-        self._seam = reached
+        self._seam: float | None = None
 
     def difference(self, image: Image) -> Image | None:
         """Return what an image has beside the background; None where it is smoother as it is.
@@ -77,7 +72,7 @@ class Background:
             self._image, self._difference = image, difference if smoother else None
         return self._difference
 
-    def joined(self, whole: Image, new: Image, before: Image | None) -> Image:
+    def joined(self, whole: Image, new: Image, before: Image) -> Image:
         """Return a map of the needle from that of the image and that of the difference.
 
         Where the needle was before, it may hardly differ.
@@ -85,10 +80,9 @@ class Background:
         Parameters
         ----------
         whole, new, before : ndarray of uint8, shape (height, width)
-            Maps of the image, of the difference, and of the image before; that only where it is not
-            known how far the needle was.
+            Maps of the image, of the difference, and of the image before.
         """
-        self._seam = self._reached if before is None else self._begin(whole, new, before)
+        self._seam = self._begin(whole, new, before)
         if self._seam is None:
             return whole
         return np.where(self._away < self._seam, np.maximum(whole, new), new)
@@ -98,26 +92,22 @@ class Background:
 
         What the difference shows and the image before showed better is a needle that has gone.
         """
+        least = self._least_new or 0.0
         there = new > _SURE
         away = self._away[there].astype(np.int64)
         come = whole[there].astype(np.int64) - before[there]
         occupied = np.flatnonzero(np.bincount(away))
-        runs = np.split(occupied, np.flatnonzero(np.diff(occupied) > 0.5 * self._least_new) + 1)
+        runs = np.split(occupied, np.flatnonzero(np.diff(occupied) > 0.5 * least) + 1)
         for run in reversed(runs):
-            if len(run) and run[-1] - run[0] >= self._least_new:
+            if len(run) and run[-1] - run[0] >= least:
                 inside = (away >= run[0]) & (away <= run[-1])
                 return float(run[0]) if come[inside].sum() > 0 else None
         return None
 
     @property
-    def is_known(self) -> bool:
-        """Whether it is known how far the needle was."""
-        return self._reached is not None
-
-    @property
     def is_empty(self) -> bool:
         """Whether there was no needle at all."""
-        return self._reached is not None and self._reached <= 0.0
+        return self._least_new is None
 
     def is_seam(self, point: Array, room: float) -> bool:
         """Return whether a point is where both maps meet: a line that ends there may go on.
@@ -129,7 +119,7 @@ class Background:
         room : float
             How near is near [px].
         """
-        if self.is_empty or self._seam is None:
+        if self._seam is None:
             return False
         return abs(float(np.hypot(*(point - self._entry))) - self._seam) < room
 

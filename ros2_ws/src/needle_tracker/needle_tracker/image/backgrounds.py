@@ -1,6 +1,6 @@
 """Which pair shows what stands behind the needle: the latest without it, or the one with least.
 
-Without the insertion that is the first pair: what has come since is the needle's.
+Without the insertion that is the first pair. What has come since is the needle's.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from needle_tracker.image.background import Background
 from needle_tracker.image.detection import Image
 from needle_tracker.optics.refraction import RefractedCamera
 
-_ROOM = 0.5e-3  # the needle may have been so much farther than the insertion says [m]
 _LEAST_NEW = 3.0  # so much of the needle must be new for its end to be plain of it [widths]
 
 Pair = tuple[Background, Background]
@@ -50,8 +49,8 @@ class Backgrounds:
         if empty is not None:
             self.see(empty, 0.0)
 
-    def see(self, images: tuple[Image, Image], insertion: float | None) -> Pair | None:
-        """Take in a pair; return what stands behind its needle, None where that is not known.
+    def see(self, images: tuple[Image, Image], insertion: float | None) -> Pair:
+        """Take in a pair; return what stands behind its needle.
 
         Parameters
         ----------
@@ -61,33 +60,22 @@ class Backgrounds:
             Length of needle in the phantom [m].
         """
         if insertion is not None and insertion <= max(self._insertion, self._hole_clearance):
-            reached = 0.0 if insertion <= self._hole_clearance else insertion + _ROOM
-            self._kept = self._backgrounds(images, reached)
+            self._keep(images, empty=insertion <= self._hole_clearance)
             self._insertion = insertion
-        elif insertion is None and self._kept is None:
-            self._kept = self._backgrounds(images, None)
-        if self._kept is None or self._kept[0].is_empty or not self._kept[0].is_known:
-            return self._kept
-        if insertion is None or insertion < self._insertion + self._least_new:
-            return None
+        elif self._kept is None:
+            self._keep(images, empty=False)
+        assert self._kept is not None
         return self._kept
 
-    def _backgrounds(self, images: tuple[Image, Image], reached: float | None) -> Pair:
+    def _keep(self, images: tuple[Image, Image], *, empty: bool) -> None:
         left, right = (
-            self._background(view, image, reached)
+            self._background(view, image, empty=empty)
             for view, image in zip(self._views, images, strict=True)
         )
-        return left, right
+        self._kept = left, right
 
-    def _background(self, view: RefractedCamera, image: Image, reached: float | None) -> Background:
-        def along(depth: float) -> float:
-            return float(np.linalg.norm(view.project(np.array([0.0, 0.0, depth])) - entry))
-
-        entry = view.project(np.zeros(3))
+    def _background(self, view: RefractedCamera, image: Image, *, empty: bool) -> Background:
+        entry, beyond = view.project(np.array([[0.0, 0.0, 0.0], [0.0, 0.0, self._least_new]]))
+        least_new = None if empty else float(np.linalg.norm(beyond - entry))
         # A camera's driver may use the array again.
-        return Background(
-            image.copy(),
-            entry,
-            None if reached is None else along(reached),
-            along(self._least_new),
-        )
+        return Background(image.copy(), entry, least_new)

@@ -111,8 +111,7 @@ class MapLook:
         new = self._map_of_difference.draw(difference, box)
         if background.is_empty:
             return new
-        known = background.is_known
-        before = None if known else self._map_before.draw(background.before, box)
+        before = self._map_before.draw(background.before, box)
         return background.joined(self._map.draw(image, box), new, before)
 
     def _is_seam(self, image: Image, point: NDArray[np.float64], room: float) -> bool:

@@ -94,7 +94,7 @@ class TipTracker:
         """Measure the tip in a stereo pair; as `StereoTracker.process`."""
         lines = self._lines.process(left, right, insertion)
         behind = self._backgrounds.see((left, right), insertion)
-        self._looks[0].background, self._looks[1].background = behind or (None, None)
+        self._looks[0].background, self._looks[1].background = behind
         if insertion is not None and insertion < self.settings.entry_zone:
             # A new insertion: all that is known of the last one is over.
             self._maps.process(left, right, insertion)

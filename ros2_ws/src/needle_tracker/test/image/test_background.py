@@ -28,7 +28,7 @@ def floor(seed: int, *, lines: bool, light: float = 1.0, needle: bool = False) -
 
 @pytest.mark.parametrize("light", [0.8, 1.0, 1.15])
 def test_takes_the_lines_away_and_leaves_the_needle(light: float) -> None:
-    background = Background(floor(1, lines=True), ENTRY, 0.0, NEW)
+    background = Background(floor(1, lines=True), ENTRY, None)
     rest = background.difference(floor(2, lines=True, light=light, needle=True))
     assert rest is not None
     around = rest[150:].astype(float)
@@ -38,31 +38,18 @@ def test_takes_the_lines_away_and_leaves_the_needle(light: float) -> None:
 
 
 def test_a_plain_floor_is_better_as_it_is() -> None:
-    background = Background(floor(1, lines=False), ENTRY, 0.0, NEW)
+    background = Background(floor(1, lines=False), ENTRY, None)
     assert background.difference(floor(2, lines=False, needle=True)) is None
 
 
 def test_a_camera_that_was_touched_leaves_the_image_as_it_is() -> None:
     moved = np.roll(floor(1, lines=True), (9, 7), axis=(0, 1))
-    background = Background(np.ascontiguousarray(moved), ENTRY, 0.0, NEW)
+    background = Background(np.ascontiguousarray(moved), ENTRY, None)
     assert background.difference(floor(2, lines=True, needle=True)) is None
 
 
-def test_the_map_of_the_image_holds_where_the_needle_was_before() -> None:
-    background = Background(floor(1, lines=True), ENTRY, 100.0, NEW)
-    whole, new = np.full(SHAPE, 200, np.uint8), np.full(SHAPE, 10, np.uint8)
-    new[120, 60] = 250
-    joined = background.joined(whole, new, None)
-    assert joined[120, 110] == 200
-    assert joined[120, 60] == 250
-    assert joined[120, 130] == 10
-    assert background.is_seam(np.array([118.0, 120.0]), 5.0)
-    assert not background.is_seam(np.array([110.0, 120.0]), 5.0)
-    assert not background.is_empty
-
-
 def test_an_empty_phantom_has_no_seam() -> None:
-    background = Background(floor(1, lines=True), ENTRY, 0.0, NEW)
+    background = Background(floor(1, lines=True), ENTRY, None)
     assert background.is_empty
     assert not background.is_seam(ENTRY, 5.0)
 
@@ -75,7 +62,7 @@ def line_map(begin: int, end: int) -> Image:
 
 
 def test_beyond_what_is_new_there_is_no_needle_though_it_is_not_known_where_it_was() -> None:
-    background = Background(floor(1, lines=True), ENTRY, None, NEW)
+    background = Background(floor(1, lines=True), ENTRY, NEW)
     # To the map of the image, a line of the paper goes on from the needle's end.
     whole, before = line_map(25, 300), line_map(25, 180)
     joined = background.joined(whole, line_map(180, 220), before)
@@ -83,10 +70,11 @@ def test_beyond_what_is_new_there_is_no_needle_though_it_is_not_known_where_it_w
     assert not joined[:, 222:].any()
     assert background.is_seam(np.array([182.0, 120.0]), 5.0)
     assert not background.is_seam(np.array([220.0, 120.0]), 5.0)
+    assert not background.is_empty
 
 
 def test_too_little_that_is_new_says_nothing() -> None:
-    background = Background(floor(1, lines=True), ENTRY, None, NEW)
+    background = Background(floor(1, lines=True), ENTRY, NEW)
     whole = line_map(25, 300)
     joined = background.joined(whole, line_map(180, 190), line_map(25, 180))
     assert (joined == whole).all()
@@ -94,7 +82,7 @@ def test_too_little_that_is_new_says_nothing() -> None:
 
 
 def test_where_a_needle_has_gone_nothing_is_new() -> None:
-    background = Background(floor(1, lines=True), ENTRY, None, NEW)
+    background = Background(floor(1, lines=True), ENTRY, NEW)
     whole = line_map(25, 180)
     joined = background.joined(whole, line_map(180, 220), line_map(25, 220))
     assert (joined == whole).all()

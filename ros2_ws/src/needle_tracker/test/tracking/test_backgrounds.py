@@ -29,29 +29,23 @@ def marked(level: int) -> Pair:
     return image, image.copy()
 
 
-def contents(backgrounds: Backgrounds, insertion: float | None) -> bool | None:
-    """Return whether what is kept was taken without a needle; None where nothing is."""
-    kept = backgrounds.see(marked(9), insertion)
-    return None if kept is None else kept[0].is_empty
+def contents(backgrounds: Backgrounds, insertion: float | None) -> bool:
+    """Return whether what is kept was taken without a needle."""
+    return backgrounds.see(marked(9), insertion)[0].is_empty
 
 
-def test_nothing_is_known_before_there_is_less_of_the_needle(views: Views) -> None:
+@pytest.mark.parametrize("insertion", [None, 0.060])
+def test_the_first_pair_is_kept_until_there_is_less_of_the_needle(
+    views: Views, insertion: float | None
+) -> None:
     backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
-    assert contents(backgrounds, 0.060) is None
-    assert contents(backgrounds, 0.061) is None
-    assert contents(backgrounds, 0.060 + 2.9 * WIDTH) is None
-    # Farther on, the last of it is new.
-    assert contents(backgrounds, 0.060 + 3.1 * WIDTH) is False
-    assert contents(backgrounds, None) is None
-
-
-def test_without_the_insertion_the_first_pair_is_kept_until_one_is_known(views: Views) -> None:
-    backgrounds = Backgrounds(views, CLEARANCE, WIDTH, None)
-    first = backgrounds.see(marked(9), None)
-    assert first is not None
-    assert not first[0].is_known
+    first = backgrounds.see(marked(9), insertion)
+    assert not first[0].is_empty
     assert backgrounds.see(marked(30), None) is first
-    assert contents(backgrounds, 0.060) is None
+    less = backgrounds.see(marked(30), 0.055)
+    assert less is not first
+    assert backgrounds.see(marked(9), 0.060) is less
+    assert contents(backgrounds, None) is False
 
 
 def test_a_pair_without_needle_holds_for_all_that_follow(views: Views) -> None:
@@ -65,11 +59,9 @@ def test_the_latest_pair_without_needle_counts(views: Views) -> None:
     backgrounds = Backgrounds(views, CLEARANCE, WIDTH, marked(40))
     now = marked(80)
     kept = backgrounds.see(now, 0.06)
-    assert kept is not None
     assert kept[0].difference(now[0]) is not None
     backgrounds.see(now, 0.0015)
     kept = backgrounds.see(now, 0.06)
-    assert kept is not None
     difference = kept[0].difference(now[0])
     assert difference is not None
     assert float(difference.std()) < 1.0
