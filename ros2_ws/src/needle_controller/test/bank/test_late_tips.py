@@ -94,7 +94,7 @@ def test_what_is_not_late_or_says_so_is_not_called_late(other: dict[str, float])
 
 def seen(late: float, slip: float = 0.0) -> tuple[Array, Array]:
     """Return insertions, and the ways of tips without noise."""
-    inserted = np.arange(1, 21) * STEP
+    inserted = np.arange(1, 21, dtype=np.float64) * STEP
     return inserted, arc(np.maximum(inserted - late, 0.0) / (1.0 + slip))
 
 
@@ -103,7 +103,8 @@ def test_an_age_is_not_a_slip() -> None:
     # Two coordinates of two tips are off by what is claimed, in the mean.
     ways *= np.sqrt(1.0 + 4.0 * STEP**2 / 3.0 / np.sum(ways**2, axis=-1, keepdims=True).clip(1e-9))
     assert untold_age(inserted, ways, np.zeros(()), **KNOWN) == pytest.approx(0.003, abs=1e-4)
-    assert untold_age(*seen(0.0, 0.2), np.zeros(()), **KNOWN) == 0.0
+    inserted, ways = seen(0.0, 0.2)
+    assert untold_age(inserted, ways, np.zeros(()), **KNOWN) == 0.0
 
 
 def test_a_first_tip_that_was_too_deep_is_not_an_age() -> None:

@@ -284,7 +284,12 @@ def test_joints_that_jump_say_what_to_do_and_go_on_once_they_are_back(bench: Ben
         for _ in range(CONFIRMED_BY):
             bench.now += TICK
             bench.joints()
-        bench.until(lambda: steering.intake.joints.latest.insertion == bench.insertion)
+        bench.until(
+            lambda: (
+                (at := steering.intake.joints.latest) is not None
+                and at.insertion == bench.insertion
+            )
+        )
         bench.until(lambda: bench.status["state"] == "IDLE")
         assert "jumped from 0.008 m" in bench.status["reason"]
         if place < deep:

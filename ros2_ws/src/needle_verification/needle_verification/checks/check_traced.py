@@ -7,9 +7,9 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from needle_verification.checking import Check, Finding, Workbench
-from needle_verification.studies.traced_set import HELD_BACK, RIGS, drawn, scenes
-from needle_verification.studies.traced_study import Told, TracedAnswer, traced_looks
-from needle_verification.studies.tracker_study import WRONG
+from needle_verification.tracking.traced_set import HELD_BACK, RIGS, drawn, scenes
+from needle_verification.tracking.traced_study import Told, TracedAnswer, traced_looks
+from needle_verification.tracking.tracker_study import WRONG
 from needle_verification.workplace import checkout
 
 _LEAST = {Told.EMPTY_PHANTOM: 0.97, Told.INSERTION: 0.97, Told.NOTHING: 0.92}

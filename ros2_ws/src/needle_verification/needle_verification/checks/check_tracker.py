@@ -11,9 +11,9 @@ from ament_index_python.packages import get_package_share_directory
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.tracking.track import TrackState
 from needle_verification.checking import Check, Finding, Workbench
-from needle_verification.studies.calibration_study import calibrated_tip_errors
-from needle_verification.studies.tracker_sequences import insertion_sequence
-from needle_verification.studies.tracker_study import (
+from needle_verification.tracking.calibration_study import calibrated_tip_errors
+from needle_verification.tracking.tracker_sequences import insertion_sequence
+from needle_verification.tracking.tracker_study import (
     WRONG,
     TrackedRun,
     new_tracker,

@@ -1,1 +1,1 @@
-"""Studies of tracker and controller over simulated needles."""
+"""Studies of the controller over simulated needles."""

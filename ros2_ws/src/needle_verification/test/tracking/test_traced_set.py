@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_verification.studies import traced_set
-from needle_verification.studies.traced_set import HELD_BACK, LOOKED_AT, PAIRS, drawn, scenes
-from needle_verification.studies.traced_study import Told, traced_looks
+from needle_verification.tracking import traced_set
+from needle_verification.tracking.traced_set import HELD_BACK, LOOKED_AT, PAIRS, drawn, scenes
+from needle_verification.tracking.traced_study import Told, traced_looks
 
 
 def test_the_halves_share_no_scene_and_have_enough_pairs() -> None:

@@ -14,7 +14,7 @@ from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
-from needle_verification.studies.tracker_sequences import Exposure, insertion_sequence
+from needle_verification.tracking.tracker_sequences import Exposure, insertion_sequence
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import pytest
 from ament_index_python.packages import get_package_share_directory
 
 from needle_common.errors import UserError
-from needle_verification.studies.calibration_study import calibrated_tip_errors
+from needle_verification.tracking.calibration_study import calibrated_tip_errors
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.triangulation import SpatialTip
-from needle_verification.studies.traced_set import DrawnSequence, TracedScene
+from needle_verification.tracking.traced_set import DrawnSequence, TracedScene
 
 SETTLED = 3
 """Pairs of a sequence's begin that do not count: a tracker without the insertion wants to see a

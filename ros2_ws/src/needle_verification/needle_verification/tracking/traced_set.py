@@ -1,4 +1,4 @@
-"""`python -m needle_verification.studies.traced_set`: draws the path-traced pairs of step C.
+"""`python -m needle_verification.tracking.traced_set`: draws the path-traced pairs of step C.
 
 Half of the set is for building on; the other half is for `scripts/verify C` and for nobody's eyes.
 A sequence that was drawn stays in the checkout's .traced, so that what was interrupted goes on.
