@@ -21,6 +21,7 @@ from needle_analysis.report.figure_style import (
     TRUTH,
     VIOLET,
     WIDTH,
+    place,
 )
 from needle_analysis.run.run_summary import (
     GOAL,
@@ -49,7 +50,8 @@ _MEASURED_DOTS: dict[str, Any] = {
 def states_figure(run: Run) -> Figure:
     """Return [KC09] figure 3's four rows: r1, r2, r3 and the accumulated rotation."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 8.8), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 8.8))
+        place(figure, 4)
         r1, r2, r3, rotation = figure.subplots(4, 1, sharex=True)
         _goal_band(r1)
         _draw_measured(r1, run)
@@ -111,11 +113,13 @@ def _draw_not_steered(axes: Any, run: Run) -> None:
 def path_figure(run: Run) -> Figure:
     """Return the needle's path: from the side against the plane, from above, and in space."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 7.0), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 7.0))
+        place(figure, 2, gap=0.85)
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
         side = figure.add_subplot(grid[0, :])
         above = figure.add_subplot(grid[1, 0])
-        space = figure.add_subplot(grid[1, 1], projection="3d")
+        # In a grid its labels would be cut off.
+        space = figure.add_axes((0.53, 0.06, 0.42, 0.44), projection="3d")
         tips = finite_tips(run).values * MM
         truth = run.truth.values[:, :3] * MM
         plane = target_offset(run) * MM
@@ -140,7 +144,8 @@ def path_figure(run: Run) -> Figure:
 def error_figure(run: Run) -> Figure:
     """Return the measurement's and the estimate's error against the truth."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 5.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 5.6))
+        place(figure, 2, right=0.7)
         tip, difference = figure.subplots(2, 1, sharex=True)
         error = tip_error(run) * MM
         tips = finite_tips(run)

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import yaml
 from matplotlib.figure import Figure
 
+from needle_analysis.report.figure_style import WIDTH, place
 from needle_analysis.run.run_summary import finite_tips
 from needle_bags.reading.bag_images import SIDES, exposures, images_at
 from needle_bags.reading.bag_reader import Run
@@ -36,7 +37,9 @@ def images_figure(run: Run) -> Figure | None:
     cameras = _cameras(run)
     with mpl.rc_context({"font.size": 9}):
         columns = sorted({index for index, _ in pictures})
-        figure = Figure(figsize=(6.6, 4.9), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 4.9))
+        place(figure, len(SIDES), gap=0.26, left=0.04, right=0.04, bottom=0.04, top=0.24)
+        figure.subplots_adjust(wspace=0.04)
         grid = figure.subplots(len(SIDES), len(columns), squeeze=False)
         insertion = run.insertion_at(chosen) * 1e3
         for column, index in enumerate(columns):
@@ -79,8 +82,9 @@ def _draw_exposure(
     camera: RefractedCamera | None,
 ) -> None:
     low, high = np.percentile(image, [0.5, 99.8])
-    axes.imshow(image, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
+    shown = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
     if camera is None:
+        axes.imshow(image, **shown)
         return
     tip = run.tips.values[run.tips.stamps == stamp][0]
     measured = np.ravel(camera.project(tip))
@@ -91,5 +95,10 @@ def _draw_exposure(
         true = np.ravel(camera.project(truth[0]))
         axes.plot(*true, "+", markersize=11, markeredgecolor="#35e06d", markeredgewidth=1.3)
     centre = np.clip(measured, _HALF_WIDTH_PX, np.subtract(image.shape[::-1], _HALF_WIDTH_PX))
+    u, v = np.maximum(np.floor(centre - _HALF_WIDTH_PX), 0).astype(int)
+    side = 2 * _HALF_WIDTH_PX + 2
+    cut = image[v : v + side, u : u + side]
+    edges = (u - 0.5, u + cut.shape[1] - 0.5, v + cut.shape[0] - 0.5, v - 0.5)
+    axes.imshow(cut, extent=edges, **shown)
     axes.set_xlim(centre[0] - _HALF_WIDTH_PX, centre[0] + _HALF_WIDTH_PX)
     axes.set_ylim(centre[1] + _HALF_WIDTH_PX, centre[1] - _HALF_WIDTH_PX)

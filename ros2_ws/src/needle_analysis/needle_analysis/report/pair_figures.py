@@ -18,6 +18,7 @@ from needle_analysis.report.figure_style import (
     STYLE,
     TRUTH,
     WIDTH,
+    place,
 )
 from needle_analysis.run.run_summary import (
     GOAL,
@@ -69,7 +70,8 @@ def _needles(runs: tuple[Run, Run]) -> list[tuple[str, str, Run]]:
 def _states(runs: tuple[Run, Run]) -> Figure:
     """Draw figure 3's rows: truth drawn through, estimate dashed; and what was commanded."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 10.4), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 10.4))
+        place(figure, 5, bottom=1.0)
         rows = figure.subplots(5, 1, sharex=True)
         rows[0].axhspan(-GOAL * MM, GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
         for letter, color, run in _needles(runs):
@@ -97,7 +99,7 @@ def _states(runs: tuple[Run, Run]) -> Figure:
         handles = [
             line for axes in (rows[0], rows[4]) for line in axes.get_legend_handles_labels()[0]
         ]
-        figure.legend(handles=handles, loc="outside lower center", ncols=3)
+        figure.legend(handles=handles, loc="lower center", ncols=3)
         return figure
 
 
@@ -113,7 +115,8 @@ def _draw_states(rows: Any, run: Run, states: Floats, stamps: Any, **style: Any)
 
 def _path(runs: tuple[Run, Run]) -> Figure:
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 5.2), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 5.2))
+        place(figure, 2)
         side, above = figure.subplots(2, 1, sharex=True)
         side.axhspan(-GOAL * MM, GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
         for letter, color, run in _needles(runs):
@@ -129,7 +132,8 @@ def _path(runs: tuple[Run, Run]) -> Figure:
 
 def _errors(runs: tuple[Run, Run]) -> Figure:
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 7.0), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 7.0))
+        place(figure, 3)
         tip, r1, roll = figure.subplots(3, 1, sharex=True)
         for letter, color, run in zip(LETTERS, _COLORS, runs, strict=True):
             tips = finite_tips(run)

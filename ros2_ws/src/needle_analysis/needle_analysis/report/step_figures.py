@@ -22,6 +22,7 @@ from needle_analysis.report.figure_style import (
     TRUTH,
     VIOLET,
     WIDTH,
+    place,
 )
 from needle_analysis.run.innovation import (
     QUANTILE_95,
@@ -39,7 +40,8 @@ _AXES = (("x, out of the plane", MEASURED), ("y", VIOLET), ("z, along", TEAL))
 def innovation_figure(run: Run, found: Innovations) -> Figure:
     """Return innovation, its size beside what is expected, and the room left to the gate."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 7.6), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 7.6))
+        place(figure, 3)
         parts, size, gate = figure.subplots(3, 1, sharex=True)
         insertion = run.insertion_at(found.stamps) * MM
         band = 2.0 * found.sigmas[:, 0] * MM
@@ -88,7 +90,8 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
     """Return the wall time of each stage of every step."""
     colors = (ESTIMATE, MEASURED, GREY, TEAL)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+        figure = Figure(figsize=(WIDTH, 3.4))
+        place(figure, 1, bottom=0.75)
         axes = figure.subplots()
         for timing, color in zip(timings, colors, strict=False):
             insertion = run.insertion_at(timing.stamps) * MM
@@ -96,7 +99,7 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
             axes.plot(insertion, milliseconds, ".", ms=4, color=color, label=timing.name)
         axes.set(yscale="log", ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        figure.legend(loc="outside lower center", ncols=4)
+        figure.legend(loc="lower center", ncols=4)
         return figure
 
 
