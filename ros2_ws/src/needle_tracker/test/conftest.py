@@ -56,6 +56,7 @@ def settings(calibration: StereoCalibration) -> TrackerSettings:
     return TrackerSettings(
         gates=gates,
         needle_width=0.7e-3,
+        bevel_length=0.0,
         bright=False,
         min_contrast=10.0,
         noise_factor=5.0,

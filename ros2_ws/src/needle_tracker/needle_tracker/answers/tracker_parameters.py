@@ -58,6 +58,9 @@ class StereoTrackerParameters:
         "those who publish joints and estimates know this node.",
     )
     needle_width: float = fixed_parameter(0.7e-3, "m", "Diameter of the needle.", 0.2e-3, 3e-3)
+    bevel_length: float = fixed_parameter(
+        0.0, "m", "Length of the needle's ground face, along the shaft; 0: unknown.", 0.0, 0.01
+    )
     needle_polarity: str = fixed_parameter(
         "auto",
         "-",
@@ -218,6 +221,7 @@ class StereoTrackerParameters:
         return TrackerSettings(
             gates=gates,
             needle_width=self.needle_width,
+            bevel_length=self.bevel_length,
             bright=None if self.needle_polarity == "auto" else self.needle_polarity == "bright",
             min_contrast=self.min_contrast,
             noise_factor=self.noise_factor,

@@ -95,6 +95,22 @@ def fit_end(
     return True
 
 
+def hidden_sigma(sigma: float, face: float) -> float:
+    """Return by how much a hidden face makes an end uncertain, if its length is known.
+
+    The end that is seen lies anywhere on the face: that is one more thing known of it, with the
+    variance of a uniform distribution. Where in it says nothing, so the end is not moved.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation along the shaft, of a face of any length [px or m].
+    face : float
+        The face's length along the shaft, in the same unit; 0 where unknown.
+    """
+    return sigma if face <= 0.0 else sigma / math.sqrt(1.0 + 12.0 * (sigma / face) ** 2)
+
+
 @inlined
 def _at(image: Image, x: float, y: float) -> float:
     """Return the map at a place, 0 to 1; 0 outside."""

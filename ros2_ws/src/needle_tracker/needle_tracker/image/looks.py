@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from needle_tracker.image import detection, tip_fit
 from needle_tracker.image.background import Background
 from needle_tracker.image.detection import DetectionSettings, Image, Path
-from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end
+from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end, hidden_sigma
 from needle_tracker.image.needle_map import Box, NeedleMap
 from needle_tracker.image.search_grid import SearchGrid
 from needle_tracker.image.tip_fit import HIDDEN_END_PX, HIDDEN_FACTOR, Expected, ImageTip
@@ -89,6 +89,8 @@ class MapLook:
     ----------
     needle_width_px : float
         Width of the needle in the image [px].
+    bevel_length_px : float
+        Length of its ground face there, seen from the side [px]; 0 where unknown.
 
     Attributes
     ----------
@@ -96,10 +98,11 @@ class MapLook:
         What stands behind the needle, where that is known.
     """
 
-    def __init__(self, needle_width_px: float) -> None:
+    def __init__(self, needle_width_px: float, bevel_length_px: float) -> None:
         self._map = NeedleMap(needle_width_px)
         self._map_of_difference = NeedleMap(needle_width_px)
         self._map_before = NeedleMap(needle_width_px)
+        self._bevel_length_px = bevel_length_px
         self.background: Background | None = None
 
     def _draw(self, image: Image, box: Box) -> Image:
@@ -178,7 +181,8 @@ class MapLook:
         height, wide = image.shape
         if sure < _SURE_ENOUGH or not (2.0 <= u <= wide - 3.0 and 2.0 <= v <= height - 3.0):
             return None
-        point, along = np.array([u, v]), math.hypot(along, _END_SYSTEMATIC * width)
+        point, hidden = np.array([u, v]), hidden_sigma(along, self._bevel_length_px)
+        along = math.hypot(along, _END_SYSTEMATIC * width)
         across = math.hypot(across, _LINE_SYSTEMATIC * width)
         clear = inside > _CLEAR_INSIDE and along < CLEAR_WIDTHS * width
         clear = clear and not self._is_seam(image, point, width)
@@ -191,7 +195,7 @@ class MapLook:
             point=point,
             direction=np.array([d_u, d_v]),
             sigma_across=across * (1.0 if clear else HIDDEN_FACTOR),
-            sigma_along=along if clear else HIDDEN_END_PX,
+            sigma_along=math.hypot(hidden, _END_SYSTEMATIC * width) if clear else HIDDEN_END_PX,
             sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC / LINE_WIDTHS),
             contrast=255.0 * sure,
             visibility=sure,

@@ -3,7 +3,7 @@
 A line ends where its darkness ends: where a ground face looks like the floor, both images end short
 by as much, and where light falls on one side of the needle, the line lies to the other in both. A
 map knows more of faces, and less of where the needle's middle is. No residual tells. What can be
-lost in that way is a share of the needle's width.
+lost in that way is a share of the needle's width, and no more than a face of known length hides.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.image.end_fit import hidden_sigma
 from needle_tracker.image.shaft import shaft_length
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -36,15 +37,18 @@ class Unseen:
         Along the shaft [needle widths].
     across : float
         Across it in an image [needle widths].
+    by_face : bool
+        Whether an end lies short because of a ground face.
     """
 
     along: float
     across: float
+    by_face: bool = True
 
 
 OF_OUTLINE = Unseen(0.2, 0.01)
 """Of a line that stands out as a whole."""
-OF_LAMP = Unseen(1.0, 0.1)
+OF_LAMP = Unseen(1.0, 0.1, by_face=False)
 """Of a lamp that the needle mirrors: it ends and lies where light has it."""
 OF_MAP = Unseen(0.25, 0.08)
 
@@ -60,6 +64,8 @@ class Claims:
         Width of the needle in the left and the right image [px].
     needle_width : float
         The needle's diameter [m].
+    bevel_length : float
+        Of its ground face, along the shaft [m]; 0 where unknown.
     """
 
     def __init__(
@@ -67,10 +73,12 @@ class Claims:
         views: tuple[RefractedCamera, RefractedCamera],
         needle_widths_px: tuple[float, float],
         needle_width: float,
+        bevel_length: float,
     ) -> None:
         self._views = views
         self._needle_widths_px = needle_widths_px
         self._needle_width = needle_width
+        self._bevel_length = bevel_length
 
     def widened(self, tip: SpatialTip, unseen: Unseen) -> SpatialTip:
         """Return the tip with as large a covariance as it has to claim.
@@ -91,7 +99,10 @@ class Claims:
             normal += np.outer(beside, beside) / (line @ line * (unseen.across * width) ** 2)
         # Lines say nothing along the shaft, so `normal` has no part of it either.
         claimed = np.linalg.pinv(normal, hermitian=True, rtol=1e-9)
-        claimed += np.outer(ahead, ahead) * (unseen.along * self._needle_width) ** 2
+        along = unseen.along * self._needle_width
+        if unseen.by_face:
+            along = hidden_sigma(along, self._bevel_length)
+        claimed += np.outer(ahead, ahead) * along**2
         return dataclasses.replace(tip, covariance=tip.covariance + claimed)
 
 

@@ -48,9 +48,15 @@ class TipTracker:
     def __init__(self, calibration: StereoCalibration, settings: TrackerSettings) -> None:
         self._lines = StereoTracker(calibration, settings)
         widths = self._lines.needle_widths_px
-        self._claims = Claims(self._lines.views, widths, settings.needle_width)
+        self._claims = Claims(
+            self._lines.views, widths, settings.needle_width, settings.bevel_length
+        )
         self._staged = StagedEnd(0.5 * settings.gates.reach.hole_tolerance)
-        left, right = self._looks = (MapLook(widths[0]), MapLook(widths[1]))
+        face_widths = settings.bevel_length / settings.needle_width
+        left, right = self._looks = (
+            MapLook(widths[0], face_widths * widths[0]),
+            MapLook(widths[1], face_widths * widths[1]),
+        )
         self._backgrounds = Backgrounds(
             self._lines.views, settings.hole_clearance, settings.needle_width, settings.reference
         )

@@ -18,6 +18,8 @@ class TrackerSettings:
         Bounds that a believed tip keeps.
     needle_width : float
         Diameter of the needle [m].
+    bevel_length : float
+        Of its ground face, along the shaft [m]; 0 where unknown.
     bright : bool or None
         Whether it is brighter than its surroundings; None: found out.
     min_contrast : float
@@ -34,6 +36,7 @@ class TrackerSettings:
 
     gates: GateSettings
     needle_width: float
+    bevel_length: float
     bright: bool | None
     min_contrast: float
     noise_factor: float

@@ -114,6 +114,7 @@ def test_parameters_of_the_node_count_here_too(
     [
         ("stereo_tracker: {ros__parameters: {needle_widht: 0.001}}", "needle_widht"),
         ("stereo_tracker: {ros__parameters: {needle_width: 1.0}}", "needle_width"),
+        ("stereo_tracker: {ros__parameters: {bevel_length: 1.2}}", "bevel_length"),
         ("stereo_trakcer: {ros__parameters: {needle_width: 0.001}}", "stereo_trakcer"),
     ],
 )
@@ -130,6 +131,15 @@ def test_parameters_that_are_none_are_refused_in_one_line(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_an_end_without_a_long_face_is_surer(folder: Path, calibration_path: Path) -> None:
+    insertion, params = str(folder / "insertion.csv"), folder / "params.yaml"
+    _, unknown = track(folder, calibration_path, "--insertion", insertion)
+    params.write_text("stereo_tracker: {ros__parameters: {bevel_length: 0.0001}}")
+    code, known = track(folder, calibration_path, "--insertion", insertion, "--params", str(params))
+    assert code == 0
+    assert float(known[-1]["sigma_z_m"]) < 0.5 * float(unknown[-1]["sigma_z_m"])
 
 
 def test_without_insertion_three_must_agree(folder: Path, calibration_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from needle_tracker.image.end_fit import _make_survival, fit_end
+from needle_tracker.image.end_fit import _make_survival, fit_end, hidden_sigma
 
 SHAPE = (80, 160)
 WIDTH = 5.0
@@ -50,6 +50,18 @@ def test_an_end_is_as_uncertain_as_the_map_says(sigma: float) -> None:
     assert result is not None
     assert result[5] == pytest.approx(sigma, rel=0.2)
     assert np.linalg.norm(result[:2] - END) < 0.3 * sigma
+
+
+def test_an_end_that_a_known_face_hides_is_as_uncertain_as_both_say_together() -> None:
+    sigma, face = 0.45, 1.2
+    # What the map says times what the face's length says, as one distribution.
+    places = np.linspace(-4.0, 4.0, 8001)
+    chance = norm.pdf(places, scale=sigma) * norm.pdf(places, scale=face / math.sqrt(12.0))
+    together = math.sqrt((chance * places**2).sum() / chance.sum())
+    assert hidden_sigma(sigma, face) == pytest.approx(together, rel=1e-6)
+    assert hidden_sigma(sigma, 0.0) == sigma
+    assert hidden_sigma(sigma, 100.0 * sigma) == pytest.approx(sigma, rel=1e-2)
+    assert hidden_sigma(100.0 * face, face) == pytest.approx(face / math.sqrt(12.0), rel=1e-3)
 
 
 def test_a_line_beside_where_it_should_be_is_found_within_the_search_only() -> None:

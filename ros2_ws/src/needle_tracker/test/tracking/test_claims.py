@@ -21,7 +21,7 @@ def tip(covariance: np.ndarray) -> SpatialTip:
 
 @pytest.mark.parametrize("unseen", [OF_OUTLINE, OF_LAMP, OF_MAP])
 def test_what_is_added_is_what_noise_of_that_share_does(views: Views, unseen: Unseen) -> None:
-    claims = Claims(views, WIDTHS_PX, WIDTH)
+    claims = Claims(views, WIDTHS_PX, WIDTH, 0.0)
     fit = np.diag([1e-10, 2e-10, 3e-10])
     added = claims.widened(tip(fit), unseen).covariance - fit
     assert float(AHEAD @ added @ AHEAD) == pytest.approx((unseen.along * WIDTH) ** 2, rel=1e-6)
@@ -44,9 +44,28 @@ def test_what_is_added_is_what_noise_of_that_share_does(views: Views, unseen: Un
     assert claimed == pytest.approx(seen, rel=0.35)
 
 
+def test_a_known_face_bounds_what_it_may_hide_and_not_where_a_lamp_ends(views: Views) -> None:
+    fit = np.diag([1e-10, 2e-10, 3e-10])
+    face = 0.3e-3
+
+    def added(unseen: Unseen, bevel_length: float) -> np.ndarray:
+        claims = Claims(views, WIDTHS_PX, WIDTH, bevel_length)
+        return np.asarray(claims.widened(tip(fit), unseen).covariance - fit)
+
+    for unseen in (OF_OUTLINE, OF_MAP):
+        known, unknown = added(unseen, face), added(unseen, 0.0)
+        share = (unseen.along * WIDTH) ** 2
+        expected = 1.0 / (1.0 / share + 12.0 / face**2)
+        assert float(AHEAD @ known @ AHEAD) == pytest.approx(expected, rel=1e-6)
+        # Across the shaft it says nothing.
+        across = np.eye(3) - np.outer(AHEAD, AHEAD)
+        np.testing.assert_allclose(across @ known @ across, across @ unknown @ across, atol=1e-18)
+    assert np.array_equal(added(OF_LAMP, face), added(OF_LAMP, 0.0))
+
+
 def test_a_tip_claims_no_more_than_its_fit(views: Views) -> None:
     loose = np.diag([1e-6, 1e-6, 4e-6])
-    widened = Claims(views, WIDTHS_PX, WIDTH).widened(tip(loose), OF_OUTLINE)
+    widened = Claims(views, WIDTHS_PX, WIDTH, 0.0).widened(tip(loose), OF_OUTLINE)
     assert np.linalg.eigvalsh(widened.covariance - loose).min() > 0.0
     assert widened.covariance == pytest.approx(loose, rel=0.1, abs=1e-7)
     assert np.array_equal(widened.position, POSITION)

@@ -40,7 +40,12 @@ def read(folder: Path, name: str) -> tuple[Image, Image]:
 
 
 def tracked(
-    calibration: StereoCalibration, name: str, *, empty: bool, insertion: bool = True
+    calibration: StereoCalibration,
+    name: str,
+    *,
+    empty: bool,
+    insertion: bool = True,
+    bevel_length: float = 0.0,
 ) -> list[tuple[SpatialTip | None, np.ndarray]]:
     """Return what is said of each pair of a scene, and the truth; a box has its own cameras."""
     folder = SCENES / name
@@ -52,6 +57,7 @@ def tracked(
     settings = dataclasses.replace(
         default_settings(cut_out),
         needle_width=scene["diameter"],
+        bevel_length=bevel_length,
         reference=read(folder, "empty") if empty else None,
     )
     tracker = TipTracker(cut_out, settings)
@@ -83,6 +89,23 @@ def test_a_steel_needle_is_found_and_no_surer_than_it_is_known(
         off = tip.position - truth
         assert np.linalg.norm(off) < 1e-3
         assert off @ np.linalg.solve(tip.covariance, off) < _CHI_SQUARED_999
+
+
+def test_a_face_of_known_length_makes_its_end_surer(calibration: StereoCalibration) -> None:
+    surer = 0
+    for (unknown, truth), (known, _) in zip(
+        tracked(calibration, "steel_on_dark", empty=False, insertion=False),
+        tracked(calibration, "steel_on_dark", empty=False, insertion=False, bevel_length=0.76e-3),
+        strict=True,
+    ):
+        assert (known is None) == (unknown is None)
+        if known is None or unknown is None:
+            continue
+        off = known.position - truth
+        assert off @ np.linalg.solve(known.covariance, off) < _CHI_SQUARED_999
+        before, now = (tip.direction @ tip.covariance @ tip.direction for tip in (unknown, known))
+        surer += bool(now < 0.8 * before)
+    assert surer >= 2
 
 
 def test_over_graph_paper_the_empty_phantom_is_what_helps(calibration: StereoCalibration) -> None:
