@@ -56,7 +56,10 @@ SUMMARY_LIMIT: Final = 2**27
 # Times [ns] are signed in ROS 2.
 TIME_LIMIT: Final = 2**63
 _MESSAGE: Final = struct.Struct("<HIQQ")
-_DEFINITIONS: Final = {Opcode.CHANNEL: Channel, Opcode.SCHEMA: Schema}
+_DEFINITIONS: Final[dict[int, type[Channel] | type[Schema]]] = {
+    Opcode.CHANNEL: Channel,
+    Opcode.SCHEMA: Schema,
+}
 
 
 class BrokenMcapError(Exception):
