@@ -10,6 +10,7 @@ row. Outside of the grid (sheath, hole, the phantom's rim) nothing is looked at.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 
 import numpy as np
@@ -125,6 +126,8 @@ class SearchGrid:
         )
 
 
+# Trackers of the same rig, one beside the other or one after the other, share theirs.
+@functools.lru_cache(maxsize=8)
 def make_search_grid(
     view: RefractedCamera,
     reach: Reach,

@@ -37,6 +37,18 @@ class RefractedCamera:
         self._foot, self._camera_height = foot_and_height(camera)
         self.packed = pack_camera(camera)
 
+    def __eq__(self, other: object) -> bool:
+        """Return whether both have the same image of everything."""
+        return isinstance(other, RefractedCamera) and self._identity == other._identity
+
+    def __hash__(self) -> int:
+        """Return what is equal for equal cameras."""
+        return hash(self._identity)
+
+    @property
+    def _identity(self) -> tuple[int, int, bytes]:
+        return self.camera.width, self.camera.height, self.packed.tobytes()
+
     @property
     def sideways(self) -> Array:
         """Unit vector in `rig`, shape (3,), across the needle's axis and the window's normal.
