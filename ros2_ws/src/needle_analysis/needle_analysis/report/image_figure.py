@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import matplotlib as mpl
@@ -16,9 +17,9 @@ from needle_bags.reading.bag_images import SIDES, exposures, images_at
 from needle_bags.reading.bag_reader import Run
 from needle_common.errors import UserError
 from needle_tracker.optics.calibration import parse_calibration
-from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 
 Floats = npt.NDArray[np.float64]
+Projection = Callable[[Floats], Floats]
 
 SHOWN = 3
 _HALF_WIDTH_PX = 110
@@ -34,7 +35,7 @@ def images_figure(run: Run) -> Figure | None:
     pictures = {(index, side): image for index, side, image in images_at(run, chosen)}
     if not pictures:
         return None
-    cameras = _cameras(run)
+    projections = _projections(run)
     with mpl.rc_context({"font.size": 9}):
         columns = sorted({index for index, _ in pictures})
         figure = Figure(figsize=(WIDTH, 4.9))
@@ -49,7 +50,7 @@ def images_figure(run: Run) -> Figure | None:
                 image = pictures.get((index, side))
                 if image is None:
                     continue
-                _draw_exposure(axes, run, int(chosen[index]), image, cameras.get(side))
+                _draw_exposure(axes, run, int(chosen[index]), image, projections.get(side))
                 axes.set_title(f"{side}, {insertion[index]:.0f} mm", fontsize=9)
         return figure
 
@@ -66,12 +67,16 @@ def _choose_exposures(run: Run) -> npt.NDArray[np.int64]:
     return chosen
 
 
-def _cameras(run: Run) -> dict[str, RefractedCamera]:
+def _projections(run: Run) -> dict[str, Projection]:
+    # A run without images needs nothing that is compiled.
+    from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
+
     try:
         calibration = parse_calibration(yaml.safe_load(run.calibration))
     except (UserError, yaml.YAMLError):
         return {}
-    return dict(zip(SIDES, stereo_views(calibration), strict=True))
+    views = stereo_views(calibration)
+    return {side: view.project for side, view in zip(SIDES, views, strict=True)}
 
 
 def _draw_exposure(
@@ -79,20 +84,20 @@ def _draw_exposure(
     run: Run,
     stamp: int,
     image: npt.NDArray[np.uint8],
-    camera: RefractedCamera | None,
+    project: Projection | None,
 ) -> None:
     low, high = np.percentile(image, [0.5, 99.8])
     shown = {"cmap": "gray", "vmin": low, "vmax": high, "interpolation": "nearest"}
-    if camera is None:
+    if project is None:
         axes.imshow(image, **shown)
         return
     tip = run.tips.values[run.tips.stamps == stamp][0]
-    measured = np.ravel(camera.project(tip))
+    measured = np.ravel(project(tip))
     circle: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 1.6}
     axes.plot(*measured, "o", markersize=16, markeredgecolor="#ff8a1f", **circle)
     truth = run.truth.values[run.truth.stamps == stamp, :3]
     if len(truth):
-        true = np.ravel(camera.project(truth[0]))
+        true = np.ravel(project(truth[0]))
         axes.plot(*true, "+", markersize=11, markeredgecolor="#35e06d", markeredgewidth=1.3)
     centre = np.clip(measured, _HALF_WIDTH_PX, np.subtract(image.shape[::-1], _HALF_WIDTH_PX))
     u, v = np.maximum(np.floor(centre - _HALF_WIDTH_PX), 0).astype(int)

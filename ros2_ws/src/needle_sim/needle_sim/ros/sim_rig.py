@@ -37,7 +37,7 @@ from needle_sim.ros.conversions import to_truth
 from needle_sim.ros.drive_follower import DriveFollower
 from needle_sim.ros.parameters import SimRigParameters
 from needle_sim.ros.simulated_device import SimulatedDevice
-from needle_sim.ros.simulated_sensors import SimulatedCameras, SimulatedTips
+from needle_sim.ros.simulated_tips import SimulatedTips
 
 HELP = """\
 sim_rig: stands in for the rig, so that every other node runs as on the real one.
@@ -140,6 +140,9 @@ class SimRigNode(WholeNode):
         if values.level == "tip":
             self._sensors = SimulatedTips(self, self._bench, values)
         else:
+            # The renderer takes longer to load than all else: not where nothing is drawn.
+            from needle_sim.ros.simulated_cameras import SimulatedCameras  # noqa: PLC0415
+
             self._sensors = SimulatedCameras(self, self._bench, values, self._on_answer)
         self._partners = AnsweringNodes(self)
         tips = ("needle/tip",) if values.level == "tip" else ()

@@ -1,15 +1,14 @@
-"""Exposures of sim_rig: the measured tip at level tip, images of the needle at the others."""
+"""Exposures of sim_rig at the levels with cameras: images of the needle."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from ament_index_python.packages import get_package_share_directory
 from builtin_interfaces.msg import Time
-from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
@@ -21,55 +20,11 @@ from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.ros.conversions import to_camera_info, to_image, to_tip, to_tip_pose
+from needle_sim.ros.conversions import to_camera_info, to_image
 from needle_sim.ros.parameters import SimRigParameters
 
 _FRAMES = ("left_camera_optical", "right_camera_optical")
 _CENTRELINE_SPACING = 0.001
-
-
-class SimulatedTips:
-    """Publishes the tip with the noise of each exposure.
-
-    Parameters
-    ----------
-    node : Node
-        Gets the publishers.
-    bench : SimulatedBench
-        What is measured.
-    values : SimRigParameters
-        The node's.
-
-    Attributes
-    ----------
-    publishers, heard : list of Publisher
-        All of its publishers, and those that partners must listen to.
-    subscriptions : list of Subscription
-        Topics that partners must publish.
-    """
-
-    half_sizes = (math.inf, math.inf)
-    """Ends of the phantom, either way, along x and y [m]: none without cameras."""
-
-    def __init__(self, node: Node, bench: SimulatedBench, values: SimRigParameters) -> None:
-        self._bench = bench
-        self._noise = values.tip_noise
-        self._tip = node.create_publisher(PointStamped, "needle/tip", RELIABLE)
-        self._tip_pose = node.create_publisher(
-            PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE
-        )
-        self.publishers: list[Publisher[Any]] = [self._tip, self._tip_pose]
-        self.heard: list[Publisher[Any]] = [self._tip]
-        self.subscriptions: list[Subscription[Any]] = []
-
-    def expose(self, number: int, stamp: Time) -> None:
-        """Publish the measurement of an exposure."""
-        tip = self._bench.measure_tip(number)
-        self._tip_pose.publish(to_tip_pose(tip, self._noise, stamp))
-        self._tip.publish(to_tip(tip, stamp))
-
-    def close(self) -> None:
-        """Do nothing: nothing is open."""
 
 
 class SimulatedCameras:
