@@ -127,7 +127,7 @@ class SearchGrid:
 
 
 # Trackers of the same rig, one beside the other or one after the other, share theirs.
-@functools.lru_cache(maxsize=8)
+@functools.lru_cache(maxsize=4)
 def make_search_grid(
     view: RefractedCamera,
     reach: Reach,
