@@ -28,6 +28,7 @@ LONG_FILES = (
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
     "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
     "ros2_ws/src/needle_analysis/test/ros/test_rerun.py",
+    "ros2_ws/src/needle_analysis/test/ros/test_rerun_hearing.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
 )
 _left: list[str] = []
