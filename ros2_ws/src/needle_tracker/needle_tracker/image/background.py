@@ -6,6 +6,8 @@ its end hides where that is. What was there before the needle takes them away.
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -45,8 +47,7 @@ class Background:
         self._mean = max(_mean(before), _LEAST_LEVEL)
         self._image: Image | None = None
         self._difference: Image | None = None
-        rows, columns = np.ogrid[: before.shape[0], : before.shape[1]]
-        self._away = np.hypot(columns - entry[0], rows - entry[1]).astype(np.float32)
+        self._away = _distances(before.shape, *map(float, entry))
         self._entry = entry
         self._seam: float | None = None
 
@@ -122,6 +123,13 @@ class Background:
         if self._seam is None:
             return False
         return abs(float(np.hypot(*(point - self._entry))) - self._seam) < room
+
+
+@lru_cache(maxsize=2)
+def _distances(shape: tuple[int, int], x: float, y: float) -> NDArray[np.float32]:
+    """Return how far each pixel is from a point [px]; of one camera it stays the same."""
+    rows, columns = np.ogrid[: shape[0], : shape[1]]
+    return np.hypot((columns - x).astype(np.float32), (rows - y).astype(np.float32))
 
 
 def _mean(image: Image) -> float:

@@ -37,6 +37,9 @@ _ENDS = frozenset(
 _OURS = "fuzz"
 _PERIOD = 0.005
 _LONGEST_QUEUE = 50
+# By then each node has seen everything once, and has the memory that it takes for good, on a busy
+# machine too [s].
+_SEEN_ONCE = 3.0
 
 
 def fuzz_trials(folder: Path, domain: int, seconds: float, seed: int) -> Iterator[dict[str, Any]]:
@@ -83,8 +86,7 @@ def _half(
         fuzzer.send()
         witness.look(_PERIOD)
         processes.check()
-        if not memory and time.monotonic() > begun + 0.2 * seconds:
-            # Until then each has seen everything once.
+        if not memory and time.monotonic() > begun + max(0.2 * seconds, _SEEN_ONCE):
             memory = processes.memories()
     grown = {name: (now - memory[name]) / 1e6 for name, now in processes.memories().items()}
     return {
