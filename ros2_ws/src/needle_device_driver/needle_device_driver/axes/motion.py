@@ -1,8 +1,27 @@
-"""Both joints on one straight way, in proportion at every moment."""
+"""Both joints on one way of straight legs, in proportion at every moment."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
+from collections.abc import Sequence
+
+
+@dataclasses.dataclass(frozen=True)
+class Leg:
+    """A straight piece of a way: where it ends, and in what time at full speed.
+
+    Attributes
+    ----------
+    insertion, rotation : float
+        Where both joints are at its end [m], [rad].
+    duration : float
+        At full speed [s].
+    """
+
+    insertion: float
+    rotation: float
+    duration: float
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,32 +47,38 @@ class CoordinatedMotion:
 
     Parameters
     ----------
-    start, end : tuple of float
+    start : tuple of float
         Insertion [m] and rotation [rad].
-    duration : float
-        Time at full speed [s].
+    legs : sequence of Leg
+        The way from there, at least one leg.
     """
 
-    def __init__(
-        self, start: tuple[float, float], end: tuple[float, float], duration: float
-    ) -> None:
-        self._start = start
-        self.end = end
-        self._duration = duration
+    def __init__(self, start: tuple[float, float], legs: Sequence[Leg]) -> None:
+        self._start = self._at = start
+        self._legs = tuple(legs)
+        self._leg = 0
+        # Of the leg under way.
         self._progress = 0.0
 
     @property
     def complete(self) -> bool:
         """Tell whether the last set-point was given."""
-        return self._progress >= 1.0
+        return self._is_last and self._progress >= 1.0
 
     def advance(self, period: float, speed_scale: float) -> SetPoint:
         """Return the set-point `period` [s] later at `speed_scale` (0..1) of full speed."""
-        rate = speed_scale / self._duration
+        left = period
+        rate = speed_scale / self._legs[self._leg].duration
+        while not self._is_last and self._progress + rate * left >= 1.0:
+            left -= (1.0 - self._progress) / rate
+            self._next_leg()
+            rate = speed_scale / self._legs[self._leg].duration
         # Progress sums up rounding; without the margin a step could take a period of nothing more.
-        self._progress += rate * period
+        self._progress += rate * left
         if self._progress > 1.0 - 1e-9:
             self._progress = 1.0
+        if left < period:
+            return self._set_point_after(period)
         return self._set_point(rate)
 
     def follow(self, insertion: float, max_rotation_rate: float, period: float) -> SetPoint:
@@ -62,19 +87,87 @@ class CoordinatedMotion:
         The rotation never goes back, and no faster than `max_rotation_rate` [rad/s] over the
         `period` [s]: after a push that was faster it comes in late.
         """
-        way = self.end[0] - self._start[0]
-        reached = min(max((insertion - self._start[0]) / way, self._progress), 1.0)
-        turn = abs(self.end[1] - self._start[1])
-        fastest = max_rotation_rate * period / turn if turn > 0.0 else 1.0
-        step = min(reached - self._progress, fastest)
-        self._progress += step
-        return self._set_point(step / period)
+        turn = max_rotation_rate * period
+        while True:
+            leg = self._legs[self._leg]
+            way, whole = leg.insertion - self._start[0], abs(leg.rotation - self._start[1])
+            # A hand may have passed the leg before it began.
+            part = (insertion - self._start[0]) / way if way > 0.0 else 1.0
+            reached = min(max(part, self._progress), 1.0)
+            step = min(reached - self._progress, turn / whole if whole > 0.0 else 1.0)
+            self._progress += step
+            turn -= step * whole
+            if self._progress < 1.0 or self._is_last:
+                return self._set_point_after(period)
+            self._next_leg()
+
+    def rotation_at(self, insertion: float) -> float:
+        """Return the rotation that belongs to an insertion; at the ends that of the end [rad]."""
+        start = self._start
+        for leg in self._legs[self._leg :]:
+            if insertion < leg.insertion:
+                part = max(insertion - start[0], 0.0) / (leg.insertion - start[0])
+                return start[1] + part * (leg.rotation - start[1])
+            start = leg.insertion, leg.rotation
+        return start[1]
+
+    @property
+    def _is_last(self) -> bool:
+        return self._leg == len(self._legs) - 1
+
+    def _next_leg(self) -> None:
+        leg = self._legs[self._leg]
+        self._start = leg.insertion, leg.rotation
+        self._leg += 1
+        self._progress = 0.0
+
+    def _place(self) -> tuple[float, float]:
+        leg = self._legs[self._leg]
+        if self._progress >= 1.0:
+            # Exactly the target at the end: start + (end - start) is not.
+            return leg.insertion, leg.rotation
+        insertion, rotation = self._start
+        return (
+            insertion + self._progress * (leg.insertion - insertion),
+            rotation + self._progress * (leg.rotation - rotation),
+        )
 
     def _set_point(self, rate: float) -> SetPoint:
-        insertion, rotation = (
-            # Exactly the target at the end: start + (end - start) is not.
-            end if self.complete else start + self._progress * (end - start)
-            for start, end in zip(self._start, self.end, strict=True)
+        leg, start = self._legs[self._leg], self._start
+        self._at = self._place()
+        speeds = rate * abs(leg.insertion - start[0]), rate * abs(leg.rotation - start[1])
+        return SetPoint(*self._at, *speeds)
+
+    def _set_point_after(self, period: float) -> SetPoint:
+        before, self._at = self._at, self._place()
+        speeds = [abs(b - a) / period for a, b in zip(before, self._at, strict=True)]
+        return SetPoint(*self._at, *speeds)
+
+
+def slowed_legs(
+    start: tuple[float, float],
+    legs: Sequence[Leg],
+    *,
+    max_speed: float,
+    max_rotation_rate: float = math.inf,
+) -> tuple[Leg, ...]:
+    """Return legs that take long enough for both bounds: insertion waits where rotation is slow.
+
+    Parameters
+    ----------
+    start : tuple of float
+        Insertion [m] and rotation [rad] where the first begins.
+    legs : sequence of Leg
+        The way.
+    max_speed, max_rotation_rate : float
+        The bounds [m/s], [rad/s].
+    """
+    slowed = []
+    for leg in legs:
+        shortest = max(
+            abs(leg.insertion - start[0]) / max_speed,
+            abs(leg.rotation - start[1]) / max_rotation_rate,
         )
-        speeds = [rate * abs(end - start) for start, end in zip(self._start, self.end, strict=True)]
-        return SetPoint(insertion, rotation, *speeds)
+        slowed.append(dataclasses.replace(leg, duration=max(leg.duration, shortest)))
+        start = leg.insertion, leg.rotation
+    return tuple(slowed)

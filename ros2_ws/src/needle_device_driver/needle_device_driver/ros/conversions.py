@@ -49,6 +49,7 @@ def to_hold_message(message: Joy) -> HoldMessage:
         stamp_ns=to_nanoseconds(message.header.stamp),
         pressed=len(message.buttons) > 0 and message.buttons[0] == 1,
         speed_scale=float(message.axes[0]) if len(message.axes) > 0 else math.nan,
+        lifetime=float(message.axes[1]) if len(message.axes) > 1 else math.inf,
     )
 
 
@@ -89,6 +90,8 @@ def to_diagnostic(status: DeviceStatus) -> Diagnostic:
             "watchdog_trips": str(status.watchdog_trips),
             "commands_refused": str(status.commands_refused),
             "needs_time": "true" if status.needs_time else "false",
+            "command_ns": str(status.command_ns),
+            "rotation_owed_rad": f"{status.rotation_owed:.2f}",
             "simulated": "" if status.simulated is None else str(status.simulated).lower(),
         },
     )

@@ -101,6 +101,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             rotation,
             values.limits,
             lock_step=values.lock_step,
+            path_delay=values.path_delay,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
         )

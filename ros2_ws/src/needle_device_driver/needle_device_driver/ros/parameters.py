@@ -10,7 +10,11 @@ from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link.can_link import LINKS, LinkSettings
-from needle_device_driver.supervisor.limits import SafetyLimits, limit_parameter
+from needle_device_driver.supervisor.limits import (
+    SafetyLimits,
+    limit_parameter,
+    path_delay_parameter,
+)
 
 # Beyond the supervisor's own limits, a drive's limits leave room for its following error.
 _LIMIT_MARGIN = 2.0
@@ -47,6 +51,7 @@ class _RigParameters:
     lock_step: bool = fixed_parameter(
         False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
     )
+    path_delay: float = path_delay_parameter()
     wait_for_recorder: bool = fixed_parameter(
         False,
         "-",

@@ -1,14 +1,22 @@
-"""A step command, and the rules that refuse it whole."""
+"""A command, step or path, and the rules that refuse it whole.
+
+A step is one point: where both joints go. A path is several, rotation over insertion for the next
+piece of a continuous insertion; it may begin where the device has been, with a point at
+`time_from_start` 0, and takes the place of the path under way.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 from needle_common.foreign_text import plain_list
+from needle_device_driver.axes.motion import Leg
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import HARD_STEP_TIME_CAP, SafetyLimits
 
+MOST_POINTS = 32
 INSERTION_JOINT = "insertion_joint"
 ROTATION_JOINT = "rotation_joint"
 
@@ -27,7 +35,7 @@ class CommandPoint:
     others : tuple of float
         Every other number that the point carries; unused, yet must be finite.
     time_from_start : float
-        Nominal duration [s].
+        Nominal time at which it is reached [s].
     """
 
     positions: tuple[float, ...]
@@ -46,12 +54,17 @@ class Command:
     joint_names : tuple of str
         Names of the joints, in the order of the positions.
     points : tuple of CommandPoint
-        The way; one point is wanted.
+        The way; a step has one, a path several.
     """
 
     stamp_ns: int
     joint_names: tuple[str, ...]
     points: tuple[CommandPoint, ...]
+
+    @property
+    def is_path(self) -> bool:
+        """Tell whether it may take the place of a path under way."""
+        return len(self.points) > 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,15 +94,6 @@ class CommandContext:
 
 
 @dataclasses.dataclass(frozen=True)
-class Step:
-    """A command that broke no rule: where to go [m], [rad], and in what time at full speed [s]."""
-
-    insertion: float
-    rotation: float
-    duration: float
-
-
-@dataclasses.dataclass(frozen=True)
 class Refusal:
     """The rule that a command broke, and how, with value and bound."""
 
@@ -99,8 +103,8 @@ class Refusal:
 
 def check_command(
     command: Command, context: CommandContext, limits: SafetyLimits
-) -> Step | Refusal:
-    """Return the step that a command asks for, or the first rule that it breaks.
+) -> tuple[Leg, ...] | Refusal:
+    """Return the way that a command asks for, or the first rule that it breaks.
 
     Parameters
     ----------
@@ -113,8 +117,9 @@ def check_command(
 
     Returns
     -------
-    Step or Refusal
-        Never a part of a command.
+    tuple of Leg, or Refusal
+        Of a path what lies ahead of where the joints were last told to be; otherwise never a part
+        of a command.
     """
     if context.publishers > 1:
         return Refusal(
@@ -125,32 +130,39 @@ def check_command(
         return wrong
     if not context.homed:
         return Refusal(Rule.HOMED_FIRST, "the axes are not homed")
-    point = command.points[0]
-    targets = dict(zip(command.joint_names, point.positions, strict=True))
-    step = Step(targets[INSERTION_JOINT], targets[ROTATION_JOINT], point.time_from_start)
-    return _check_bounds(step, context, limits) or step
+    way = _way(command, context)
+    return _check_bounds(way, context, limits) or _ahead(way, context.insertion)
 
 
 def _check_form(command: Command) -> Refusal | None:
-    names = command.joint_names
+    names, points = command.joint_names, command.points
     if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
         return Refusal(
             Rule.COMMAND_FORM,
             f"joints {plain_list(names)}, wanted {INSERTION_JOINT}, {ROTATION_JOINT}",
         )
-    if len(command.points) != 1:
-        return Refusal(Rule.COMMAND_FORM, f"{len(command.points)} points, wanted 1")
-    point = command.points[0]
-    if len(point.positions) != len(names):
-        return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, wanted 2")
-    if not all(map(math.isfinite, (*point.positions, *point.others, point.time_from_start))):
-        return Refusal(Rule.COMMAND_FINITE, "a number is not finite")
-    if not 0.0 < point.time_from_start <= HARD_STEP_TIME_CAP:
+    if not 0 < len(points) <= MOST_POINTS:
+        return Refusal(Rule.COMMAND_FORM, f"{len(points)} points, wanted 1 to {MOST_POINTS}")
+    for point in points:
+        if len(point.positions) != len(names):
+            return Refusal(Rule.COMMAND_FORM, f"{len(point.positions)} positions, wanted 2")
+        if not all(map(math.isfinite, (*point.positions, *point.others, point.time_from_start))):
+            return Refusal(Rule.COMMAND_FINITE, "a number is not finite")
+    return _check_times(command)
+
+
+def _check_times(command: Command) -> Refusal | None:
+    times = [point.time_from_start for point in command.points]
+    # A path may begin where the device is, or has been.
+    earliest = 0.0 if command.is_path else math.nextafter(0.0, 1.0)
+    if not earliest <= times[0] or not times[-1] <= HARD_STEP_TIME_CAP:
+        wrong = times[0] if times[0] < earliest else times[-1]
         return Refusal(
             Rule.COMMAND_FORM,
-            f"time_from_start {point.time_from_start:g} s, wanted > 0 s and at most "
-            f"{HARD_STEP_TIME_CAP:g} s",
+            f"time_from_start {wrong:g} s, wanted > 0 s and at most {HARD_STEP_TIME_CAP:g} s",
         )
+    if any(after <= before for before, after in itertools.pairwise(times)):
+        return Refusal(Rule.COMMAND_FORM, "time_from_start does not rise from point to point")
     return None
 
 
@@ -167,19 +179,65 @@ def _check_time(command: Command, context: CommandContext, limits: SafetyLimits)
     return None
 
 
-def _check_bounds(step: Step, context: CommandContext, limits: SafetyLimits) -> Refusal | None:
-    length = step.insertion - context.insertion
-    rotation = abs(step.rotation - context.rotation)
+@dataclasses.dataclass(frozen=True)
+class _Piece:
+    start: tuple[float, float]
+    leg: Leg
+
+    @property
+    def length(self) -> float:
+        return self.leg.insertion - self.start[0]
+
+    @property
+    def turn(self) -> float:
+        return abs(self.leg.rotation - self.start[1])
+
+
+def _way(command: Command, context: CommandContext) -> list[_Piece]:
+    """Return the whole way, from its own first point if that is at time 0, else from the joints."""
+    insertion, rotation = map(command.joint_names.index, (INSERTION_JOINT, ROTATION_JOINT))
+    start, before = (context.insertion, context.rotation), 0.0
+    way = []
+    for point in command.points:
+        at = point.positions[insertion], point.positions[rotation]
+        if point.time_from_start > 0.0:
+            way.append(_Piece(start, Leg(*at, point.time_from_start - before)))
+        start, before = at, point.time_from_start
+    return way
+
+
+def _ahead(way: list[_Piece], insertion: float) -> tuple[Leg, ...]:
+    """Return the legs ahead of an insertion [m]; one partly done takes its share of time."""
+    ahead = [piece for piece in way if piece.leg.insertion > insertion]
+    first = ahead[0]
+    part = (first.leg.insertion - insertion) / first.length
+    rest = dataclasses.replace(first.leg, duration=first.leg.duration * part)
+    return (rest, *(piece.leg for piece in ahead[1:]))
+
+
+def _check_bounds(
+    way: list[_Piece], context: CommandContext, limits: SafetyLimits
+) -> Refusal | None:
+    end = way[-1].leg.insertion
+    length = end - context.insertion
     if length <= 0.0:
         return Refusal(
             Rule.FORWARD_ONLY,
-            f"insertion {step.insertion * 1e3:.4g} mm is not ahead of "
-            f"{context.insertion * 1e3:.4g} mm",
+            f"insertion {end * 1e3:.4g} mm is not ahead of {context.insertion * 1e3:.4g} mm",
         )
-    speed, rate = length / step.duration, rotation / step.duration
-    turns = abs(step.rotation) / (2 * math.pi)
+    back = next((piece for piece in way if piece.length <= 0.0), None)
+    if back is not None:
+        return Refusal(
+            Rule.FORWARD_ONLY,
+            f"insertion {back.leg.insertion * 1e3:.4g} mm is not ahead of the point before, "
+            f"{back.start[0] * 1e3:.4g} mm",
+        )
+    speed = max(piece.length / piece.leg.duration for piece in way)
+    rotation = max(abs(piece.leg.rotation - context.rotation) for piece in way)
+    rate = max(piece.turn / piece.leg.duration for piece in way)
+    turns = max(abs(piece.leg.rotation) for piece in way) / (2 * math.pi)
     bounded = (
-        (Rule.MAX_DEPTH, "depth", step.insertion * 1e3, limits.max_depth * 1e3, "mm"),
+        (Rule.MAX_DEPTH, "depth", end * 1e3, limits.max_depth * 1e3, "mm"),
         (Rule.MAX_STEP_LENGTH, "step", length * 1e3, limits.max_step_length * 1e3, "mm"),
         (Rule.MAX_SPEED, "speed", speed * 1e3, limits.max_speed * 1e3, "mm/s"),
         (Rule.MAX_ROTATION_STEP, "rotation", rotation, limits.max_rotation_step, "rad"),

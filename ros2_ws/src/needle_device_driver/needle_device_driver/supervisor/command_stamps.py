@@ -28,6 +28,11 @@ class CommandStamps:
         self._last_ns: int | None = None
         self._used_ns: deque[int] = deque(maxlen=_REMEMBERED_STEPS)
 
+    @property
+    def newest_ns(self) -> int:
+        """The newest ROS time noted [ns]; 0: none yet."""
+        return self._ages.newest_ns or 0
+
     def note(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] at steady time `now` [s]."""
         self._ages.note(ros_ns, ros_ns * 1e-9 if self._lock_step else now)

@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
-from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.axes.motion import Leg
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import MotionRun, axes_problem
-from needle_device_driver.supervisor.reports import SUCCEEDED, Event, Notice, StepResult
+from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, Notice, StepResult
+from needle_device_driver.supervisor.retraction_bound import RetractionBound
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
 
 _WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
-
-
-class RetractionBound:
-    """Remembers the last known depth across the loss of the home position.
-
-    Parameters
-    ----------
-    max_depth : float
-        The way out when no depth was ever known [m].
-    """
-
-    def __init__(self, max_depth: float) -> None:
-        self._remaining = max_depth
-        self._before: AxisSnapshot | None = None
-
-    def note(self, insertion: AxisSnapshot) -> None:
-        """Take each snapshot of the insertion axis."""
-        before, self._before = self._before, insertion
-        if insertion.homed or before is None:
-            return
-        if before.homed:
-            self._remaining = max(before.position, 0.0)
-        elif before.origin == insertion.origin:
-            self._remaining += insertion.position - before.position
-
-    def target(self, insertion: AxisSnapshot) -> float:
-        """Return where a retraction ends at the latest, in the axis' present count [m]."""
-        return 0.0 if insertion.homed else insertion.position - self._remaining
 
 
 class DeviceCore:
@@ -91,6 +65,7 @@ class DeviceCore:
         self._run: MotionRun | None = None
         self._homing_time = 0.0
         self._seen_powered = False
+        self._pushed_too_fast = False
         self._events: list[Event] = []
         self.state = State.UNCONFIGURED
         self.activity = Activity.NONE
@@ -115,6 +90,14 @@ class DeviceCore:
             return 0.0
         insertion = self.snapshot.insertion
         return insertion.position - self._retraction_bound.target(insertion)
+
+    @property
+    def rotation_owed(self) -> float:
+        """How far the rotation is behind a needle that is pushed too fast for it [rad]."""
+        if self._run is None or self.snapshot is None:
+            return 0.0
+        owed = self._run.rotation_owed(self.snapshot)
+        return owed if owed > self._limits.rotation_following_error else 0.0
 
     def notice(self, text: str, rule: Rule | None = None) -> None:
         """Tell a person something once."""
@@ -209,8 +192,7 @@ class DeviceCore:
     def start(
         self,
         activity: Activity,
-        end: tuple[float, float],
-        duration: float,
+        legs: Sequence[Leg],
         stamp_ns: int | None = None,
     ) -> None:
         """Begin a step or retraction from where the axes are.
@@ -219,10 +201,8 @@ class DeviceCore:
         ----------
         activity : Activity
             Which of them.
-        end : tuple of float
-            Insertion [m] and rotation [rad].
-        duration : float
-            At full speed [s].
+        legs : sequence of Leg
+            The way.
         stamp_ns : int, optional
             Of the command [ns].
         """
@@ -230,8 +210,7 @@ class DeviceCore:
         self.activity, self.step_stamp_ns = activity, stamp_ns
         self._run = MotionRun(
             activity,
-            end,
-            duration,
+            legs,
             self.snapshot,
             self._limits,
             feedback_delay=self._feedback_delay,
@@ -241,6 +220,23 @@ class DeviceCore:
         if not self.snapshot.ready:
             # After a stop, an axis is made ready by the order to move, never by itself.
             self.order(lambda axis: axis.power(True))
+
+    def replace(self, legs: Sequence[Leg], stamp_ns: int) -> None:
+        """Go another way from where the axes were last told to be; the command before is answered.
+
+        Parameters
+        ----------
+        legs : sequence of Leg
+            The way.
+        stamp_ns : int
+            Of the command that takes the place of the one under way [ns].
+        """
+        assert self._run is not None
+        assert self.snapshot is not None
+        assert self.step_stamp_ns is not None
+        self.answer(self.step_stamp_ns, REPLACED)
+        self._run.replace(legs, self.snapshot)
+        self.step_stamp_ns = stamp_ns
 
     def start_homing(self) -> str:
         """Begin to look for both home switches; return what went wrong."""
@@ -324,6 +320,7 @@ class DeviceCore:
         set_point = self._run.advance(at, period, speed_scale)
         if set_point is None:
             return
+        self._watch_pushing()
         try:
             if self._axes.insertion.actuated:
                 self._axes.insertion.start_move(set_point.insertion, set_point.insertion_speed)
@@ -331,6 +328,14 @@ class DeviceCore:
                 self._axes.rotation.start_move(set_point.rotation, set_point.rotation_speed)
         except AxisError as error:
             self.fail(str(error), error.rule)
+
+    def _watch_pushing(self) -> None:
+        owed, told = self.rotation_owed, self._pushed_too_fast
+        self._pushed_too_fast = owed > 0.0
+        if owed > 0.0 and not told:
+            text = f"pushed too fast: the rotation is {owed:.2f} rad behind, push more slowly"
+            self.explain(text)
+            self.notice(text, Rule.MAX_ROTATION_RATE)
 
     def poll(self, now: float) -> PairSnapshot:
         """Read the axes."""

@@ -29,12 +29,15 @@ class HoldMessage:
         Whether hold to run is pressed.
     speed_scale : float
         Share of the nominal speed, 0..1.
+    lifetime : float
+        How long it counts by its sender's own word [s]; never longer than the time-out.
     """
 
     sender: str
     stamp_ns: int
     pressed: bool
     speed_scale: float
+    lifetime: float = math.inf
 
 
 @dataclasses.dataclass
@@ -43,6 +46,7 @@ class _Sender:
     stamp_ns: int
     pressed: bool
     arrival: float
+    timeout: float
     # Whether a release came since the last press.
     armed: bool
     # Time from stamp to arrival of a release that was stamped before a reset [ns].
@@ -55,7 +59,13 @@ class Hold:
     Parameters
     ----------
     timeout : float
-        A message counts so long after its arrival [s].
+        A message counts so long after its arrival [s], or as long as itself says if that is
+        shorter.
+
+    Attributes
+    ----------
+    presses : int
+        How often a press has begun to count.
     """
 
     def __init__(self, timeout: float) -> None:
@@ -66,6 +76,7 @@ class Hold:
         self._lapsed = False
         self._spent_ns: int | None = None
         self._strangers_armed = True
+        self.presses = 0
 
     @property
     def owner(self) -> str | None:
@@ -89,7 +100,12 @@ class Hold:
 
     def is_fresh(self, now: float) -> bool:
         """Return whether there is an owner who was heard within the time-out."""
-        return self.age(now) <= self._timeout
+        return self._owner is not None and self.age(now) <= self.timeout
+
+    @property
+    def timeout(self) -> float:
+        """How long the owner's last message counts [s]; without owner, how long any may."""
+        return self._timeout if self._owner is None else self._senders[self._owner].timeout
 
     def is_off(self, now: float) -> bool:
         """Return whether nobody who was heard within the time-out presses."""
@@ -116,7 +132,7 @@ class Hold:
         """
         scale = message.speed_scale
         # What cannot be understood counts as the safe thing, a release.
-        pressed = message.pressed and 0.0 <= scale <= 1.0
+        pressed = message.pressed and 0.0 <= scale <= 1.0 and message.lifetime > 0.0
         sender = self._senders.get(message.sender)
         if sender is None:
             if len(self._senders) >= MAX_SENDERS or len(message.sender) > LONGEST_NAME:
@@ -125,12 +141,14 @@ class Hold:
                 stamp_ns=message.stamp_ns - 1,
                 pressed=False,
                 arrival=now,
+                timeout=self._timeout,
                 armed=self._strangers_armed and not self._is_spent(message.stamp_ns),
             )
         if pressed and not self._is_new(sender, message.stamp_ns, now):
             return Rule.HOLD_STAMP_INCREASES
         sender.pressed = pressed
         sender.arrival = now
+        sender.timeout = min(message.lifetime, self._timeout)
         if not pressed:
             self._take_release(sender, message.stamp_ns, now)
             if self._owner == message.sender:
@@ -147,6 +165,7 @@ class Hold:
         if self._owner is not None:
             return Rule.HOLD_ONE_OWNER
         self._owner = message.sender
+        self.presses += 1
         self._speed_scale = scale
         self._lapsed = False
         return None
@@ -189,7 +208,7 @@ class Hold:
                 self._strangers_armed = self._strangers_armed and sender.armed
 
     def _presses(self, sender: _Sender, now: float) -> bool:
-        return sender.pressed and now - sender.arrival <= self._timeout
+        return sender.pressed and now - sender.arrival <= sender.timeout
 
     def _is_spent(self, stamp_ns: int) -> bool:
         """Return whether a stamp is none above all that were heard before the last reset."""

@@ -145,3 +145,15 @@ def limit_parameter(name: str) -> Any:
     """Declare the field `name` of `SafetyLimits` as a field of a parameter dataclass."""
     (field,) = (field for field in dataclasses.fields(SafetyLimits) if field.name == name)
     return dataclasses.field(default=field.default, metadata=field.metadata)
+
+
+def path_delay_parameter() -> Any:
+    """Declare the field `path_delay` of a parameter dataclass: of a device in a simulation."""
+    return fixed_parameter(
+        0.04,
+        "s",
+        "Lock step: a path of continuous insertion takes effect so long after its tip's exposure, "
+        "in simulated time.",
+        0.0,
+        1.0,
+    )

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 from needle_device_driver.axes.axis_pair import PairSnapshot
-from needle_device_driver.axes.motion import CoordinatedMotion, SetPoint
+from needle_device_driver.axes.motion import CoordinatedMotion, Leg, SetPoint, slowed_legs
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.states import Activity
@@ -34,16 +35,14 @@ def axes_problem(
 
 
 class MotionRun:
-    """Leads both axes along one straight way.
+    """Leads both axes along one way.
 
     Parameters
     ----------
     activity : Activity
         STEP or RETRACTION; a retraction leaves the rotation axis alone.
-    end : tuple of float
-        Target of insertion [m] and rotation [rad].
-    duration : float
-        Time at full speed [s].
+    legs : sequence of Leg
+        The way.
     at : PairSnapshot
         Where the axes are.
     limits : SafetyLimits
@@ -57,8 +56,7 @@ class MotionRun:
     def __init__(
         self,
         activity: Activity,
-        end: tuple[float, float],
-        duration: float,
+        legs: Sequence[Leg],
         at: PairSnapshot,
         limits: SafetyLimits,
         *,
@@ -66,8 +64,7 @@ class MotionRun:
         pushed: bool,
     ) -> None:
         self.activity = activity
-        self._end = end
-        self._duration = duration
+        self._legs = tuple(legs)
         self._limits = limits
         self._pushed = pushed
         self._motion = self._begin(at)
@@ -91,6 +88,18 @@ class MotionRun:
             self._settling += period
         self._due.append(set_point)
         return set_point
+
+    def replace(self, legs: Sequence[Leg], at: PairSnapshot) -> None:
+        """Go another way from the last set-point on, without a stop."""
+        self._legs = tuple(legs)
+        self._motion = self._begin(at)
+        self._settling = 0.0
+
+    def rotation_owed(self, at: PairSnapshot) -> float:
+        """Return by how much the rotation is behind a needle that a hand pushes [rad]."""
+        if not (self._pushed and self._due):
+            return 0.0
+        return abs(self._motion.rotation_at(at.insertion.position) - self._due[-1].rotation)
 
     def problem(self, at: PairSnapshot) -> Problem | None:
         """Return the rule that the motion breaks, and how."""
@@ -126,16 +135,16 @@ class MotionRun:
         """Return whether the motion has ended; a retraction also ends at the home switch."""
         if self.activity is Activity.RETRACTION and at.insertion.at_home_switch:
             return True
-        insertion, rotation = self._end
+        end = self._legs[-1]
         return (
             self._motion.complete
             and (
                 self._pushed
-                or abs(insertion - at.insertion.position) <= self._limits.insertion_tolerance
+                or abs(end.insertion - at.insertion.position) <= self._limits.insertion_tolerance
             )
             and (
                 self.activity is Activity.RETRACTION
-                or abs(rotation - at.rotation.position) <= self._limits.rotation_tolerance
+                or abs(end.rotation - at.rotation.position) <= self._limits.rotation_tolerance
             )
         )
 
@@ -143,15 +152,19 @@ class MotionRun:
         # From the last set-point: a motor rests beside it, and counted from there the first
         # set-point could be too far ahead.
         start = at.insertion.set_point, at.rotation.set_point
-        limits, retracts = self._limits, self.activity is Activity.RETRACTION
-        shortest = max(
-            abs(self._end[0] - start[0])
-            / (limits.retraction_speed if retracts else limits.max_speed),
-            0.0 if retracts else abs(self._end[1] - start[1]) / limits.max_rotation_rate,
-        )
-        return CoordinatedMotion(start, self._end, max(self._duration, shortest))
+        if self.activity is Activity.RETRACTION:
+            legs = slowed_legs(start, self._legs, max_speed=self._limits.retraction_speed)
+        else:
+            legs = slowed_legs(
+                start,
+                self._legs,
+                max_speed=self._limits.max_speed,
+                max_rotation_rate=self._limits.max_rotation_rate,
+            )
+        return CoordinatedMotion(start, legs)
 
     def _off(self, at: PairSnapshot) -> str:
-        insertion = abs(self._end[0] - at.insertion.position)
-        rotation = abs(self._end[1] - at.rotation.position)
+        end = self._legs[-1]
+        insertion = abs(end.insertion - at.insertion.position)
+        rotation = abs(end.rotation - at.rotation.position)
         return f"insertion {insertion * 1e3:.4f} mm, rotation {rotation:.5f} rad off"

@@ -9,6 +9,8 @@ from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import Activity, State
 
 SUCCEEDED = "succeeded"
+REPLACED = "replaced"
+"""Of a path whose place another took before its end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +22,7 @@ class StepResult:
     stamp_ns : int
         The command's stamp [ns].
     outcome : str
-        `succeeded` or `aborted: why`.
+        `succeeded`, `replaced` or `aborted: why`.
     """
 
     stamp_ns: int
@@ -126,6 +128,10 @@ class DeviceStatus:
         How many commands were refused.
     needs_time : bool
         Whether something goes on when time does: a simulated clock may stand still otherwise.
+    command_ns : int
+        Stamp of the newest command, whatever became of it [ns]; 0: none yet.
+    rotation_owed : float
+        How far the rotation is behind a needle that a hand pushes too fast for it [rad].
     simulated : bool or None
         Whether no real needle can move; None while that is not known.
     """
@@ -144,4 +150,6 @@ class DeviceStatus:
     watchdog_trips: int
     commands_refused: int
     needs_time: bool
+    command_ns: int
+    rotation_owed: float
     simulated: bool | None = None

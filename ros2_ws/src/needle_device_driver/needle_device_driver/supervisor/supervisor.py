@@ -7,13 +7,13 @@ from collections.abc import Callable
 from needle_common.foreign_text import plain
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
+from needle_device_driver.axes.motion import Leg
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
-from needle_device_driver.supervisor.command_stamps import CommandStamps
+from needle_device_driver.supervisor.command import Command
+from needle_device_driver.supervisor.command_desk import CommandDesk
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage, HoldRefusals
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_device_driver.supervisor.motion_run import INNER_SWITCH
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Reply
 from needle_device_driver.supervisor.states import Activity, State, Trigger
 
@@ -35,6 +35,9 @@ class MotionSupervisor:
     lock_step : bool
         Simulated time stands still while somebody is silent: a hold that lapses pauses instead of
         aborting (a release always aborts), and tips age in that time.
+    path_delay : float
+        In lock step a path takes effect so long after its stamp, in simulated time [s], so that
+        it does not depend on when it came; 0: as soon as it comes.
     feedback_delay : int
         How many cycles after its order a set-point shows in the axes' snapshots.
     switching : callable, optional
@@ -48,6 +51,7 @@ class MotionSupervisor:
         limits: SafetyLimits,
         *,
         lock_step: bool = False,
+        path_delay: float = 0.0,
         feedback_delay: int = 0,
         switching: Callable[[], bool] = lambda: False,
     ) -> None:
@@ -57,16 +61,17 @@ class MotionSupervisor:
         self._lock_step = lock_step
         self._hold = Hold(limits.hold_timeout)
         self._hold_refusals = HoldRefusals()
-        self._stamps = CommandStamps(2.0 * limits.tip_age_limit, lock_step=lock_step)
         self._estop_pressed = False
         self._needle_out = False
         self._others = ""
-        self._commands_refused = 0
         self._core = DeviceCore(
             self._axes,
             limits,
             feedback_delay=feedback_delay,
             on_stop=self._hold.require_new_press,
+        )
+        self._commands = CommandDesk(
+            self._core, self._hold, limits, lock_step=lock_step, path_delay=path_delay
         )
 
     # ---- what is told -------------------------------------------------------------------------
@@ -116,8 +121,10 @@ class MotionSupervisor:
             reason=self._core.reason,
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
-            commands_refused=self._commands_refused,
-            needs_time=self.may_move(now) or self._switching(),
+            commands_refused=self._commands.refused,
+            needs_time=self.may_move(now) or self._switching() or self._commands.needs_time(now),
+            command_ns=self._commands.newest_ns,
+            rotation_owed=self._core.rotation_owed,
         )
 
     # ---- what comes from outside --------------------------------------------------------------
@@ -147,7 +154,7 @@ class MotionSupervisor:
 
     def note_time(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
-        self._stamps.note(ros_ns, now)
+        self._commands.note_time(ros_ns, now)
 
     def receive_hold(self, message: HoldMessage, now: float) -> None:
         """Take a hold message that arrived now."""
@@ -185,7 +192,9 @@ class MotionSupervisor:
         self._core.fail(reason, rule)
 
     def submit(self, command: Command, now: float, publishers: int = 1) -> None:
-        """Take a step command: it starts at once, or is refused whole; a result tells which.
+        """Take a command: it starts, or is refused whole; a result tells which.
+
+        A path takes the place of the one under way. In lock step it waits for its time.
 
         Parameters
         ----------
@@ -197,26 +206,8 @@ class MotionSupervisor:
             How many publish commands at present.
         """
         self._watch_hold(now)
-        at = self._ready_for_step(now)
-        if isinstance(at, Refusal):
-            self._refuse(command, at)
-            return
-        context = CommandContext(
-            insertion=at.insertion.set_point,
-            rotation=at.rotation.set_point,
-            homed=at.homed,
-            not_new=self._stamps.why_not_new(command.stamp_ns),
-            tip_age=self._stamps.age(command.stamp_ns, now),
-            publishers=publishers,
-        )
-        step = check_command(command, context, self._limits)
-        if isinstance(step, Refusal):
-            self._refuse(command, step)
-            return
-        self._needle_out = False
-        self._stamps.use(command.stamp_ns)
-        end = step.insertion, step.rotation
-        self._core.start(Activity.STEP, end, step.duration, command.stamp_ns)
+        if self._commands.submit(command, now, publishers):
+            self._needle_out = False
 
     def count_watchdog_trip(self) -> None:
         """Count a watchdog of the supervisor's owner among its own."""
@@ -279,8 +270,9 @@ class MotionSupervisor:
         distance = self._core.way_out
         if distance <= self._limits.insertion_tolerance or at.insertion.at_home_switch:
             return Reply(True, "the needle is out")
-        end = (at.insertion.position - distance, at.rotation.position)
-        self._core.start(Activity.RETRACTION, end, distance / self._limits.retraction_speed)
+        duration = distance / self._limits.retraction_speed
+        way = [Leg(at.insertion.position - distance, at.rotation.position, duration)]
+        self._core.start(Activity.RETRACTION, way)
         if self._core.activity is not Activity.RETRACTION:
             return Reply(False, self._core.fault)
         return Reply(True, f"retracting {distance * 1e3:.1f} mm while the hold lasts")
@@ -300,7 +292,7 @@ class MotionSupervisor:
             return Reply(False, f"a {self._core.activity.value} is under way")
         self._hold.readmit(now)
         self._hold_refusals.clear()
-        self._stamps.readmit()
+        self._commands.readmit()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
             return Reply(True, "nothing to reset")
         if self._others:
@@ -323,6 +315,9 @@ class MotionSupervisor:
             self._core.drive_homing(period)
             return
         self._watch_hold(now)
+        if self._commands.take_waiting(now):
+            self._needle_out = False
+        self._commands.watch_path(now)
         if self.may_move(now):
             self._core.drive(period, self._hold.speed_scale, now)
 
@@ -340,7 +335,7 @@ class MotionSupervisor:
             return
         core = self._core
         moving = core.moves_with_hold
-        text = f"no hold message for {age:.3f} s, limit {self._limits.hold_timeout:g} s"
+        text = f"no hold message for {age:.3f} s, limit {self._hold.timeout:g} s"
         core.notice(text, Rule.HOLD_AGE)
         if self._lock_step:
             # Simulated time waits too: the same motion goes on later.
@@ -365,29 +360,3 @@ class MotionSupervisor:
             self._core.go(Trigger.DISABLE, "disabled on request")
         error = self._core.power_off() if self._core.configured else ""
         return Reply(False, error) if error else Reply(True, "disabled")
-
-    def _ready_for_step(self, now: float) -> PairSnapshot | Refusal:
-        if self._core.state is not State.HOLDING:
-            return Refusal(Rule.COMMAND_STATE, self._not_in(State.HOLDING).message)
-        if self._hold.owner is None:
-            return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
-        # Not the last cycle's: a stop since then must be known.
-        at = self._core.poll(now)
-        if at.age(now) > self._limits.reply_age_limit:
-            return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
-        if not at.powered:
-            return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
-        if at.insertion.at_inner_switch:
-            return Refusal(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
-        return at
-
-    def _refuse(self, command: Command, refusal: Refusal) -> None:
-        self._commands_refused += 1
-        if refusal.rule is Rule.TIP_AGE:
-            self._core.count_watchdog_trip()
-        text = f"command refused: {refusal.reason}"
-        self._core.explain(text)
-        self._core.notice(text, refusal.rule)
-        # The running step's own stamp would tell its sender that the step has ended.
-        if command.stamp_ns != self._core.step_stamp_ns:
-            self._core.answer(command.stamp_ns, f"aborted: {refusal.reason}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.rules import Rule
@@ -102,12 +103,18 @@ class Bench:
 
     period = PERIOD
 
-    def __init__(self, *, lock_step: bool = False, **limits: float) -> None:
+    def __init__(
+        self, *, lock_step: bool = False, path_delay: float = 0.0, **limits: float
+    ) -> None:
         self.insertion = FakeAxis("insertion")
         self.rotation = FakeAxis("rotation")
         self.limits = SafetyLimits(**limits)
         self.supervisor = MotionSupervisor(
-            self.insertion, self.rotation, self.limits, lock_step=lock_step
+            self.insertion,
+            self.rotation,
+            self.limits,
+            lock_step=lock_step,
+            path_delay=path_delay,
         )
         self.now = 100.0
         self.ros_ns = 1_000_000_000
@@ -153,9 +160,10 @@ class Bench:
         sender: str = "a",
         scale: float = 1.0,
         stamp_ns: int | None = None,
+        lifetime: float = math.inf,
     ) -> None:
         stamp = next(self.stamps) if stamp_ns is None else stamp_ns
-        self.supervisor.receive_hold(HoldMessage(sender, stamp, pressed, scale), self.now)
+        self.supervisor.receive_hold(HoldMessage(sender, stamp, pressed, scale, lifetime), self.now)
 
     def cycle(self, count: int = 1, *, holding: bool = False, scale: float = 1.0) -> None:
         for _ in range(count):

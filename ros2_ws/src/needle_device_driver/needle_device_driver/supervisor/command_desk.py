@@ -1,0 +1,169 @@
+"""What becomes of a command: it starts, replaces a path, waits for its time, or is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_device_driver.axes.axis_pair import PairSnapshot
+from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
+from needle_device_driver.supervisor.command_stamps import CommandStamps
+from needle_device_driver.supervisor.device_core import DeviceCore
+from needle_device_driver.supervisor.hold import Hold
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_device_driver.supervisor.motion_run import INNER_SWITCH
+from needle_device_driver.supervisor.states import Activity, State
+
+
+@dataclasses.dataclass(frozen=True)
+class _Waiting:
+    command: Command
+    publishers: int
+    press: int
+
+
+class CommandDesk:
+    """Takes commands for a device; `now` is everywhere the steady clock [s].
+
+    Parameters
+    ----------
+    core : DeviceCore
+        Carries out what is allowed.
+    hold : Hold
+        Whose press counts.
+    limits : SafetyLimits
+        The bounds of the rules.
+    lock_step : bool
+        Tips age in simulated time.
+    path_delay : float
+        In lock step a path takes effect so long after its stamp, in simulated time [s].
+
+    Attributes
+    ----------
+    refused : int
+        Commands that were refused.
+    newest_ns : int
+        Stamp of the newest command, whatever became of it [ns]; 0: none yet.
+    """
+
+    def __init__(
+        self,
+        core: DeviceCore,
+        hold: Hold,
+        limits: SafetyLimits,
+        *,
+        lock_step: bool,
+        path_delay: float,
+    ) -> None:
+        self._core = core
+        self._hold = hold
+        self._limits = limits
+        self._stamps = CommandStamps(2.0 * limits.tip_age_limit, lock_step=lock_step)
+        self._delay_ns = round(path_delay * 1e9) if lock_step else 0
+        self._waiting: _Waiting | None = None
+        self._on_path = False
+        self.refused = 0
+        self.newest_ns = 0
+
+    def note_time(self, ros_ns: int, now: float) -> None:
+        """Note that ROS time is `ros_ns` [ns]."""
+        self._stamps.note(ros_ns, now)
+
+    def readmit(self) -> None:
+        """Let in commands stamped after a time that went back."""
+        self._stamps.readmit()
+
+    def needs_time(self, now: float) -> bool:
+        """Return whether a path waits for its time while somebody holds."""
+        return self._waiting is not None and self._hold.is_fresh(now)
+
+    def submit(self, command: Command, now: float, publishers: int) -> bool:
+        """Take a command, nothing checked; return whether it moves the needle from now on."""
+        self.newest_ns = command.stamp_ns
+        if command.is_path and not self._is_due(command):
+            self._waiting = _Waiting(command, publishers, self._hold.presses)
+            return False
+        return self._start(command, now, publishers)
+
+    def take_waiting(self, now: float) -> bool:
+        """Start the path whose time has come; return whether it moves the needle from now on."""
+        waiting = self._waiting
+        if waiting is None or not self._is_due(waiting.command):
+            return False
+        if self._hold.owner is not None and waiting.press == self._hold.presses:
+            if not self._hold.is_fresh(now):
+                # A lapse only pauses.
+                return False
+            self._waiting = None
+            return self._start(waiting.command, now, waiting.publishers)
+        self._waiting = None
+        self._refuse(waiting.command, Refusal(Rule.HOLD_TO_RUN, "the hold it was for has ended"))
+        return False
+
+    def watch_path(self, now: float) -> None:
+        """End a path whose tip has become too old: nobody says any more where the needle is."""
+        stamp_ns = self._core.step_stamp_ns
+        if not self._on_path or stamp_ns is None:
+            return
+        age, limit = self._stamps.age(stamp_ns, now), self._limits.tip_age_limit
+        if age is not None and age > limit:
+            self._core.count_watchdog_trip()
+            text = f"the tip behind the path is {age:.3f} s old, limit {limit:g} s"
+            self._core.notice(text, Rule.TIP_AGE)
+            self._core.abort(text)
+
+    def _is_due(self, command: Command) -> bool:
+        return self._stamps.newest_ns >= command.stamp_ns + self._delay_ns
+
+    def _start(self, command: Command, now: float, publishers: int) -> bool:
+        at = self._ready_for(command, now)
+        if isinstance(at, Refusal):
+            self._refuse(command, at)
+            return False
+        context = CommandContext(
+            insertion=at.insertion.set_point,
+            rotation=at.rotation.set_point,
+            homed=at.homed,
+            not_new=self._stamps.why_not_new(command.stamp_ns),
+            tip_age=self._stamps.age(command.stamp_ns, now),
+            publishers=publishers,
+        )
+        legs = check_command(command, context, self._limits)
+        if isinstance(legs, Refusal):
+            self._refuse(command, legs)
+            return False
+        self._stamps.use(command.stamp_ns)
+        self._on_path = command.is_path
+        if self._core.activity is Activity.STEP:
+            self._core.replace(legs, command.stamp_ns)
+        else:
+            self._core.start(Activity.STEP, legs, command.stamp_ns)
+        return True
+
+    def _ready_for(self, command: Command, now: float) -> PairSnapshot | Refusal:
+        replaces = command.is_path and self._on_path and self._core.activity is Activity.STEP
+        if self._core.state is not State.HOLDING and not replaces:
+            state = self._core.state.value
+            return Refusal(Rule.COMMAND_STATE, f"the device is {state}, not {State.HOLDING.value}")
+        if self._hold.owner is None:
+            return Refusal(Rule.HOLD_TO_RUN, "nobody holds to run")
+        # Not the last cycle's: a stop since then must be known.
+        at = self._core.poll(now)
+        if at.age(now) > self._limits.reply_age_limit:
+            return Refusal(Rule.REPLY_AGE, "no fresh reply from the axes")
+        if not at.powered:
+            return Refusal(Rule.COMMAND_STATE, "the axes are not powered yet")
+        if at.insertion.at_inner_switch:
+            return Refusal(Rule.INNER_LIMIT_SWITCH, f"{INNER_SWITCH}: retract")
+        return at
+
+    def _refuse(self, command: Command, refusal: Refusal) -> None:
+        self.refused += 1
+        if refusal.rule is Rule.TIP_AGE:
+            self._core.count_watchdog_trip()
+        text = f"command refused: {refusal.reason}"
+        self._core.explain(text)
+        self._core.notice(text, refusal.rule)
+        # The running step's own stamp would tell its sender that the step has ended.
+        if command.stamp_ns != self._core.step_stamp_ns:
+            self._core.answer(command.stamp_ns, f"aborted: {refusal.reason}")
