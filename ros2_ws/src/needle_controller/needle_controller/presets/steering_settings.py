@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, parameter
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
@@ -22,6 +22,7 @@ ONE_SIDED_PRESETS = ("paper", "open_loop")
 PRESETS = ("best", *ONE_SIDED_PRESETS)
 POINT_PRESETS = ("best",)
 """Those that estimate the whole pose, and so can steer to a point."""
+INSERTIONS = ("stepwise", "continuous")
 TIP_NOISES = ("bounded", "normal")
 TIP_COVARIANCES = ("configured", "from_tip_pose")
 """Where a tip's covariance comes from."""
@@ -96,6 +97,21 @@ class SteeringSettings:
         description="Insertion of one step; the last one ends at the depth.",
         lower=1e-4,
         upper=0.01,
+    )
+    insertion: str = fixed_parameter(
+        "stepwise",
+        "-",
+        "stepwise = the needle rests after each step until its tip was seen; continuous = it goes "
+        "on while held: the path ahead is sent anew with every tip.",
+        choices=INSERTIONS,
+    )
+    horizon: float = parameter(
+        0.002,
+        unit="m",
+        description="Continuous insertion: how far beyond the newest tip the path leads, and the "
+        "needle at most; the device's max_step_length or less.",
+        lower=2e-4,
+        upper=0.005,
     )
     nominal_speed: float = parameter(
         0.002,

@@ -141,6 +141,25 @@ class JointHistory:
             left.rotation + part * (right.rotation - left.rotation),
         )
 
+    def between(self, start: JointSample, end: JointSample, spacing: float) -> list[JointSample]:
+        """Return samples on the way from one to another, whose insertions are spaced out.
+
+        Parameters
+        ----------
+        start, end : JointSample
+            Where the way begins and ends.
+        spacing : float
+            Least insertion from one to the next, and to the end [m].
+        """
+        kept, last = [], start.insertion
+        for sample in self.after(start.stamp_ns):
+            if sample.stamp_ns >= end.stamp_ns:
+                break
+            if last + spacing <= sample.insertion <= end.insertion - spacing:
+                kept.append(sample)
+                last = sample.insertion
+        return kept
+
     def after(self, stamp_ns: int) -> Iterator[JointSample]:
         """Yield the samples newer than an instant [ns], oldest first."""
         first = bisect_right(self._samples, stamp_ns, key=lambda sample: sample.stamp_ns)

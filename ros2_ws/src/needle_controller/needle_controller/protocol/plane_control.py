@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -180,7 +181,11 @@ class PlaneControl:
         return float(np.arctan2(-start[0, 1], start[0, 0]))
 
     def update(
-        self, tip: Array, joints: JointSample, known: TipCovariance | None = None
+        self,
+        tip: Array,
+        joints: JointSample,
+        known: TipCovariance | None = None,
+        way: Sequence[JointSample] = (),
     ) -> ControlUpdate:
         """Take a tip.
 
@@ -194,6 +199,8 @@ class PlaneControl:
             How well the tip is known, in `rig`; as configured if none is given. `measurement_std`
             squared is added: no source knows what repeats from tip to tip, nor what the needle's
             model leaves out, and a filter that believes in micrometres holds on to the wrong roll.
+        way : sequence of JointSample
+            Joints on the way since the last tip, where rotation was not in proportion to insertion.
 
         Returns
         -------
@@ -205,11 +212,8 @@ class PlaneControl:
             self._first_joints = joints
             self._estimator.reset(position, np.array([joints.insertion, joints.rotation]))
         else:
-            # An encoder at rest may read a count less; drawing out is the protocol's business.
-            inserted = max(joints.insertion - self._joints.insertion, 0.0)
-            rotation = joints.rotation - self._joints.rotation
-            self._rotation += abs(rotation)
-            self._estimator.advance(inserted, rotation)
+            for sample in (*way, joints):
+                self._advance(sample)
             self._correct(position, known)
         self._joints = joints
         estimate = self._estimator.estimate()
@@ -222,6 +226,15 @@ class PlaneControl:
                 estimate, SteeringCommand(still, still), turned, reach, blocked=True
             )
         return ControlUpdate(estimate, command, turned, reach)
+
+    def _advance(self, joints: JointSample) -> None:
+        assert self._joints is not None
+        # An encoder at rest may read a count less; drawing out is the protocol's business.
+        inserted = max(joints.insertion - self._joints.insertion, 0.0)
+        rotation = joints.rotation - self._joints.rotation
+        self._rotation += abs(rotation)
+        self._estimator.advance(inserted, rotation)
+        self._joints = joints
 
     def path_obstacle(self, rotation: float) -> str:
         """Return why no path leads a needle that is out to its point, empty if one does.

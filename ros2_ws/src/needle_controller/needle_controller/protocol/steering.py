@@ -7,14 +7,14 @@ is an argument. What is sent depends on stamps, never on the order in which topi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from needle_controller.model.reachability import Reachability
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.failed_steps import FailedSteps
 from needle_controller.protocol.joint_history import Heard, JointSample
 from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.patience import Patience
-from needle_controller.protocol.plane_control import PlaneControl
+from needle_controller.protocol.plane_control import ControlUpdate, PlaneControl
 from needle_controller.protocol.retraction import RetractionWatch
 from needle_controller.protocol.start_conditions import Situation, is_out, obstacle
 from needle_controller.protocol.steering_types import (
@@ -27,7 +27,7 @@ from needle_controller.protocol.steering_types import (
     StartReply,
     SteeringState,
 )
-from needle_controller.protocol.step_watch import Followed, StepWatch
+from needle_controller.protocol.step_watch import FailedSteps, Followed, StepWatch
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import AcceptedTip, RefusedTip, TipMeasurement
 from needle_controller.protocol.tip_intake import TipIntake
@@ -49,27 +49,26 @@ class Steering:
     ----------
     control : PlaneControl
         Estimator and law.
-    state, awaiting : SteeringState, Awaiting
-        Where the protocol is, and what it needs to go on.
-    reason : str
-        Why it is there, or what is amiss.
-    starts : int
-        How often somebody has started it.
-    step : int
-        Steps done.
+    state, awaiting, reason : SteeringState, Awaiting, str
+        Where the protocol is, what it needs to go on, and why or what is amiss.
+    starts, step : int
+        How often somebody has started it; steps done.
     rejection : str
         Why the last tip was refused; empty once one was used.
     watchdog_trips : int
         How often the steady clock, not data, decided.
-    insertion : float
-        At the last used tip [m].
-    reach, trust : Reachability or None, Trust
-        Of plane or point, and of the estimate, at the last used tip.
+    command_ns : int
+        Stamp of the command sent last [ns]; 0: none yet.
+    insertion, reach, trust : float, Reachability or None, Trust
+        At the last used tip: insertion [m], reach of plane or point, trust in the estimate.
     intake : TipIntake
         Tips and joints.
     patience : Patience
         How long has been waited, and for what.
     """
+
+    _goes_on = False
+    """Whether the needle goes on while a tip is awaited."""
 
     def __init__(self, settings: SteeringSettings) -> None:
         self.settings = settings
@@ -81,6 +80,7 @@ class Steering:
         self.step = 0
         self.rejection = ""
         self.watchdog_trips = 0
+        self.command_ns = 0
         self.insertion = 0.0
         self.reach: Reachability | None = None
         self.trust = Trust()
@@ -180,15 +180,7 @@ class Steering:
         return actions + self._ask() + self._use_tip()
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
-        """Take that the device made another step in place of the one under way: of a recording.
-
-        Parameters
-        ----------
-        stamp_ns : int
-            The other command's stamp [ns].
-        end : JointSample
-            Where it led.
-        """
+        """Take that a recorded device made another step: its command's stamp [ns], where it led."""
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
@@ -210,13 +202,7 @@ class Steering:
         return actions
 
     def on_time(self, steady: float) -> list[Action]:
-        """Watch the age of what is awaited.
-
-        Parameters
-        ----------
-        steady : float
-            Now, on the steady clock [s].
-        """
+        """Watch the age of what is awaited, at a time of the steady clock [s]."""
         if not (self._steering and self.awaiting in {Awaiting.TIP, Awaiting.RESULT}):
             self.patience.restart()
             return []
@@ -312,19 +298,36 @@ class Steering:
     def _use_tip(self) -> list[Action]:
         actions: list[Action] = []
         while self._steering and self.awaiting is Awaiting.TIP and self._followed is None:
-            taken = self.intake.take(self.settings)
+            taken = self.intake.take(self.settings, moving=self._goes_on)
             if taken is None:
                 break
             if isinstance(taken, AcceptedTip):
-                return actions + self._step_from(taken)
-            actions += self._refuse(taken)
+                actions += self._go_on_from(taken)
+            else:
+                actions += self._refuse(taken)
         return actions
 
-    def _step_from(self, accepted: AcceptedTip) -> list[Action]:
-        tip, joints, settings = accepted.tip, accepted.joints, self.settings
+    def _go_on_from(self, accepted: AcceptedTip) -> list[Action]:
+        """Do what a good tip lets be done."""
+        update, actions = self._use(accepted)
+        if not self._steering:
+            return actions
+        tip, joints = accepted.tip, accepted.joints
+        self._ready_step = next_step(
+            tip.stamp_ns, joints, update.command, self.settings, slowly=self.trust.is_doubtful
+        )
+        if self._ready_step is None:
+            return actions + self._end_at(joints)
+        return actions + self._send()
+
+    def _use(
+        self, accepted: AcceptedTip, way: Sequence[JointSample] = ()
+    ) -> tuple[ControlUpdate, list[Action]]:
+        """Hand a tip to the estimator; steering has ended where no way on is clear."""
+        tip, joints = accepted.tip, accepted.joints
         self.rejection = ""
         self.insertion = joints.insertion
-        update = self.control.update(tip.position, joints, accepted.covariance)
+        update = self.control.update(tip.position, joints, accepted.covariance, way)
         self.reach = update.reach
         self.trust = trust_of(update.estimate)
         self.reason = "; ".join(update.estimate.warnings)
@@ -334,14 +337,12 @@ class Steering:
             actions.append(Log("info", "STEERING: a good tip came"))
         if update.blocked:
             why = f"no way on from insertion {joints.insertion:.4g} m is clear of the obstacles"
-            return actions + self._leave(SteeringState.IDLE, why, "warning")
-        self._ready_step = next_step(
-            tip.stamp_ns, joints, update.command, settings, slowly=self.trust.is_doubtful
-        )
-        if self._ready_step is None:
-            text = f"insertion {joints.insertion:.6g} m reached; {self.trust.summary}"
-            return actions + self._leave(SteeringState.DONE, text, "info")
-        return actions + self._send()
+            actions += self._leave(SteeringState.IDLE, why, "warning")
+        return update, actions
+
+    def _end_at(self, joints: JointSample) -> list[Action]:
+        text = f"insertion {joints.insertion:.6g} m reached; {self.trust.summary}"
+        return self._leave(SteeringState.DONE, text, "info")
 
     def _send(self) -> list[Action]:
         step, device = self._ready_step, self._device
@@ -358,6 +359,7 @@ class Steering:
             self.awaiting = Awaiting.TIP
             return self._use_tip()
         self._ready_step, self._sent = None, step
+        self.command_ns = step.stamp_ns
         self.awaiting = Awaiting.RESULT
         self.patience.restart()
         return [step]

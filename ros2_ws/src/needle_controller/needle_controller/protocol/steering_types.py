@@ -69,6 +69,23 @@ class SendStep:
 
 
 @dataclasses.dataclass(frozen=True)
+class SendPath:
+    """Send the path ahead, in place of the one under way.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the tip that it was made from or confirmed by [ns].
+    points : tuple of tuple of float
+        Of each point insertion [m], rotation [rad], time from start [s]; the first is where the
+        path begins, at time 0.
+    """
+
+    stamp_ns: int
+    points: tuple[tuple[float, float, float], ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class PublishUpdate:
     """Publish estimate and control input, stamped with the tip's exposure."""
 
@@ -85,7 +102,7 @@ class Log:
     kind: str = ""
 
 
-Action = SendStep | PublishUpdate | Log
+Action = SendStep | SendPath | PublishUpdate | Log
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Whether the joints followed a step, and since when they are where it led."""
+"""Whether the joints followed a step, since when they are where it led, and how often not."""
 
 from __future__ import annotations
 
@@ -13,6 +13,11 @@ REST_INSERTION, REST_ROTATION = 2e-6, 1e-4
 """What a joint at rest may change by [m], [rad]."""
 _STANDSTILL = 5
 """Samples at one place, sent after the answer, which say that the joints do not go on."""
+
+MOST_REFUSALS = 10
+"""Commands in a row that may end without motion before the controller gives up."""
+MOST_UNFOLLOWED = 3
+"""Steps in a row that may be said to have succeeded without the joints being where they led."""
 
 
 class Followed(enum.Enum):
@@ -80,3 +85,41 @@ class StepWatch:
             return Followed.NOT_YET
         self.end_ns = sample.stamp_ns
         return Followed.STOOD
+
+
+class FailedSteps:
+    """Counts steps in a row that came to nothing, and says when that is enough."""
+
+    def __init__(self) -> None:
+        self._refusals = 0
+        self._unfollowed = 0
+
+    def forget(self) -> None:
+        """Start over: a step was done, or a person has looked."""
+        self._refusals = self._unfollowed = 0
+
+    def aborted(self, text: str, *, moved: bool) -> str:
+        """Take a command that was aborted; return why to give up, empty if it is too early."""
+        self._refusals = 0 if moved else self._refusals + 1
+        if self._refusals < MOST_REFUSALS:
+            return ""
+        return f"{self._refusals} commands in a row ended without motion, the last {text}"
+
+    def unfollowed(self, step: SendStep, at: JointSample) -> tuple[str, bool]:
+        """Take a step that the joints did not follow; return that in words, and whether to give up.
+
+        Parameters
+        ----------
+        step : SendStep
+            What was sent.
+        at : JointSample
+            Where the joints stand.
+        """
+        self._unfollowed += 1
+        text = (
+            f"a step is said to have succeeded, but joint_states stand at {at.insertion:.6g} m, "
+            f"{at.rotation:.4g} rad, not at {step.insertion:.6g} m, {step.rotation:.4g} rad"
+        )
+        if self._unfollowed < MOST_UNFOLLOWED:
+            return text, False
+        return f"{text}; so were {self._unfollowed} in a row: see to drives and joint_states", True

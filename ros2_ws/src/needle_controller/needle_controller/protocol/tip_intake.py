@@ -103,13 +103,17 @@ class TipIntake:
         """Want no tip that was exposed before this [ns]."""
         self.after_ns = max(self.after_ns, stamp_ns)
 
-    def take(self, settings: SteeringSettings) -> AcceptedTip | RefusedTip | None:
+    def take(
+        self, settings: SteeringSettings, *, moving: bool = False
+    ) -> AcceptedTip | RefusedTip | None:
         """Return the first tip that is wanted, once all that belongs to it has come.
 
         Parameters
         ----------
         settings : SteeringSettings
             What is wanted of a tip.
+        moving : bool
+            Whether a tip counts from where the needle has moved on since.
 
         Returns
         -------
@@ -119,7 +123,7 @@ class TipIntake:
         taken = self._take(settings)
         if isinstance(taken, AcceptedTip):
             before, self.last = self.last, taken
-            if self.has_moved_on(settings.step_length):
+            if not moving and self.has_moved_on(settings.step_length):
                 self.last = before
                 return self.take(settings)
             self._jumped.clear()

@@ -28,7 +28,12 @@ from needle_controller.observers.estimator import Estimate
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import ControlUpdate
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import DeviceReport, SendStep, SteeringState
+from needle_controller.protocol.steering_types import (
+    DeviceReport,
+    SendPath,
+    SendStep,
+    SteeringState,
+)
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import TipMeasurement
 
@@ -106,13 +111,21 @@ def _number(text: str) -> float | None:
         return None
 
 
-def to_trajectory(step: SendStep) -> JointTrajectory:
-    """Return a step as a trajectory of one point."""
-    point = JointTrajectoryPoint(positions=[step.insertion, step.rotation])
-    nanoseconds = round(step.duration * 1e9)
-    point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
-    message = JointTrajectory(joint_names=[INSERTION_JOINT, ROTATION_JOINT], points=[point])
-    message.header.stamp = to_stamp(step.stamp_ns)
+def to_trajectory(command: SendStep | SendPath) -> JointTrajectory:
+    """Return a step as a trajectory of one point, a path as one of several."""
+    if isinstance(command, SendStep):
+        points: tuple[tuple[float, float, float], ...] = (
+            (command.insertion, command.rotation, command.duration),
+        )
+    else:
+        points = command.points
+    message = JointTrajectory(joint_names=[INSERTION_JOINT, ROTATION_JOINT])
+    for insertion, rotation, time in points:
+        point = JointTrajectoryPoint(positions=[insertion, rotation])
+        nanoseconds = round(time * 1e9)
+        point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)
+        message.points.append(point)
+    message.header.stamp = to_stamp(command.stamp_ns)
     return message
 
 
@@ -168,6 +181,8 @@ def to_diagnostic(steering: Steering, preset: str) -> Diagnostic:
         "r1_high_m": _said(steering.trust.high),
         "reason": steering.patience.silence or steering.reason,
         "awaiting": steering.awaiting.value,
+        "insertion": steering.settings.insertion,
+        "command_ns": str(steering.command_ns),
         "tip_after_ns": str(steering.intake.after_ns),
         "tips_rejected": str(steering.intake.refused.total()),
         "tips_rejected_for": ", ".join(

@@ -21,8 +21,8 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds
 from needle_common.ros.topic_input import TopicInput
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendStep
+from needle_controller.protocol.continuous import make_steering
+from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SendPath, SendStep
 from needle_controller.ros import conversions
 from needle_controller.ros.obstacle_messages import OBSTACLES, to_obstacles
 
@@ -57,7 +57,7 @@ class SteeringMessages:
     """
 
     def __init__(self, settings: SteeringSettings) -> None:
-        self.steering = Steering(settings)
+        self.steering = make_steering(settings)
         self.bad_joints = 0
         self.joints_complaint = ""
         self.plane_complaint = ""
@@ -142,10 +142,10 @@ class SteeringMessages:
         return [Log("info", f"{len(obstacles)} obstacles", OBSTACLES)]
 
 
-def output_messages(action: SendStep | PublishUpdate) -> list[tuple[str, Any]]:
+def output_messages(action: SendStep | SendPath | PublishUpdate) -> list[tuple[str, Any]]:
     """Return the messages of an action, each with its relative topic, in the order of sending."""
     stamp = action.stamp_ns
-    if isinstance(action, SendStep):
+    if isinstance(action, SendStep | SendPath):
         return [("device/joint_trajectory", conversions.to_trajectory(action))]
     estimate = action.update.estimate
     return [

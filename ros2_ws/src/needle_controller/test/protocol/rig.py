@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
@@ -36,11 +36,16 @@ class Rig:
         preset: str = "best",
         insertion: float = 0.0,
         rotation: float = 0.0,
+        way: str = "stepwise",
     ) -> None:
         settings = SteeringSettings(
-            preset=preset, depth=depth, target_offset=0.003, tip_covariance=tip_covariance
+            preset=preset,
+            depth=depth,
+            target_offset=0.003,
+            tip_covariance=tip_covariance,
+            insertion=way,
         )
-        self.steering = Steering(settings)
+        self.steering = make_steering(settings)
         self.now = TICK
         self.insertion = insertion
         self.rotation = rotation

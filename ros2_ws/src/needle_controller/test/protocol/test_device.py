@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.protocol.failed_steps import MOST_REFUSALS
 from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
+from needle_controller.protocol.step_watch import MOST_REFUSALS
 
 from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 

@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
-from needle_controller.protocol.failed_steps import MOST_UNFOLLOWED
 from needle_controller.protocol.joint_history import CONFIRMED_BY, JointSample
 from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, SteeringState
+from needle_controller.protocol.step_watch import MOST_UNFOLLOWED
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
 
 from .rig import HELD, TICK, Rig, logged, none_sent, sent, where
