@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import array
+from collections.abc import Mapping
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -72,3 +73,11 @@ def to_camera_info(camera: SimulatedCamera, frame: str, stamp: Time) -> CameraIn
         r=np.eye(3).ravel(),
         p=np.hstack([camera.camera_matrix, np.zeros((3, 1))]).ravel(),
     )
+
+
+def stamp_in(values: Mapping[str, str], key: str) -> int:
+    """Return the stamp that a status has under a key [ns]; -1 where it has none."""
+    try:
+        return int(values.get(key) or -1)
+    except ValueError:
+        return -1

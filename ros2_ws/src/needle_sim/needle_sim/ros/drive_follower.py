@@ -110,6 +110,10 @@ class DriveFollower:
         """Return whether somebody's hold counts."""
         return self._status.get("hold_owner", "") != ""
 
+    def heard_command(self, _: float) -> int:
+        """Return the stamp of the newest command that the device has heard [ns]."""
+        return int(self._status.get("command_ns") or 0)
+
     def begin_tick(self, time_ns: int, _: float, now: float) -> None:
         """Wait from now on for what the tick that ends at `time_ns` [ns] comes to."""
         self._tick.begin(time_ns, now)

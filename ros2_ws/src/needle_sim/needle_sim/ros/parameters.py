@@ -7,7 +7,11 @@ import math
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
-from needle_device_driver.supervisor.limits import SafetyLimits, limit_parameter
+from needle_device_driver.supervisor.limits import (
+    SafetyLimits,
+    limit_parameter,
+    path_delay_parameter,
+)
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS
 
 LEVELS = ("tip", "camera", "drive")
@@ -80,6 +84,7 @@ class SimRigParameters:
         0.1,
         60.0,
     )
+    path_delay: float = path_delay_parameter()
     tick_timeout: float = fixed_parameter(
         0.5, "s", "Level drive: how long driver and drives may leave a tick unanswered.", 0.02, 60.0
     )

@@ -33,7 +33,7 @@ from needle_common.ros.whole_node import WholeNode
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.lock_step import Action, LockStep
 from needle_sim.rig.pace import Pace
-from needle_sim.ros.conversions import to_truth
+from needle_sim.ros.conversions import stamp_in, to_truth
 from needle_sim.ros.drive_follower import DriveFollower
 from needle_sim.ros.parameters import SimRigParameters
 from needle_sim.ros.simulated_device import SimulatedDevice
@@ -86,6 +86,7 @@ class SimRigNode(WholeNode):
             tip_noise=values.tip_noise,
             seed=values.seed,
         )
+        self._frame_ns = round(NANOSECONDS / values.camera_rate)
         self._lock_step: LockStep | None = None
         self._watched = WatchedTime()
         self._pace: Pace | None = None
@@ -93,7 +94,11 @@ class SimRigNode(WholeNode):
             self._pace = Pace(TICK, values.real_time_factor)
         else:
             self._lock_step = LockStep(
-                answered=values.level != "tip", reexpose_after=values.reexpose_after
+                answered=values.level != "tip",
+                reexpose_after=values.reexpose_after,
+                tick_ns=TICK_NS,
+                frame_ns=self._frame_ns,
+                path_delay_ns=round(values.path_delay * NANOSECONDS),
             )
         self._time_ns = START_NS
         self._started = False
@@ -129,6 +134,7 @@ class SimRigNode(WholeNode):
                 self._bench,
                 values.limits,
                 in_lock_step=self._lock_step is not None,
+                path_delay=values.path_delay,
                 refuse=self._why_not_ready,
                 on_step_end=self._on_step_end,
                 now=time.monotonic(),
@@ -177,6 +183,8 @@ class SimRigNode(WholeNode):
         self._device.observe(now)
         trips = self._lock_step.watchdog_trips
         action = self._lock_step.next_action(
+            time_ns=self._time_ns,
+            heard_command_ns=self._device.heard_command(now),
             under_way=self._device.under_way(),
             may_move=self._device.may_move(now),
             held=self._device.held(now),
@@ -214,11 +222,9 @@ class SimRigNode(WholeNode):
         if pace.wait(now) > 0.0:
             return pace.wait(now)
         pace.tick(now)
-        due = self._time_ns + TICK_NS >= self._next_frame_ns and not self._ended
-        if due:
-            self._next_frame_ns = (
-                self._time_ns + TICK_NS + round(NANOSECONDS / self._settings.camera_rate)
-            )
+        then_ns = self._time_ns + TICK_NS
+        if due := then_ns >= self._next_frame_ns and not self._ended:
+            self._next_frame_ns = then_ns + self._frame_ns
         self._tick(Action.EXPOSE if due else Action.TICK, now)
         return pace.wait(time.monotonic())
 
@@ -352,12 +358,13 @@ class SimRigNode(WholeNode):
         if self._lock_step is None:
             return
         values = values_of(message)
-        try:
-            tip_after_ns = int(values.get("tip_after_ns") or -1)
-        except ValueError:
-            tip_after_ns = -1
         self._lock_step.take_controller_status(
-            values.get("state", ""), values.get("awaiting", ""), tip_after_ns, self._watched_now()
+            values.get("state", ""),
+            values.get("awaiting", ""),
+            stamp_in(values, "tip_after_ns"),
+            self._watched_now(),
+            continuous=values.get("insertion") == "continuous",
+            command_ns=stamp_in(values, "command_ns"),
         )
 
     def _on_answer(self, message: PoseWithCovarianceStamped) -> None:

@@ -33,6 +33,8 @@ class SimulatedDevice:
         The supervisor's.
     in_lock_step : bool
         A hold that falls silent pauses instead of aborting.
+    path_delay : float
+        In lock step a path takes effect so long after its tip's exposure [s].
     refuse : callable
         Returns why services are not ready yet; empty when they are.
     on_step_end : callable
@@ -56,6 +58,7 @@ class SimulatedDevice:
         limits: SafetyLimits,
         *,
         in_lock_step: bool,
+        path_delay: float,
         refuse: Callable[[], str],
         on_step_end: Callable[[], None],
         now: float,
@@ -64,7 +67,11 @@ class SimulatedDevice:
         self._insertion = SimulatedAxis("insertion")
         self._rotation = SimulatedAxis("rotation")
         self._supervisor = MotionSupervisor(
-            self._insertion, self._rotation, limits, lock_step=in_lock_step
+            self._insertion,
+            self._rotation,
+            limits,
+            lock_step=in_lock_step,
+            path_delay=path_delay,
         )
         self._supervisor.configure(now)
         self._interface = interface = DeviceInterface(
@@ -105,6 +112,10 @@ class SimulatedDevice:
     def held(self, now: float) -> bool:
         """Return whether somebody's hold counts."""
         return bool(self._supervisor.status(now).hold_owner)
+
+    def heard_command(self, now: float) -> int:
+        """Return the stamp of the newest command that the device has heard [ns]."""
+        return self._supervisor.status(now).command_ns
 
     def begin_tick(self, time_ns: int, period: float, now: float) -> None:
         """Let `period` [s] go by that ends at `time_ns` [ns]."""

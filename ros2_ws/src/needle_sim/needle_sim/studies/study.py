@@ -73,6 +73,9 @@ class StudySettings:
         What goes wrong.
     seed : int
         Of all randomness.
+    turn_delay : float
+        Insertion from a measurement until the base begins to turn by it, less than a step [m]: of a
+        needle that goes in continuously, its speed times the time that an answer takes.
     """
 
     curvature: float
@@ -80,6 +83,7 @@ class StudySettings:
     step_length: float
     disturbances: Disturbances
     seed: int
+    turn_delay: float = 0.0
 
     @property
     def steps(self) -> int:
@@ -156,7 +160,11 @@ def _steer(
         reached = min(step * settings.step_length, settings.depth)
         length = reached - insertion
         turned = rate * length
-        needles.insert(insertion, reached, length, turned)
+        # Where the turn is done does not depend on where it begins.
+        turns_from = insertion + min(settings.turn_delay, 0.9 * length)
+        if turns_from > insertion:
+            needles.insert(insertion, turns_from, turns_from - insertion, 0.0 * turned)
+        needles.insert(turns_from, reached, reached - turns_from, turned)
         insertion = reached
         tally.add(true.x, insertion, turned)
         on_progress(len(true.x))

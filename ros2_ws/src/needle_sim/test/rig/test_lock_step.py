@@ -2,27 +2,45 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 
 from needle_sim.rig.lock_step import MAX_WITHOUT_STEP, Action, LockStep
 
 STAMP = 40_000_000
+TICK, FRAME, DELAY = 20_000_000, 33_333_333, 40_000_000
 
 
 def next_action(
     lock_step: LockStep,
     *,
+    time_ns: int = STAMP,
+    heard_command_ns: int = 0,
     under_way: bool = False,
     may_move: bool = False,
     held: bool = True,
     now: float = 0.0,
 ) -> Action:
-    return lock_step.next_action(under_way=under_way, may_move=may_move, held=held, now=now)
+    return lock_step.next_action(
+        time_ns=time_ns,
+        heard_command_ns=heard_command_ns,
+        under_way=under_way,
+        may_move=may_move,
+        held=held,
+        now=now,
+    )
+
+
+def new_lock_step(*, answered: bool) -> LockStep:
+    return LockStep(
+        answered=answered, reexpose_after=2.0, tick_ns=TICK, frame_ns=FRAME, path_delay_ns=DELAY
+    )
 
 
 @pytest.fixture(params=[False, True], ids=["tip", "camera"])
 def lock_step(request: pytest.FixtureRequest) -> LockStep:
-    return LockStep(answered=request.param, reexpose_after=2.0)
+    return new_lock_step(answered=request.param)
 
 
 def exposed_and_answered(lock_step: LockStep, *, found: bool = True) -> None:
@@ -107,7 +125,7 @@ def test_rule_4_silence_is_broken_and_counted_only_while_steering_and_held(
 
 
 def test_an_unanswered_exposure_keeps_the_next_back_but_for_rule_4() -> None:
-    lock_step = LockStep(answered=True, reexpose_after=2.0)
+    lock_step = new_lock_step(answered=True)
     lock_step.take_controller_status("STEERING", "tip", 0, 0.0)
     lock_step.exposed(STAMP, 0.0)
     lock_step.step_ended(0.0)
@@ -120,7 +138,7 @@ def test_an_unanswered_exposure_keeps_the_next_back_but_for_rule_4() -> None:
 
 
 def test_exposures_without_a_step_have_a_bound_while_steering() -> None:
-    lock_step = LockStep(answered=True, reexpose_after=2.0)
+    lock_step = new_lock_step(answered=True)
 
     def expose(count: int, *, found: bool) -> None:
         for number in range(count):
@@ -140,3 +158,61 @@ def test_exposures_without_a_step_have_a_bound_while_steering() -> None:
     assert lock_step.why_stuck == "60 exposures since the last step, and no tip led to one"
     expose(1, found=False)
     assert lock_step.why_stuck == "61 exposures since the last step, and no tip was found"
+
+
+def continuous(
+    lock_step: LockStep, *, tip_after_ns: int = 0, command_ns: int = 0, awaiting: str = "tip"
+) -> None:
+    lock_step.take_controller_status(
+        "STEERING", awaiting, tip_after_ns, 0.0, continuous=True, command_ns=command_ns
+    )
+
+
+def test_continuously_time_goes_on_and_frames_come_at_their_rate() -> None:
+    lock_step = new_lock_step(answered=False)
+    continuous(lock_step)
+    time_ns, exposures = STAMP, []
+    for _ in range(50):
+        action = next_action(lock_step, time_ns=time_ns, heard_command_ns=time_ns)
+        time_ns += TICK
+        if action is Action.EXPOSE:
+            exposures.append(time_ns)
+            lock_step.exposed(time_ns, 0.0)
+            continuous(lock_step, tip_after_ns=time_ns, command_ns=time_ns)
+        else:
+            assert action is Action.TICK
+    assert {b - a for a, b in itertools.pairwise(exposures)} == {2 * TICK}
+
+
+def test_continuously_time_waits_where_an_answer_is_due_that_has_not_come() -> None:
+    lock_step = new_lock_step(answered=False)
+    continuous(lock_step)
+    lock_step.exposed(STAMP, 0.0)
+    assert next_action(lock_step, time_ns=STAMP) is Action.TICK
+    assert next_action(lock_step, time_ns=STAMP + TICK) is Action.WAIT
+    continuous(lock_step, tip_after_ns=STAMP, command_ns=STAMP)
+    # The controller has answered, the device has not heard it.
+    assert next_action(lock_step, time_ns=STAMP + TICK) is Action.WAIT
+    heard = next_action(lock_step, time_ns=STAMP + TICK, heard_command_ns=STAMP)
+    assert heard is Action.EXPOSE
+
+
+def test_continuously_a_tip_that_was_not_found_is_an_answer() -> None:
+    lock_step = new_lock_step(answered=True)
+    continuous(lock_step)
+    lock_step.exposed(STAMP, 0.0)
+    assert next_action(lock_step, time_ns=STAMP + TICK) is Action.WAIT
+    lock_step.take_answer(STAMP, False, 0.0)
+    assert next_action(lock_step, time_ns=STAMP + TICK) is Action.EXPOSE
+
+
+def test_continuously_time_stands_still_without_hold_and_goes_on_after_a_long_silence() -> None:
+    lock_step = new_lock_step(answered=False)
+    continuous(lock_step)
+    assert next_action(lock_step, held=False) is Action.WAIT
+    continuous(lock_step, awaiting="hold")
+    assert next_action(lock_step) is Action.WAIT
+    continuous(lock_step)
+    lock_step.exposed(STAMP, 0.0)
+    assert next_action(lock_step, time_ns=STAMP + TICK, now=2.1) is Action.EXPOSE
+    assert lock_step.watchdog_trips == 1
