@@ -18,7 +18,7 @@ from needle_analysis.report.figure_style import (
     STYLE,
     WIDTH,
 )
-from needle_analysis.run.run_events import health_of, trips
+from needle_analysis.run.run_events import health_of, is_aborted, trips
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status
 
 _STATE_COLORS = {
@@ -64,9 +64,7 @@ def lanes_of(run: Run) -> list[Lane]:
     if len(run.holds):
         lanes.append(Lane("hold", list(_pressed(run, end))))
     stops = [
-        Span(result.log_time, result.log_time, RED)
-        for result in run.results
-        if result.outcome != "succeeded"
+        Span(result.log_time, result.log_time, RED) for result in run.results if is_aborted(result)
     ]
     if stops:
         lanes.append(Lane("aborted steps", stops))

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from needle_bags.reading.bag_reader import HealthEvent, Run, Status
+from needle_bags.reading.bag_reader import HealthEvent, Result, Run, Status
 
 WARNING = 1
+
+
+def is_aborted(result: Result) -> bool:
+    """Return whether a step or path ended early: not at its end, nor for the next path."""
+    return result.outcome.startswith("aborted")
 
 
 def troubles(run: Run) -> list[HealthEvent]:
@@ -20,7 +25,7 @@ def troubles(run: Run) -> list[HealthEvent]:
     aborted = [
         HealthEvent(result.log_time, "device: step", WARNING, result.outcome)
         for result in run.results
-        if result.outcome != "succeeded"
+        if is_aborted(result)
     ]
     health = [event for event in health_of(run) if event.level]
     return sorted([*health, *trips(run), *aborted], key=lambda event: event.log_time)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from needle_analysis.run.run_events import is_aborted
 from needle_bags.reading.bag_reader import Run, Series, Stamps
 from needle_common.commands.cli import JsonValue, finite_or_none
 
@@ -43,7 +44,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
     missed = point_error(run)
     off = missed if missed is not None else final
     done = reached_depth(run)
-    steps = sum(result.outcome == "succeeded" for result in run.results)
+    steps = _steps(run)
     insertion = run.joints.values[:, 0]
     summary: dict[str, JsonValue] = {
         "level": _text(run.run_info.get("level"), run.parameter("sim_rig", "level")),
@@ -65,7 +66,7 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "tips": len(run.tips),
         "tips_not_finite": int(np.sum(~np.isfinite(run.tips.values).all(axis=1))),
         "tips_missed": int(np.sum(~np.isfinite(run.tip_covariances.values).all(axis=1))),
-        "steps_aborted": len(run.results) - steps,
+        "steps_aborted": sum(is_aborted(result) for result in run.results),
         "steps_per_s": _steps_per_second(run, steps),
         "wall_s": wall_s,
         "watchdog_trips": watchdog_trips(run),
@@ -75,6 +76,13 @@ def summarize(run: Run, wall_s: float | None = None) -> dict[str, JsonValue]:
         "bag": str(run.path),
     }
     return {key: finite_or_none(value) for key, value in summary.items()}
+
+
+def _steps(run: Run) -> int:
+    """Return how many steps were done; of a continuous insertion how many tips were used."""
+    if run.last_status("insertion") == "continuous":
+        return int(run.last_status("step"))
+    return sum(result.outcome == "succeeded" for result in run.results)
 
 
 def rerun_of(run: Run) -> str | None:

@@ -71,7 +71,14 @@ class Results:
 
 def settings_of(options: MonteCarloOptions) -> StudySettings:
     """Return what the needles of a study have in common."""
-    return StudySettings(CURVATURE, options.depth, STEP_LENGTH, options.disturbances, options.seed)
+    return StudySettings(
+        CURVATURE,
+        options.depth,
+        STEP_LENGTH,
+        options.disturbances,
+        options.seed,
+        options.turn_delay,
+    )
 
 
 def starts_of(options: MonteCarloOptions) -> FloatArray:
@@ -114,7 +121,11 @@ def _to_plane(
     outcomes = run_study(
         starts,
         controller_factory(
-            options.controller, options.claimed_bound, flips, sigma_scale=options.sigma_scale
+            options.controller,
+            options.claimed_bound,
+            flips,
+            sigma_scale=options.sigma_scale,
+            turn_delay=options.turn_delay,
         ),
         settings_of(options),
         on_progress=on_progress,

@@ -81,6 +81,7 @@ class MonteCarloOptions:
     claimed_bound: float
     sigma_scale: float
     flips: int
+    turn_delay: float
     targets: int
     rotation_budget: float
     target_drift: float
@@ -103,6 +104,8 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
     if given.noise_shape not in NOISE_SHAPES:
         raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(NOISE_SHAPES)}")
+    if given.targets != "0" and given.turn_delay_mm != "0":
+        raise UserError("--turn-delay-mm is of needles that are steered to the plane")
     depth = given.depth_mm or (_DEPTH_MM if given.targets == "0" else _DEPTH_OF_POINTS_MM)
     return MonteCarloOptions(
         controller=given.controller,
@@ -133,6 +136,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         claimed_bound=number("--claimed-mm", given.claimed_mm, 0.01, 100.0, "mm") * 1e-3,
         sigma_scale=number("--sigma-scale", given.sigma_scale, 0.01, 100.0, "-"),
         flips=whole_number("--flips", given.flips, 0, 100),
+        turn_delay=number("--turn-delay-mm", given.turn_delay_mm, 0.0, 0.9, "mm") * 1e-3,
         targets=whole_number("--targets", given.targets, 0, 1_000_000),
         rotation_budget=math.radians(number("--rotation-deg", given.rotation_deg, 0.0, 1e6, "deg")),
         target_drift=number("--target-drift-mm", given.target_drift_mm, 0.0, 100.0, "mm") * 1e-3,
@@ -192,6 +196,13 @@ def _parser() -> CommandParser:
         ("--bump-mm", "0", "D", "how far the phantom, with the needle, is moved at half the depth"),
         ("--kappa-patches", "0", "F", "curvature off by up to this share, anew every 20 mm"),
         ("--flips", "0", "N", "times the bevel is flipped, evenly spaced, mirrored"),
+        (
+            "--turn-delay-mm",
+            "0",
+            "D",
+            "insertion from a measurement until the base turns by it: of a needle that goes in "
+            "continuously its speed times the answer's latency; not with --targets",
+        ),
         (
             "--targets",
             "0",

@@ -56,9 +56,18 @@ class SteeredNeedles:
         Returns the command for an estimate at an inserted length [m].
     covariance : ndarray, shape (3, 3), optional
         What each tip's is said to be [m^2]; the estimator's own assumption if none is given.
+    turn_delay : float
+        See `study.StudySettings`: the joints tell.
     """
 
-    def __init__(self, estimator: Estimator, law: StepLaw, covariance: Array | None = None) -> None:
+    def __init__(
+        self,
+        estimator: Estimator,
+        law: StepLaw,
+        covariance: Array | None = None,
+        turn_delay: float = 0.0,
+    ) -> None:
+        self._turn_delay = turn_delay
         self._estimator = estimator
         self._law = law
         self._covariance = covariance
@@ -81,6 +90,10 @@ class SteeredNeedles:
         """Take a step and what was measured after it; see `study.Controller.step`."""
         self._insertion = self._insertion + d_insertion
         self._turned = self._turned + np.abs(d_rotation)
+        if self._turn_delay > 0.0:
+            unturned = np.minimum(self._turn_delay, 0.9 * np.asarray(d_insertion))
+            self._estimator.advance(unturned, 0.0 * d_rotation)
+            d_insertion = d_insertion - unturned
         self._estimator.advance(d_insertion, d_rotation)
         self._estimator.correct(tips, self._covariance, age)
         return self._rate()
@@ -227,6 +240,7 @@ def controller_factory(
     flip_depths: Sequence[float] = (),
     *,
     sigma_scale: float = 1.0,
+    turn_delay: float = 0.0,
 ) -> Callable[[], SteeredNeedles]:
     """Return what makes the controller of some needles.
 
@@ -241,6 +255,8 @@ def controller_factory(
     sigma_scale : float
         Other than 1: it is not told of a bound; instead each tip comes with a covariance, whose
         standard deviations are those of uniform noise within `claimed`, divided by this.
+    turn_delay : float
+        As of `study.StudySettings` [m].
 
     Raises
     ------
@@ -248,7 +264,9 @@ def controller_factory(
         If there is no such controller, or it cannot flip.
     """
     settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths)
-    return lambda: SteeredNeedles(*make_controller(settings, np.eye(3), np.zeros(3)), covariance)
+    return lambda: SteeredNeedles(
+        *make_controller(settings, np.eye(3), np.zeros(3)), covariance, turn_delay
+    )
 
 
 def point_controller_factory(
