@@ -34,6 +34,8 @@ _LEVELS = {
     "stereo_tracker": ("camera", "drive"),
 }
 
+CONTINUOUS_CAMERA_RATE = 30.0
+"""Frames of a needle that goes on [1/s]."""
 # A sensor without noise still has this bound for the controllers' design [m].
 SMALLEST_NOISE = 1e-5
 
@@ -54,6 +56,7 @@ OPTIONS = {
     "measurement_std": "--noise-mm",
     "bag": "--bag",
     "preset": "--controller",
+    "insertion": "--insertion",
     "depth": "--depth-mm",
     "target_point": "--target",
     "obstacles": "--obstacles",
@@ -130,6 +133,9 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         },
         "operator": {"wait_for_recorder": True},
     }
+    if options.insertion == "continuous":
+        sim_rig["camera_rate"] = CONTINUOUS_CAMERA_RATE
+        parameters["plane_controller"]["insertion"] = options.insertion
     if options.target_mm is not None:
         point = [c * 1e-3 for c in options.target_mm]
         parameters["plane_controller"]["target_point"] = point

@@ -55,6 +55,8 @@ something missing, 130 interrupted.
 LEVELS = ("tip", "camera", "drive")
 CONTROLLERS = ("best", "paper", "open_loop")
 """plane_controller's presets; named here again, for to import them takes half a second."""
+INSERTIONS = ("stepwise", "continuous")
+"""How plane_controller lets the needle go in, likewise."""
 
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
@@ -66,6 +68,7 @@ class SimulateOptions:
 
     level: str = "camera"
     controller: str = "best"
+    insertion: str = "stepwise"
     seed: int = 1
     initial_x_mm: float = -3.0
     initial_pitch_deg: float = 2.0
@@ -93,6 +96,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     given = _parser().parse_args(join_start(arguments))
     _one_of("--level", given.level, LEVELS)
     _one_of("--controller", given.controller, CONTROLLERS)
+    _one_of("--insertion", given.insertion, INSERTIONS)
     noise = None
     if given.level == "tip":
         noise = number("--noise-mm", given.noise_mm or "1.0", 0.0, 20.0, "mm")
@@ -105,6 +109,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     return SimulateOptions(
         level=given.level,
         controller=given.controller,
+        insertion=given.insertion,
         initial_x_mm=x_mm,
         initial_pitch_deg=pitch_deg,
         initial_roll_deg=roll_deg,
@@ -139,6 +144,13 @@ def _parser() -> CommandParser:
         metavar="paper|best|open_loop",
         help="how the needle is turned: as in the paper, by the best controller known here, or not "
         f"at all (default: best); for comparison also {', '.join(CONTROLLERS[3:])}",
+    )
+    add(
+        "--insertion",
+        default="stepwise",
+        metavar="|".join(INSERTIONS),
+        help="whether the needle rests after each step until its tip was seen, or goes on while a "
+        "person holds (default: stepwise)",
     )
     add(
         "--initial",

@@ -72,6 +72,21 @@ def test_one_seed_is_one_run_and_another_another(run: Run) -> None:
     assert one["/device/joint_trajectory"] != other["/device/joint_trajectory"]
 
 
+def test_a_continuous_run_goes_on_and_repeats(run: Run) -> None:
+    arguments = ("--level", "tip", "--insertion", "continuous", "--depth-mm", "6")
+    one, again = (run(name, *arguments) for name in ("goes_on", "goes_on_again"))
+    first, second = (payloads(finished.bag, TOPICS) for finished in (one, again))
+    assert first == second
+    # 6 mm at 2 mm/s, exposed 25 times a second (every other tick), and a little more at its ends.
+    assert 75 <= len(first["/needle/tip"]) <= 85
+    summary = json.loads((one.bag / "summary.json").read_text())
+    assert summary["steps"] == 6
+    assert summary["steps_aborted"] == 0
+    assert summary["insertion_final_mm"] == pytest.approx(6.0, abs=0.01)
+    assert summary["state"] == "DONE"
+    assert rerun.main([str(one.bag)]) == 0
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -118,8 +118,8 @@ def check_command(
     Returns
     -------
     tuple of Leg, or Refusal
-        Of a path what lies ahead of where the joints were last told to be; otherwise never a part
-        of a command.
+        Of a path what lies ahead of where the joints were last told to be, nothing where they are
+        at its end; otherwise never a part of a command.
     """
     if context.publishers > 1:
         return Refusal(
@@ -131,6 +131,9 @@ def check_command(
     if not context.homed:
         return Refusal(Rule.HOMED_FIRST, "the axes are not homed")
     way = _way(command, context)
+    left = way[-1].leg.insertion - context.insertion
+    if command.is_path and abs(left) <= limits.insertion_tolerance:
+        return ()
     return _check_bounds(way, context, limits) or _ahead(way, context.insertion)
 
 

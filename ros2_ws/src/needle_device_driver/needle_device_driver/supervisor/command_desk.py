@@ -12,6 +12,7 @@ from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import INNER_SWITCH
+from needle_device_driver.supervisor.reports import SUCCEEDED
 from needle_device_driver.supervisor.states import Activity, State
 
 
@@ -133,6 +134,10 @@ class CommandDesk:
             self._refuse(command, legs)
             return False
         self._stamps.use(command.stamp_ns)
+        if not legs:
+            # Another path has led there already, or is about to say so.
+            self._core.answer(command.stamp_ns, SUCCEEDED)
+            return False
         self._on_path = command.is_path
         if self._core.activity is Activity.STEP:
             self._core.replace(legs, command.stamp_ns)

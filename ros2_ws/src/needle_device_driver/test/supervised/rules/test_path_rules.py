@@ -69,6 +69,17 @@ def test_coordinated_a_path_takes_the_place_of_another_without_a_stop(bench: Ben
     ]
 
 
+def test_forward_only_a_path_that_ends_where_the_needle_is_moves_nothing(bench: Bench) -> None:
+    bench.ready()
+    path(bench, (0.0, 0.0), (0.5, 0.1), (1.0, 0.1))
+    bench.cycle(12, holding=True)
+    at = bench.positions
+    stamp = path(bench, (0.0, 0.0), (0.5, 0.5), (1.0, 0.5))
+    bench.cycle(5, holding=True)
+    assert bench.positions == at == (0.001, 0.1)
+    assert (bench.results[-1].stamp_ns, bench.results[-1].outcome) == (stamp, "succeeded")
+
+
 def test_max_rotation_rate_where_rotation_cannot_follow_insertion_waits(bench: Bench) -> None:
     bench.ready()
     path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
