@@ -48,6 +48,13 @@ class _RigParameters:
     connect_timeout: float = fixed_parameter(
         10.0, "s", "Autostart: how long adapter and drives may take to be there.", 0.0, 3600.0
     )
+    insertion_drive: str = fixed_parameter(
+        "motor",
+        "-",
+        "motor; or hand: a person pushes the needle, the insertion drive only says where it is, and "
+        "the rotation follows.",
+        choices=("motor", "hand"),
+    )
     lock_step: bool = fixed_parameter(
         False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
     )
@@ -90,8 +97,6 @@ class _RigParameters:
         check_fields(self)
         if self.drive("insertion").node_id == self.drive("rotation").node_id:
             raise UserError("insertion_node_id and rotation_node_id are the same")
-        if not self.drive("rotation").actuated:
-            raise UserError("rotation_actuated = False: nobody would turn the needle")
         for name in ("watchdog", "reply_age_limit"):
             value = getattr(self, name)
             # In lock step motors stand still while nobody sends SYNC; real ones do not.
@@ -126,6 +131,7 @@ class _RigParameters:
         values = {name: value for name, value in own.items() if value is not None}
         margin = _LIMIT_MARGIN * values["following_error"]
         if axis == "insertion":
+            values["actuated"] = self.insertion_drive == "motor"
             values |= {"speed": limits.max_speed, "lower": -margin}
             values["upper"] = limits.max_depth + margin
         else:
@@ -168,9 +174,6 @@ def _axis(
             0.0, "-", "Share of rated torque; 0: as the drive has it.", 0.0, 5.0
         ),
         "tolerance": fixed_parameter(tolerance, unit, "An axis so close has arrived.", 1e-7, 1.0),
-        "actuated": fixed_parameter(
-            True, "-", "False: a hand moves the axis, its drive only says where it is."
-        ),
     }
     return [(f"{axis}_{name}", type(f.default), f) for name, f in fields.items()]
 

@@ -126,7 +126,7 @@ def test_error_codes_have_words() -> None:
         {"link": "usb"},
         {"channel": ""},
         {"bitrate": 123_456},
-        {"rotation_actuated": False},
+        {"insertion_drive": "foot"},
         {"insertion_counts_per_unit": 0.0},
         {"max_speed": 0.006},
     ],

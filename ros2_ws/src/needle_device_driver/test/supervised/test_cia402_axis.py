@@ -278,7 +278,7 @@ def test_many_steps_end_where_their_sum_is_to_the_count(
 
 
 def pushed(make_drive_bench: Callable[..., DriveBench]) -> DriveBench:
-    bench = make_drive_bench(insertion_actuated=False)
+    bench = make_drive_bench(insertion_drive="hand")
     bench.insertion.position = 777
     bench.ready()
     return bench

@@ -288,3 +288,53 @@ def test_coordinated_random_paths_replaced_at_random_keep_every_bound(bench: Ben
     assert not [
         r for a, b in itertools.pairwise(bench.results) for r in (a, b) if "abort" in r.outcome
     ]
+
+
+def pushed_bench() -> Bench:
+    bench = Bench()
+    bench.insertion.actuated = False
+    bench.ready()
+    return bench
+
+
+def push(bench: Bench, distance: float) -> None:
+    bench.insertion.position += distance
+    bench.cycle(holding=True)
+
+
+def test_coordinated_pushed_by_hand_rotation_follows_the_path_over_the_distance_made() -> None:
+    bench = pushed_bench()
+    path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.1))
+    bench.cycle(holding=True)
+    farthest = 0.0
+    for distance in (1e-4, 3e-4, -2e-4, 4e-4, 5e-4, 3e-4):
+        push(bench, distance)
+        bench.cycle(3, holding=True)
+        farthest = max(farthest, bench.positions[0])
+        wanted = np.interp(farthest, [0.0, 0.001, 0.002], [0.0, 0.3, 0.1])
+        assert bench.positions[1] == pytest.approx(wanted)
+    assert bench.status.reason == ""
+
+
+def test_max_rotation_rate_pushed_too_fast_is_said_at_once_and_no_longer_when_it_is_over() -> None:
+    bench = pushed_bench()
+    path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
+    push(bench, 1.5e-3)
+    assert bench.status.rotation_owed == pytest.approx(0.5 - np.pi * bench.period)
+    assert "pushed too fast: the rotation is 0.44 rad behind" in bench.status.reason
+    assert bench.last_rule is Rule.MAX_ROTATION_RATE
+    bench.cycle(10, holding=True)
+    assert bench.status.rotation_owed == 0.0
+    assert bench.positions == (pytest.approx(1.5e-3), pytest.approx(0.5))
+    assert len([notice for notice in bench.notices if "pushed too fast" in notice.text]) == 1
+
+
+def test_hold_to_run_pushed_by_hand_without_hold_nothing_turns() -> None:
+    bench = pushed_bench()
+    path(bench, (0.0, 0.0), (1.0, 0.5), (2.0, 0.5))
+    push(bench, 2e-4)
+    bench.hold(False)
+    turned = bench.positions[1]
+    bench.insertion.position += 5e-4
+    bench.cycle(5)
+    assert bench.positions[1] == turned
