@@ -19,6 +19,7 @@ from needle_verification.checks import (
     check_bags,
     check_control,
     check_driver,
+    check_hold_sources,
     check_simulation,
     check_traced,
     check_tracker,
@@ -32,6 +33,7 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
     "C": (*check_tracker.CHECKS, *check_traced.CHECKS),
     "D": check_driver.CHECKS,
     "E": check_bags.CHECKS,
+    "I": check_hold_sources.CHECKS,
 }
 
 DESCRIPTION = """\
