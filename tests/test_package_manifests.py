@@ -23,7 +23,18 @@ ROSDEP_KEYS = {
     "yaml": "python3-yaml",
 }
 # rosdep knows no key of them: they come from requirements-ros.lock alone, or an extra's.
-FROM_THE_LOCK_ALONE = {"canopen", "drjit", "lz4", "mcap", "mitsuba", "rosbags", "zstandard"}
+FROM_THE_LOCK_ALONE = {
+    "canopen",
+    "drjit",
+    "lz4",
+    "mcap",
+    "mitsuba",
+    "nicegui",
+    "rosbags",
+    "uvicorn",
+    "websockets",
+    "zstandard",
+}
 
 
 def imports_of(folder: Path) -> set[str]:

@@ -25,7 +25,7 @@ def set_up(script: str) -> None:
         name=name,
         version=said["version"],
         packages=find_packages(include=[name, f"{name}.*"]),
-        package_data={"": ["py.typed", "*.onnx", "*.xml"]},
+        package_data={"": ["py.typed", "*.onnx", "*.xml", "static/*"]},
         data_files=[
             ("share/ament_index/resource_index/packages", [f"resource/{name}"]),
             (f"share/{name}", ["package.xml"]),

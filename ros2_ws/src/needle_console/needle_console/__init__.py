@@ -1,0 +1,1 @@
+"""The web console: what the rig sees and believes, and a hold to steer it by."""

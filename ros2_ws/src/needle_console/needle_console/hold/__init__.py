@@ -1,0 +1,1 @@
+"""Hold to run over a WebSocket of its own."""

@@ -1,0 +1,1 @@
+"""What is drawn and said, from snapshots of plain data."""
