@@ -157,7 +157,8 @@ def _figure(name: str, images: Mapping[str, bytes]) -> str:
 def _timing(timings: Sequence[StageTiming]) -> str:
     if not timings:
         return ""
-    head = ("stage", "from what to what", "steps", "median [ms]", "95 % [ms]", "largest [ms]")
+    parts = ("median", "95 %", "99 %", "largest")
+    head = ("stage", "from what to what", "steps", *(f"{part} [ms]" for part in parts))
     return html_page.table(head, timing_rows(timings))
 
 

@@ -88,7 +88,7 @@ def _draw_gate(axes: Any, run: Run) -> None:
 
 def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
     """Return the wall time of each stage of every step."""
-    colors = (ESTIMATE, MEASURED, GREY, TEAL)
+    colors = (ESTIMATE, MEASURED, VIOLET, RED, GREY, TEAL)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 3.4))
         place(figure, 1, bottom=0.75)
@@ -99,15 +99,15 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
             axes.plot(insertion, milliseconds, ".", ms=4, color=color, label=timing.name)
         axes.set(yscale="log", ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        figure.legend(loc="lower center", ncols=4)
+        figure.legend(loc="lower center", ncols=3)
         return figure
 
 
 def timing_rows(timings: Sequence[StageTiming]) -> list[tuple[str, ...]]:
-    """Return (stage, from what to what, steps, median, 95 %, largest [ms]) as text."""
+    """Return (stage, from what to what, steps, median, 95 %, 99 %, largest [ms]) as text."""
     rows: list[tuple[str, ...]] = []
     for timing in timings:
-        figures: npt.NDArray[np.float64] = np.percentile(timing.seconds, [50, 95, 100]) * 1e3
+        figures: npt.NDArray[np.float64] = np.percentile(timing.seconds, [50, 95, 99, 100]) * 1e3
         numbers = (f"{value:.1f}" for value in figures)
         rows.append((timing.name, timing.meaning, str(len(timing.seconds)), *numbers))
     return rows

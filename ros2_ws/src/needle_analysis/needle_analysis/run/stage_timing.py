@@ -1,4 +1,8 @@
-"""Duration of each stage of a step, by when its messages were sent."""
+"""Duration of each stage of a step or path, by when its messages were sent.
+
+A cycle of the driver ends with its joint_states: the first that were sent after a command follow the
+first set-points made from it.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +20,12 @@ Floats = npt.NDArray[np.float64]
 
 _EXPOSURE = ("stereo/left/camera_info", "sim/tip_pose")
 _TIP, _COMMAND, _RESULT = "needle/tip_pose", "device/joint_trajectory", "device/result"
+_JOINTS = "joint_states"
 STAGES = (
     ("tracker", "exposure to tip"),
     ("controller", "tip to command"),
+    ("driver", "command to the end of the cycle with its first set-points"),
+    ("image to set-point", "all of these; at 5 mm/s each 10 ms are 0.05 mm"),
     ("device", "command to result: the motion"),
     ("camera", "result to next exposure"),
 )
@@ -55,9 +62,17 @@ def stage_timings(run: Run) -> list[StageTiming]:
     """
     sent = _first_sent(run)
     exposed = sent[_EXPOSURE[0]] or sent[_EXPOSURE[1]]
-    ends = ((exposed, sent[_TIP]), (sent[_TIP], sent[_COMMAND]), (sent[_COMMAND], sent[_RESULT]))
-    durations = [{stamp: b[stamp] - a[stamp] for stamp in a.keys() & b.keys()} for a, b in ends]
-    durations.append(_waits(sent[_RESULT], exposed))
+    tips, commands, results = sent[_TIP], sent[_COMMAND], sent[_RESULT]
+    to_set_points = _waits(commands, sent[_JOINTS])
+    set_points = {stamp: commands[stamp] + wait for stamp, wait in to_set_points.items()}
+    durations = [
+        _between(exposed, tips),
+        _between(tips, commands),
+        to_set_points,
+        _between(exposed, set_points),
+        _between(commands, results),
+        _waits(results, exposed),
+    ]
     timings = []
     for (name, meaning), found in zip(STAGES, durations, strict=True):
         stamps = np.array(sorted(found), np.int64)
@@ -69,18 +84,24 @@ def stage_timings(run: Run) -> list[StageTiming]:
 
 def _first_sent(run: Run) -> dict[str, dict[int, int]]:
     """Return relative topic -> stamp -> when the first message with that stamp was sent."""
-    names = {run.namespace + name: name for name in (*_EXPOSURE, _TIP, _COMMAND, _RESULT)}
+    topics = (*_EXPOSURE, _TIP, _COMMAND, _RESULT, _JOINTS)
+    names = {run.namespace + name: name for name in topics}
     sent: dict[str, dict[int, int]] = defaultdict(dict)
     for message in raw_as_sent(run.path, names.__contains__, lambda _: False):
         sent[names[message.topic]].setdefault(stamp_of(message.data), message.time)
     return sent
 
 
-def _waits(results: dict[int, int], exposed: dict[int, int]) -> dict[int, int]:
-    """Return by command how long after its result the next exposure was sent [ns]."""
-    times = np.sort(np.array(list(exposed.values()), np.int64))
+def _between(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
+    """Return by stamp how long after one message the other with that stamp was sent [ns]."""
+    return {stamp: ends[stamp] - begins[stamp] for stamp in begins.keys() & ends.keys()}
+
+
+def _waits(begins: dict[int, int], ends: dict[int, int]) -> dict[int, int]:
+    """Return by stamp how long after a message any of the others was sent next [ns]."""
+    times = np.sort(np.array(list(ends.values()), np.int64))
     waits = {}
-    for stamp, time in results.items():
+    for stamp, time in begins.items():
         after = int(np.searchsorted(times, time))
         if after < len(times):
             waits[stamp] = int(times[after]) - time

@@ -16,6 +16,7 @@ from needle_analysis.report.report_page import verdict_text
 from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import commanded_rotation, summarize
+from needle_analysis.run.stage_timing import STAGES
 from needle_bags.reading.bag_reader import HealthEvent, Result, Status, read_run
 from needle_common.commands.cli import JsonValue
 
@@ -68,8 +69,8 @@ def test_the_regression_bag_shows_everything(tmp_path: Path) -> None:
     page = (tmp_path / "report.html").read_text()
     for heading in ("What the cameras saw", "Innovation and gate", "Timing of each stage"):
         assert f"<h2>{heading}</h2>" in page
-    rows = re.findall(r"<tr><td>(\w+)</td><td>[^<]*</td><td>(\d+)</td>", page)
-    assert [name for name, _ in rows] == ["tracker", "controller", "device", "camera"]
+    rows = re.findall(r"<tr><td>([\w -]+)</td><td>[^<]*</td><td>(\d+)</td>", page)
+    assert [name for name, _ in rows] == [name for name, _ in STAGES]
     assert all(120 <= int(count) <= 121 for _, count in rows)
 
 

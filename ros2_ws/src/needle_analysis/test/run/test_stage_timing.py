@@ -15,12 +15,12 @@ STORE = get_typestore(Stores.ROS2_JAZZY)
 HEADER = "std_msgs/msg/Header"
 MILLISECOND = 1_000_000
 START = 1_700_000_000_000_000_000
-PERIOD, TRACKER, CONTROLLER, DEVICE = 100.0, 7.0, 2.0, 30.0
+PERIOD, TRACKER, CONTROLLER, DRIVER, DEVICE = 100.0, 7.0, 2.0, 12.0, 30.0
 STEPS = 25
 
 
 def write(directory: Path, exposure: str) -> Any:
-    """Steps of 100 ms: exposure, tip 7 ms later, command 2 ms later, result 30 ms later."""
+    """Steps of 100 ms: exposure, then tip, command, joints and result, each so much later."""
     bag = BagCopy(directory, "jazzy", {})
     for step in range(STEPS):
         sent = START + round(step * PERIOD * MILLISECOND)
@@ -30,7 +30,8 @@ def write(directory: Path, exposure: str) -> Any:
             (exposure, 0.0),
             ("needle/tip_pose", TRACKER),
             ("device/joint_trajectory", CONTROLLER),
-            ("device/result", DEVICE),
+            ("joint_states", DRIVER),
+            ("device/result", DEVICE - DRIVER),
         ):
             sent += round(delay * MILLISECOND)
             # Received late and all at once, as on a busy machine.
@@ -44,7 +45,14 @@ def write(directory: Path, exposure: str) -> Any:
 def test_stages_take_what_they_took(tmp_path: Path, exposure: str) -> None:
     timings = {timing.name: timing for timing in stage_timings(write(tmp_path / "bag", exposure))}
     wait = PERIOD - TRACKER - CONTROLLER - DEVICE
-    wanted = {"tracker": TRACKER, "controller": CONTROLLER, "device": DEVICE, "camera": wait}
+    wanted = {
+        "tracker": TRACKER,
+        "controller": CONTROLLER,
+        "driver": DRIVER,
+        "image to set-point": TRACKER + CONTROLLER + DRIVER,
+        "device": DEVICE,
+        "camera": wait,
+    }
     for name, milliseconds in wanted.items():
         assert timings[name].seconds * 1e3 == pytest.approx(milliseconds)
         assert len(timings[name].stamps) == (STEPS - 1 if name == "camera" else STEPS)

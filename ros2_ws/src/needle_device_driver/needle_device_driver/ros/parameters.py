@@ -51,8 +51,8 @@ class _RigParameters:
     insertion_drive: str = fixed_parameter(
         "motor",
         "-",
-        "motor; or hand: a person pushes the needle, the insertion drive only says where it is, and "
-        "the rotation follows.",
+        "motor; or hand: a person pushes the needle, the insertion drive only says where it is, "
+        "and the rotation follows.",
         choices=("motor", "hand"),
     )
     lock_step: bool = fixed_parameter(
