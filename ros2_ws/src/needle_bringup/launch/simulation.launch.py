@@ -1,9 +1,10 @@
 """The simulated rig: sim_rig, tracker and controller; for ROS 2 Jazzy with `ros2 launch`.
 
-    ros2 launch needle_bringup simulation.launch.py level:=tip operator:=true bag:=bags/by_launch
+    ros2 launch needle_bringup simulation.launch.py level:=tip simulated_operator:=true
 
-`scripts/simulate` does the same without `launch`, and reports. Without `operator:=true` time starts
-when somebody else sends device/hold. The launch ends with the operator, and with any other node.
+`scripts/simulate` does the same without `launch`, and reports. Without
+`simulated_operator:=true` time starts when somebody else sends device/hold. The launch ends with
+the operator, and with any other node.
 """
 
 from launch import LaunchDescription
@@ -19,10 +20,10 @@ def generate_launch_description() -> LaunchDescription:
         "seed": ("1", "seed of all noise"),
         "real_time_factor": ("1.0", "0.0: lock step"),
         "controller": ("best", "how the needle is turned"),
-        "operator": ("false", "let the stand-in keep the hold"),
+        "simulated_operator": ("false", "let the stand-in keep the hold"),
         "bag": ("", "new bag; empty: none"),
         "can": ("/tmp/needle_can", "level drive: where the emulated CAN adapter appears"),
         "params": ("", "parameter file for any node; empty: none"),
     }
-    choices = {"level": LEVELS, "controller": CONTROLLERS, "operator": ("true", "false")}
+    choices = {"level": LEVELS, "controller": CONTROLLERS, "simulated_operator": ("true", "false")}
     return describe(arguments, simulated_nodes, choices)

@@ -1,1 +1,1 @@
-"""The rig as a whole: operator, simulate, launch files, configuration."""
+"""The rig as a whole: operators, simulate, launch files, configuration."""

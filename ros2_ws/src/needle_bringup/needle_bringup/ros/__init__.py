@@ -1,1 +1,1 @@
-"""The operator stand-in, and what the launch files share."""
+"""The operator's stand-in, and what the launch files share."""

@@ -57,8 +57,8 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     Parameters
     ----------
     arguments : mapping
-        Launch argument -> text: level, seed, real_time_factor, controller, operator, bag, can and
-        params.
+        Launch argument -> text: level, seed, real_time_factor, controller, simulated_operator, bag,
+        can and params.
 
     Returns
     -------
@@ -78,8 +78,8 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     for name, parameter in (("drive_emulator", "pty"), ("device_driver", "channel")):
         if name in parameters:
             parameters[name][parameter] = arguments["can"]
-    if arguments["operator"] == "false":
-        del parameters["operator"]
+    if arguments["simulated_operator"] == "false":
+        del parameters["simulated_operator"]
     if bag is None:
         del parameters["recorder"]
         for values in parameters.values():

@@ -24,7 +24,7 @@ PACKAGES = {
     "device_driver": "needle_device_driver",
     "stereo_tracker": "needle_tracker",
     "plane_controller": "needle_controller",
-    "operator": "needle_bringup",
+    "simulated_operator": "needle_bringup",
 }
 NODES = tuple(PACKAGES)
 # Nodes that not every level runs -> the levels that do.
@@ -131,7 +131,7 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
             "target_offset": -options.initial_x_mm * 1e-3,
             "wait_for_recorder": True,
         },
-        "operator": {"wait_for_recorder": True},
+        "simulated_operator": {"wait_for_recorder": True},
     }
     if options.insertion == "continuous":
         sim_rig["camera_rate"] = CONTINUOUS_CAMERA_RATE

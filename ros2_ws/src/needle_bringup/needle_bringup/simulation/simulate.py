@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 
-from needle_bringup.operator.progress import PROGRESS_FD
+from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
     NODES,
@@ -66,7 +66,7 @@ class NodeFailedError(UserError):
     """
 
     def __init__(self, node: NodeProcess) -> None:
-        self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != "operator"
+        self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != "simulated_operator"
         where = "" if self.is_bad_input else f" (all it said is in {node.log})"
         super().__init__(node.describe_end() + where)
 
@@ -157,9 +157,9 @@ def _run_nodes(executables: dict[str, str], bag: Path, domain: int, end: EndRequ
                 [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
                 environment=environment,
                 log=logs / f"{name}.log",
-                pass_fds=[progress] if name == "operator" else [],
+                pass_fds=[progress] if name == "simulated_operator" else [],
             )
-        operator = nodes["operator"]
+        operator = nodes["simulated_operator"]
         begin = time.monotonic()
         while operator.exit_code is None and failure is None:
             _check(end)
@@ -180,7 +180,7 @@ def _run_nodes(executables: dict[str, str], bag: Path, domain: int, end: EndRequ
 def _first_dead(nodes: dict[str, NodeProcess]) -> NodeProcess | None:
     """Return a node that ended although it should run."""
     for name, node in nodes.items():
-        if name != "operator" and node.exit_code is not None:
+        if name != "simulated_operator" and node.exit_code is not None:
             return node
     return None
 
@@ -190,7 +190,7 @@ def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
 
     The driver switches the drives off before they, too, are gone.
     """
-    operator, recorder = nodes.get("operator"), nodes.get("recorder")
+    operator, recorder = nodes.get("simulated_operator"), nodes.get("recorder")
     driver = nodes.get("device_driver")
     rest = [node for node in nodes.values() if node not in (operator, driver, recorder)]
     warnings = stop([operator]) if operator else []

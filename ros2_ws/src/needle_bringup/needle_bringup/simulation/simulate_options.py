@@ -19,9 +19,9 @@ from needle_common.errors import UserError
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
 
-Starts recorder, sim_rig, stereo_tracker, plane_controller and operator (at level drive also
-drive_emulator and device_driver) as processes of their own, shows how far the needle is in, and
-leaves a folder that holds the bag (open it with rosbags, mcap, Foxglove, PlotJuggler or
+Starts recorder, sim_rig, stereo_tracker, plane_controller and simulated_operator (at level drive
+also drive_emulator and device_driver) as processes of their own, shows how far the needle is in,
+and leaves a folder that holds the bag (open it with rosbags, mcap, Foxglove, PlotJuggler or
 `ros2 bag`), report.html with its figures, summary.json, the parameters and the nodes' logs.
 """
 

@@ -24,7 +24,7 @@ def simulated(**arguments: str) -> Parameters:
         "seed": "1",
         "real_time_factor": "1.0",
         "controller": "best",
-        "operator": "false",
+        "simulated_operator": "false",
         "bag": "",
         "can": "/tmp/needle_can",
         "params": "",
@@ -87,8 +87,10 @@ def test_a_simulation_has_the_nodes_of_its_level_and_waits_for_a_recorder_only_i
 ) -> None:
     assert set(simulated(level="tip")) == {"sim_rig", "plane_controller"}
     assert not any("wait_for_recorder" in values for values in simulated(level="drive").values())
-    with_all = simulated(level="drive", operator="true", bag=str(tmp_path / "bag"), can="/tmp/c")
-    assert with_all["operator"]["wait_for_recorder"]
+    with_all = simulated(
+        level="drive", simulated_operator="true", bag=str(tmp_path / "bag"), can="/tmp/c"
+    )
+    assert with_all["simulated_operator"]["wait_for_recorder"]
     assert with_all["device_driver"]["channel"] == with_all["drive_emulator"]["pty"] == "/tmp/c"
 
 
@@ -96,8 +98,8 @@ def test_what_an_argument_says_no_file_says(tmp_path: Path) -> None:
     level = file_of(tmp_path, {"sim_rig": {"ros__parameters": {"level": "tip"}}})
     with pytest.raises(UserError, match="level is set by level:="):
         simulated(params=level)
-    other = file_of(tmp_path, {"operator": {"ros__parameters": {"stall_timeout": 1.0}}})
-    with pytest.raises(UserError, match="operator is not started"):
+    other = file_of(tmp_path, {"simulated_operator": {"ros__parameters": {"stall_timeout": 1.0}}})
+    with pytest.raises(UserError, match="simulated_operator is not started"):
         simulated(params=other)
     good = file_of(tmp_path, {"plane_controller": {"ros__parameters": {"depth": 0.05}}})
     assert simulated(params=good)["plane_controller"]["depth"] == 0.05

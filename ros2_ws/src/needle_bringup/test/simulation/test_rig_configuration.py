@@ -49,7 +49,7 @@ def test_obstacles_are_read_into_numbers(tmp_path: Path) -> None:
 
 
 def test_only_the_nodes_of_the_level_run() -> None:
-    everywhere = {"recorder", "sim_rig", "plane_controller", "operator"}
+    everywhere = {"recorder", "sim_rig", "plane_controller", "simulated_operator"}
     assert set(nodes_of(SimulateOptions(level="tip"))) == everywhere
     assert set(nodes_of(SimulateOptions(level="camera"))) == everywhere | {"stereo_tracker"}
     drives = {"drive_emulator", "device_driver"}

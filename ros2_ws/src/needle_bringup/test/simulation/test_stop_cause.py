@@ -11,7 +11,7 @@ import pytest
 
 from needle_analysis.run.run_summary import stop_cause, summarize
 from needle_bags.reading.bag_reader import HealthEvent, Run, Status, read_run
-from needle_bringup.operator.progress import Progress
+from needle_bringup.simulated_operator.progress import Progress
 from needle_bringup.simulation.simulate import describe
 
 

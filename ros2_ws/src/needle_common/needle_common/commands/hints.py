@@ -9,9 +9,9 @@ _CONTROLLER = "ros2 run needle_controller plane_controller"
 _TRACKER = "ros2 run needle_tracker stereo_tracker"
 _CAMERAS = "ros2 run needle_tracker stereo_camera; simulated: ros2 run needle_sim sim_rig"
 _RECORDER = "ros2 run needle_bags recorder"
-_OPERATOR = "ros2 run needle_bringup operator, in simulation; on a rig a person's switch"
+_HOLD = "in simulation: ros2 run needle_bringup simulated_operator; on a rig a person's switch"
 _SIM_RIG = "ros2 run needle_sim sim_rig"
-_START = "the operator does, or ros2 service call /plane_controller/start std_srvs/srv/Trigger"
+_START = "simulated_operator does, or ros2 service call /plane_controller/start std_srvs/srv/Trigger"
 _DRIVER = "ros2 run needle_device_driver device_driver"
 _EMULATOR = "ros2 run needle_sim drive_emulator"
 
@@ -20,7 +20,7 @@ _COMMANDS: tuple[tuple[str, str, str], ...] = (
     ("recorder of ", "", _RECORDER),
     ("publisher of ", "device/joint_trajectory", _CONTROLLER),
     ("publisher of ", "needle/controller_status", _CONTROLLER),
-    ("publisher of ", "device/hold", _OPERATOR),
+    ("publisher of ", "device/hold", _HOLD),
     ("publisher of ", "needle/tip", _TRACKER),
     ("publisher of ", "needle/tip_pose", _TRACKER),
     ("publisher of ", "/clock", _SIM_RIG),

@@ -152,7 +152,7 @@ def faults(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
 def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
     """End every motion within its bound when a node of the graph is killed."""
     # Nominal 2 mm/s: the step under way ends, and at most one more was ordered already.
-    ways = {"plane_controller": 2.0, "stereo_tracker": 2.0, "operator": 2.0 * (0.25 + 0.07)}
+    ways = {"plane_controller": 2.0, "stereo_tracker": 2.0, "simulated_operator": 2.0 * (0.25 + 0.07)}
     for kind, way in ways.items():
         outcomes = _trials("kills", moments, kind)
         longest = max(float(outcome["distance_mm"]) for outcome in outcomes)

@@ -33,8 +33,8 @@ MILESTONES = (
     ("ROS_DOMAIN_ID", 4.0),
     (r"3\d\.\d of", 0.5),
     (r"6\d\.\d of", 0.5),
-    ("operator: inserted", 0.1),
-    ("operator: inserted", 1.0),
+    ("simulated_operator: inserted", 0.1),
+    ("simulated_operator: inserted", 1.0),
 )
 SEED = 2009
 SHORT = ("--depth-mm", "12")

@@ -1,7 +1,7 @@
 """Trials of the device driver against the emulated drives, each printed as one JSON object.
 
 `python -m needle_verification.ros.drive_trials steps 10000`, `... faults 50 cut_bus unplug`,
-`... kills 50 operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each),
+`... kills 50 simulated_operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each),
 `... fuzz 900` (seconds).
 """
 

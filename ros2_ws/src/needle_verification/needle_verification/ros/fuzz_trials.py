@@ -23,7 +23,7 @@ from needle_verification.trials.random_messages import random_message
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
 _READY = 120.0
-_LEFT_OUT = ("operator",)
+_LEFT_OUT = ("simulated_operator",)
 # A second one of these is a fault by itself: only in the second half.
 _ONE_ONLY = ("/clock", "/device/status")
 # Asked for, an end is an end; confirmed, a homing is a motion.

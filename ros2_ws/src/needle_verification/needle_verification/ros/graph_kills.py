@@ -14,7 +14,7 @@ from needle_common.ros.conversions import LATCHED, values_of
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
-KILLED = ("plane_controller", "stereo_tracker", "operator")
+KILLED = ("plane_controller", "stereo_tracker", "simulated_operator")
 _READY = 120.0
 _WATCHED = 3.0
 _STILL = 1.0
@@ -76,7 +76,7 @@ def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random)
     hand.pause(_STILL)
     moved = max(abs(at.insertion - stopped.insertion) for at in hand.motors[still_from:])
     # On it goes only by a new press of the hold, or by the node that was missing.
-    if kind == "operator":
+    if kind == "simulated_operator":
         hand.press()
     elif kind == "stereo_tracker":
         graph.start(kind)
@@ -90,7 +90,7 @@ def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random)
             lambda: hand.count_publishers("device/joint_trajectory") == 0, "its lease", _READY
         )
         graph.start(kind)
-        graph.restart("operator")
+        graph.restart("simulated_operator")
     hand.until(
         lambda: hand.motors[-1].insertion > stopped.insertion + 1e-4, "steering again", _RESUMED
     )

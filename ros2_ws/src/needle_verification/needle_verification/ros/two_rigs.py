@@ -19,7 +19,7 @@ from needle_verification.trials.trial_processes import (
 )
 
 DEVICES = ("device_driver", "sim_rig")
-STARTED = (*DEVICES, "plane_controller", "operator")
+STARTED = (*DEVICES, "plane_controller", "simulated_operator")
 _DEPTH_MM = 3.0
 _START = 0.03
 _LONGEST_DELAY = 5.0
@@ -65,7 +65,9 @@ def _trial(place: Path, domain: int, rng: random.Random) -> dict[str, Any]:
         for name in order:
             hand.pause(delays[name])
             processes.start(name)
-        hand.until(lambda: processes.exit_code("operator") is not None, "its end", _PATIENCE)
+        hand.until(
+            lambda: processes.exit_code("simulated_operator") is not None, "its end", _PATIENCE
+        )
         hand.until(
             lambda: any(processes.exit_code(name) is not None for name in DEVICES),
             "the end of one device",

@@ -1,6 +1,6 @@
 import pytest
 
-from needle_bringup.operator.operator_sequence import (
+from needle_bringup.simulated_operator.operator_sequence import (
     ASK_AGAIN,
     ENABLE,
     HOME,
@@ -17,7 +17,7 @@ DISABLED = {"homed": "true", "state": "DISABLED"}
 
 def fresh() -> OperatorSequence:
     """Return a sequence before a simulated device that is alone."""
-    sequence = OperatorSequence(0.0, "operator", wait_timeout=30.0, stall_timeout=60.0)
+    sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.see_devices(["/sim_rig"])
     see(sequence, {}, 0.0)
     sequence.see_controller({"state": "IDLE", "starts": "0"}, 0.0)
@@ -181,13 +181,13 @@ def test_a_press_that_does_not_count_is_released_and_pressed_again(counted_befor
     prepare(sequence, 1.0)
     holding = {"homed": "true", "state": "HOLDING"}
     if counted_before:
-        see(sequence, holding | {"hold_owner": "operator"}, 1.1)
-    see(sequence, holding | {"press_again": "operator"}, 9.0)
+        see(sequence, holding | {"hold_owner": "simulated_operator"}, 1.1)
+    see(sequence, holding | {"press_again": "simulated_operator"}, 9.0)
     assert not sequence.hold()
     see(sequence, holding, 9.1)
     assert sequence.hold(), "the device has heard the release"
     assert sequence.presses_again == 1
-    see(sequence, holding | {"hold_owner": "operator"}, 9.2)
+    see(sequence, holding | {"hold_owner": "simulated_operator"}, 9.2)
     assert sequence.hold()
     assert sequence.presses_again == 1
 
@@ -245,7 +245,7 @@ def test_a_device_that_is_real_ends_it_whenever_it_is_heard(prepared: int) -> No
 
 
 def test_it_acts_only_on_a_device_that_is_alone_and_has_said_that_it_is_simulated() -> None:
-    sequence = OperatorSequence(0.0, "operator", wait_timeout=30.0, stall_timeout=60.0)
+    sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.see_missing([])
     sequence.see_devices(["/device_driver"])
     assert sequence.next_call(1.0) is None, "nothing is known of it yet"
@@ -332,7 +332,7 @@ def test_what_was_said_before_this_start_is_of_another_run() -> None:
 
 def test_before_it_acts_another_device_has_time_to_show_itself() -> None:
     sequence = OperatorSequence(
-        0.0, "operator", wait_timeout=30.0, stall_timeout=60.0, look_around=2.0
+        0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0, look_around=2.0
     )
     sequence.see_missing([])
     sequence.see_devices(["/sim_rig"])
@@ -403,7 +403,7 @@ def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
 
 
 def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:
-    sequence = OperatorSequence(0.0, "operator", wait_timeout=30.0, stall_timeout=60.0)
+    sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.see_missing([])
     sequence.see_devices(["/sim_rig"])
     see(sequence, DISABLED, 1.0)

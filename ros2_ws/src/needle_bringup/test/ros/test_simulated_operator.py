@@ -1,4 +1,4 @@
-"""The operator as a process, against a rig that is played by the test."""
+"""The stand-in as a process, against a rig that is played by the test."""
 
 import os
 import signal
@@ -88,7 +88,7 @@ def _status(values: dict[str, str]) -> DiagnosticStatus:
 
 
 class Scene:
-    """A played rig and the operator process before it."""
+    """A played rig and the stand-in's process before it."""
 
     def __init__(self, domain: int, *, simulated: str = "true") -> None:
         self.context = Context()
@@ -97,7 +97,7 @@ class Scene:
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.rig)
         self.operator = subprocess.Popen(
-            [find_executable("needle_bringup", "operator")],
+            [find_executable("needle_bringup", "simulated_operator")],
             env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
             stderr=subprocess.PIPE,
             text=True,
@@ -148,7 +148,7 @@ def test_prepares_holds_until_done_releases_and_disables(scene: Scene) -> None:
     scene.until(lambda: len(rig.holds) >= 10)
     stamps = [to_nanoseconds(hold.header.stamp) for hold in rig.holds]
     assert stamps == sorted(set(stamps))
-    assert {hold.header.frame_id for hold in rig.holds} == {"operator"}
+    assert {hold.header.frame_id for hold in rig.holds} == {"simulated_operator"}
     assert all(hold.buttons[0] == 1 and hold.axes[0] == 1.0 for hold in rig.holds)
     rig.tell_controller("DONE", 120)
     code, said = scene.end()
@@ -179,13 +179,13 @@ def test_a_fault_ends_it_with_the_reason_in_one_line(scene: Scene) -> None:
     code, said = scene.end()
     assert code == 1
     lines = [line for line in said.strip().splitlines() if not line.startswith("[INFO]")]
-    assert lines == ["operator: plane_controller FAULT: the needle is gone"]
+    assert lines == ["simulated_operator: plane_controller FAULT: the needle is gone"]
 
 
 def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(scene: Scene) -> None:
     rig = scene.rig
     scene.until(lambda: rig.asked == STARTED)
-    # No answer comes: the operator waits for it while the signal comes.
+    # No answer comes: the stand-in waits for it while the signal comes.
     rig.mute = {"device/enable"}
     rig.tell_controller("FAULT", 7, "the device is gone")
     scene.until(lambda: rig.asked[-1] == "device/enable False")

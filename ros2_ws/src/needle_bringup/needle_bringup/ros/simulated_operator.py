@@ -1,4 +1,4 @@
-"""The `operator` executable: keeps the hold in simulation, in a person's stead."""
+"""The `simulated_operator` executable: keeps the hold in simulation, in a person's stead."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from rclpy.task import Future
 from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
-from needle_bringup.operator.operator_sequence import (
+from needle_bringup.ros.simulated_operator_parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.operator_sequence import (
     DISABLE,
     PREPARATION,
     OperatorSequence,
     ServiceCall,
 )
-from needle_bringup.operator.progress import PROGRESS_FD, Progress
-from needle_bringup.ros.operator_parameters import OperatorParameters
+from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress
 from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.process.end_request import EndRequest
@@ -36,7 +36,7 @@ from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 
 HELP = """\
-operator: stands in for the person who holds the needle's switch, in simulation.
+simulated_operator: stands in for the person who holds the needle's switch, in simulation.
 
 Confirms that the needle is out, homes, enables, starts the controller, then keeps the hold until
 the controller is DONE or in FAULT; releases and disables at the end, also on Ctrl-C. Draws the
@@ -57,12 +57,12 @@ DISABLE_TIMEOUT_INTERRUPTED = 0.3
 RELEASES = 3
 
 
-class OperatorNode(WholeNode):
+class SimulatedOperatorNode(WholeNode):
     """Shell around `OperatorSequence`: calls what it asks for and tells it what was heard."""
 
     def __init__(self) -> None:
-        super().__init__("operator")
-        self._settings = NodeParameters(self, OperatorParameters)
+        super().__init__("simulated_operator")
+        self._settings = NodeParameters(self, SimulatedOperatorParameters)
         values = self._settings.values
         self._sequence = OperatorSequence(
             time.monotonic(),
@@ -121,7 +121,7 @@ class OperatorNode(WholeNode):
             for _ in range(RELEASES - 1):
                 executor.spin_once(timeout_sec=0.02)
                 self._send_hold(pressed=False)
-        line = f"operator: {outcome.reason}"
+        line = f"simulated_operator: {outcome.reason}"
         supervised = self._progress.stream is not sys.stderr
         # Whoever supervises knows why it interrupts, and says so.
         self._progress.close("" if supervised and outcome.interrupted else line)
@@ -237,8 +237,8 @@ def _progress_stream() -> TextIO:
 
 
 def _spin(node: Node, end: EndRequest) -> int:
-    """Run the operator until its run is over; returns its exit code."""
-    assert isinstance(node, OperatorNode)
+    """Run the stand-in until its run is over; returns its exit code."""
+    assert isinstance(node, SimulatedOperatorNode)
     executor = executor_of(node)
     try:
         while not node.ended:
@@ -253,11 +253,11 @@ def _spin(node: Node, end: EndRequest) -> int:
 
 
 def main() -> int:
-    """Run the operator; returns its exit code."""
+    """Run the stand-in; returns its exit code."""
     return run_node(
-        OperatorNode,
+        SimulatedOperatorNode,
         help_text=HELP,
-        parameters=OperatorParameters,
+        parameters=SimulatedOperatorParameters,
         spin=_spin,
         interrupted=EXIT_INTERRUPTED,
     )

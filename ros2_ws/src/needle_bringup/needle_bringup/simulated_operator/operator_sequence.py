@@ -1,4 +1,4 @@
-"""Order of what the operator stand-in does, and when it gives up: no ROS."""
+"""Order of what the stand-in of a person does, and when it gives up: no ROS."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The operator stand-in's parameters."""
+"""The stand-in's parameters."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from needle_common.settings.parameter_fields import check_fields, fixed_paramete
 
 
 @dataclasses.dataclass(frozen=True)
-class OperatorParameters:
-    """Parameters of the operator stand-in; SI units."""
+class SimulatedOperatorParameters:
+    """Parameters of the person's stand-in; SI units."""
 
     speed_scale: float = parameter(
         1.0,

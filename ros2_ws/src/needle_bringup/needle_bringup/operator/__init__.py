@@ -1,1 +1,0 @@
-"""Order of what the operator stand-in does."""

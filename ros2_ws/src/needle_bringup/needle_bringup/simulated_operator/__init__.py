@@ -1,0 +1,1 @@
+"""Order of what a person's stand-in does in simulation."""
