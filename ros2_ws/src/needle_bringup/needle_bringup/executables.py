@@ -2,4 +2,5 @@
 
 from needle_common.commands.executables import node
 
+operator = node("needle_bringup.ros.operator")
 simulated_operator = node("needle_bringup.ros.simulated_operator")

@@ -1,1 +1,1 @@
-"""The operator's stand-in, and what the launch files share."""
+"""The operators, a person's and the simulation's, and what the launch files share."""

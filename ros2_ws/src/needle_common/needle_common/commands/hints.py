@@ -9,9 +9,11 @@ _CONTROLLER = "ros2 run needle_controller plane_controller"
 _TRACKER = "ros2 run needle_tracker stereo_tracker"
 _CAMERAS = "ros2 run needle_tracker stereo_camera; simulated: ros2 run needle_sim sim_rig"
 _RECORDER = "ros2 run needle_bags recorder"
-_HOLD = "in simulation: ros2 run needle_bringup simulated_operator; on a rig a person's switch"
+_HOLD = "ros2 run needle_bringup operator; simulated: ros2 run needle_bringup simulated_operator"
 _SIM_RIG = "ros2 run needle_sim sim_rig"
-_START = "simulated_operator does, or ros2 service call /plane_controller/start std_srvs/srv/Trigger"
+_START = (
+    "simulated_operator does, or ros2 service call /plane_controller/start std_srvs/srv/Trigger"
+)
 _DRIVER = "ros2 run needle_device_driver device_driver"
 _EMULATOR = "ros2 run needle_sim drive_emulator"
 

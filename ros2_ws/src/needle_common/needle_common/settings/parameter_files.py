@@ -20,6 +20,7 @@ NODES = (
     "stereo_camera",
     "stereo_tracker",
     "plane_controller",
+    "operator",
     "simulated_operator",
     "player",
 )

@@ -81,7 +81,7 @@ def test_each_missing_thing_comes_with_the_command_that_brings_it() -> None:
     )
     assert said == (
         "publisher of /rig/needle/controller_status, publisher of /rig/device/joint_trajectory "
-        "(ros2 run needle_controller plane_controller); publisher of /rig/device/hold (in "
-        "simulation: ros2 run needle_bringup simulated_operator; on a rig a person's switch); "
+        "(ros2 run needle_controller plane_controller); publisher of /rig/device/hold (ros2 run "
+        "needle_bringup operator; simulated: ros2 run needle_bringup simulated_operator); "
         "something else"
     )

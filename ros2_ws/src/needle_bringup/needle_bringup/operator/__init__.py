@@ -1,0 +1,1 @@
+"""What a person holds, and what may come of it: from a device's bytes to the hold."""

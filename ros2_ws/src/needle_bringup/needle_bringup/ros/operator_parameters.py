@@ -1,0 +1,99 @@
+"""The operator's parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_bringup.operator.controls import Controls
+from needle_common.errors import UserError
+from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
+
+PEDAL, JOYSTICK, JOY = "pedal", "joystick", "joy"
+_NONE = -1
+_LAST_KEY, _LAST_AXIS = 0x2FF, 0x3F
+
+
+@dataclasses.dataclass(frozen=True)
+class OperatorParameters:
+    """Parameters of the operator; SI units."""
+
+    source: str = fixed_parameter(
+        PEDAL,
+        "-",
+        "What is held: a pedal or key or a joystick, by their event device; or the topic joy.",
+        choices=(PEDAL, JOYSTICK, JOY),
+    )
+    device: str = fixed_parameter(
+        "", "-", "Event device of the pedal or joystick, best by its name in /dev/input/by-id."
+    )
+    key: int = fixed_parameter(
+        _NONE,
+        "-",
+        "Held to insert: code of a key or button, as evtest shows it; of joy its index.",
+        _NONE,
+        _LAST_KEY,
+    )
+    retract_key: int = fixed_parameter(
+        _NONE, "-", "Held to draw the needle out; -1: none.", _NONE, _LAST_KEY
+    )
+    stop_key: int = fixed_parameter(_NONE, "-", "Pressed to stop; -1: none.", _NONE, _LAST_KEY)
+    speed_axis: int = fixed_parameter(
+        _NONE,
+        "-",
+        "Axis of a joystick, or index of joy's, that sets the speed; -1: none.",
+        _NONE,
+        _LAST_AXIS,
+    )
+    axis_at_zero: float = fixed_parameter(
+        -1.0, "-", "What the axis reads at speed 0, of -1 to 1.", -1.0, 1.0
+    )
+    axis_at_full: float = fixed_parameter(
+        1.0, "-", "What the axis reads at full speed, of -1 to 1.", -1.0, 1.0
+    )
+    speed_scale: float = parameter(
+        1.0,
+        unit="-",
+        lower=0.0,
+        upper=1.0,
+        description="Share of the nominal speed, with speed_axis that of its full end.",
+    )
+
+    def __post_init__(self) -> None:
+        """Refuse what nobody could hold.
+
+        Raises
+        ------
+        UserError
+            A field that is out of bounds, is missing, or contradicts another.
+        """
+        check_fields(self)
+        if self.key == _NONE:
+            raise UserError("key = -1: name what is held to insert (evtest shows codes)")
+        if self.source != JOY and not self.device:
+            raise UserError(
+                f"device = '': name the {self.source}'s event device, such as "
+                "/dev/input/by-id/usb-..."
+            )
+        keys = [key for key in (self.key, self.retract_key, self.stop_key) if key != _NONE]
+        if len(set(keys)) < len(keys):
+            raise UserError(f"key, retract_key and stop_key are not all different: {keys}")
+        if self.speed_axis != _NONE and self.source == PEDAL:
+            raise UserError(f"speed_axis = {self.speed_axis}: a pedal has none")
+        if self.axis_at_zero == self.axis_at_full:
+            raise UserError(f"axis_at_zero and axis_at_full are both {self.axis_at_full}")
+
+    @property
+    def controls(self) -> Controls:
+        """What the source's buttons and axes mean."""
+        return Controls(
+            insert=self.key,
+            retract=_known(self.retract_key),
+            stop=_known(self.stop_key),
+            speed_axis=_known(self.speed_axis),
+            axis_at_zero=self.axis_at_zero,
+            axis_at_full=self.axis_at_full,
+        )
+
+
+def _known(code: int) -> int | None:
+    return None if code == _NONE else code

@@ -1,0 +1,54 @@
+"""A joystick behind a topic: fresh, alone, and with the buttons that are wanted."""
+
+import math
+
+import pytest
+
+from needle_bringup.operator.controls import Controls
+from needle_bringup.operator.hand import Hand, Lost
+from needle_bringup.operator.joy_source import LONGEST_SILENCE, JoySource
+
+CONTROLS = Controls(insert=0, retract=2, speed_axis=1, axis_at_zero=0.0, axis_at_full=1.0)
+
+
+class Desk:
+    def __init__(self) -> None:
+        self.publishers = 1
+        self.source = JoySource(CONTROLS, lambda: 0.5, lambda: self.publishers)
+
+
+def test_the_last_message_counts_while_it_is_fresh() -> None:
+    source = Desk().source
+    assert isinstance(source.read(0.0), Lost)
+    source.take([0.0, 1.0], [1, 0, 0], 5.0)
+    assert source.read(5.0 + 0.999 * LONGEST_SILENCE) == Hand(insert=True, speed=0.5)
+    silent = source.read(5.0 + 1.001 * LONGEST_SILENCE)
+    assert silent == Lost("no message of the joystick for more than 0.1 s")
+    source.take([0.0, 0.5], [0, 1, 1], 6.0)
+    assert source.read(6.0) == Hand(retract=True, speed=0.25)
+
+
+def test_of_two_that_talk_in_turn_none_counts() -> None:
+    desk = Desk()
+    desk.source.take([0.0, 1.0], [1, 0, 0], 5.0)
+    desk.publishers = 2
+    assert isinstance(desk.source.read(5.0), Lost)
+
+
+@pytest.mark.parametrize(
+    ("axes", "buttons", "why"),
+    [
+        ([0.0, 1.0], [1, 0], "has 2 buttons, none 2"),
+        ([0.0], [1, 0, 0], "has 1 axes, none 1"),
+        ([0.0, math.nan], [1, 0, 0], "axis 1 is nan"),
+        ([0.0, math.inf], [1, 0, 0], "axis 1 is inf"),
+    ],
+)
+def test_a_message_that_cannot_be_meant_is_no_hand(
+    axes: list[float], buttons: list[int], why: str
+) -> None:
+    source = Desk().source
+    source.take(axes, buttons, 5.0)
+    read = source.read(5.0)
+    assert isinstance(read, Lost)
+    assert why in read.why

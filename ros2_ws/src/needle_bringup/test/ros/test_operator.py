@@ -1,0 +1,200 @@
+"""The operator as a process, with a joystick's topic before it and a rig played by the test."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import Joy
+from std_srvs.srv import Trigger
+
+from needle_bringup.operator.controls import Controls
+from needle_bringup.ros.operator_parameters import OperatorParameters
+from needle_common.errors import UserError
+from needle_common.files.installed import find_executable
+from needle_common.process.ros_domain import own_domain
+from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_nanoseconds
+
+LIMIT = 20.0
+INSERT, RETRACT, STOP = 0, 1, 2
+SERVICES = ("device/stop", "device/retract", "plane_controller/stop")
+PARAMETERS = {
+    "source": "joy",
+    "key": INSERT,
+    "retract_key": RETRACT,
+    "stop_key": STOP,
+    "speed_axis": 0,
+    "speed_scale": 0.5,
+}
+
+
+class PlayedRig(Node):
+    """Sends a joystick's state, answers like driver and controller, keeps what was held."""
+
+    def __init__(self, context: Context) -> None:
+        super().__init__("played_rig", context=context)
+        self.asked: list[str] = []
+        self.holds: list[Joy] = []
+        self.down: set[int] = set()
+        self.silent = False
+        for name in SERVICES:
+            self.create_service(Trigger, name, self._answer(name))
+        self.create_subscription(Joy, "device/hold", self.holds.append, HOLD)
+        self._device = self.create_publisher(DiagnosticStatus, "device/status", LATCHED)
+        self._joy = self.create_publisher(Joy, "joy", RELIABLE)
+        self.create_timer(0.02, self._send)
+
+    def tell(self, **values: str) -> None:
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        self._device.publish(DiagnosticStatus(values=pairs))
+
+    def _send(self) -> None:
+        if not self.silent:
+            buttons = [int(button in self.down) for button in range(3)]
+            self._joy.publish(Joy(axes=[0.6], buttons=buttons))
+
+    def _answer(self, name: str) -> Callable[[Trigger.Request, Trigger.Response], Trigger.Response]:
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            self.asked.append(name)
+            response.success = True
+            return response
+
+        return answer
+
+
+class Scene:
+    """A played rig and the operator's process before it."""
+
+    def __init__(self, domain: int) -> None:
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain)
+        self.rig = PlayedRig(self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.rig)
+        words = [word for name, value in PARAMETERS.items() for word in ("-p", f"{name}:={value}")]
+        self.operator = subprocess.Popen(
+            [find_executable("needle_bringup", "operator"), "--ros-args", *words],
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def until(self, condition: Callable[[], object]) -> None:
+        deadline = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < deadline, (self.rig.asked, self.rig.holds[-3:])
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def is_held(self) -> bool:
+        return bool(self.rig.holds[-1].buttons[0])
+
+    def after(self, count: int) -> None:
+        """Wait until so many more messages of the hold were heard."""
+        wanted = len(self.rig.holds) + count
+        self.until(lambda: len(self.rig.holds) >= wanted)
+
+    def close(self) -> None:
+        self.operator.kill()
+        self.operator.wait()
+        assert self.operator.stderr is not None
+        self.operator.stderr.close()
+        self.executor.shutdown()
+        self.rig.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def scene() -> Iterator[Scene]:
+    with own_domain() as domain:
+        one = Scene(domain)
+        yield one
+        one.close()
+
+
+def test_a_joystick_inserts_retracts_and_stops_until_it_falls_silent(scene: Scene) -> None:
+    rig = scene.rig
+    # Pressed from the start on: it does not count.
+    rig.down = {INSERT}
+    scene.until(lambda: len(rig.holds) > 15)
+    assert not any(hold.buttons[0] for hold in rig.holds)
+    rig.down = set()
+    scene.after(5)
+    rig.down = {INSERT}
+    scene.until(scene.is_held)
+    held = rig.holds[-1]
+    assert held.header.frame_id == "operator"
+    # Half of 1.6 / 2 of the axis' way; and what a message promises.
+    assert list(held.axes) == pytest.approx([0.4, 0.1])
+    stamps = [to_nanoseconds(hold.header.stamp) for hold in rig.holds]
+    assert stamps == sorted(set(stamps))
+    rig.down = {INSERT, STOP}
+    scene.until(lambda: not scene.is_held())
+    scene.until(lambda: rig.asked == ["device/stop"])
+    rig.down = {INSERT}
+    scene.after(10)
+    assert not any(hold.buttons[0] for hold in rig.holds[-8:])
+    rig.down = set()
+    scene.after(5)
+    # Drawn out: the controller is stopped before anything is held.
+    rig.down = {RETRACT}
+    scene.until(scene.is_held)
+    assert rig.asked == ["device/stop", "plane_controller/stop"]
+    rig.tell(hold_owner="operator", activity="none")
+    scene.until(lambda: rig.asked[-1] == "device/retract")
+    rig.tell(hold_owner="operator", activity="retraction")
+    scene.after(5)
+    assert scene.is_held()
+    rig.tell(hold_owner="operator", activity="none")
+    scene.until(lambda: not scene.is_held())
+    rig.down = set()
+    scene.after(5)
+    rig.down = {INSERT}
+    scene.until(scene.is_held)
+    rig.silent = True
+    scene.until(lambda: not scene.is_held())
+    rig.silent = False
+    scene.after(10)
+    assert not any(hold.buttons[0] for hold in rig.holds[-8:])
+    assert len(rig.asked) == 3
+
+
+def test_a_signal_releases_what_is_held(scene: Scene) -> None:
+    rig = scene.rig
+    scene.until(lambda: len(rig.holds) > 15)
+    rig.down = {INSERT}
+    scene.until(scene.is_held)
+    scene.operator.send_signal(signal.SIGTERM)
+    scene.until(lambda: scene.operator.poll() is not None)
+    scene.until(lambda: not scene.is_held())
+    assert scene.operator.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"source": "joy"}, "key = -1"),
+        ({"key": 48}, "device = ''"),
+        ({"key": 48, "device": "/dev/input/x", "speed_axis": 2}, "a pedal has none"),
+        ({"key": 48, "device": "/dev/input/x", "stop_key": 48}, "not all different"),
+        ({"key": 48, "device": "/dev/input/x", "axis_at_zero": 1.0}, "are both 1.0"),
+        ({"key": 4800, "device": "/dev/input/x"}, "key"),
+        ({"key": 48, "device": "/dev/input/x", "source": "terminal"}, "source"),
+    ],
+)
+def test_what_nobody_could_hold_is_refused(values: dict[str, object], said: str) -> None:
+    with pytest.raises(UserError, match=said):
+        OperatorParameters(**values)  # type: ignore[arg-type]
+
+
+def test_a_key_that_is_not_named_is_none() -> None:
+    parameters = OperatorParameters(key=48, device="/dev/input/x")
+    assert parameters.controls == Controls(insert=48)
