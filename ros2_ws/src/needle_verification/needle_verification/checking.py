@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import os
 import re
 import signal
 import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import ports_of
 from needle_common.process.shared_memory import dead_ports
-from needle_verification.descendants import processes_with
+from needle_verification.descendants import processes_with, ran
 
 # Every process that a check starts carries this in its environment, so that none can hide.
 MARK = "NEEDLE_VERIFICATION"
@@ -221,6 +223,25 @@ class Workbench:
         if name not in self._runs:
             self._runs[name] = self.start(name, *arguments).wait()
         return self._runs[name]
+
+
+def trial_outcomes(module: str, *words: object) -> list[dict[str, Any]]:
+    """Run trials in a process of their own; return what each came to.
+
+    Parameters
+    ----------
+    module : str
+        What runs them: it prints a JSON object for each.
+    *words : object
+        Its command line.
+
+    Raises
+    ------
+    UserError
+        If they do not end well.
+    """
+    command = [sys.executable, "-m", module, *map(str, words)]
+    return [json.loads(line) for line in ran(command).stdout.splitlines()]
 
 
 def payloads(bag: Path, topics: Sequence[str]) -> dict[str, list[bytes]]:

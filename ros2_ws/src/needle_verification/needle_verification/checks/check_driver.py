@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import json
 import math
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from needle_common.commands.cli import EXIT_DONE
-from needle_verification.checking import Check, Finding, SimulateRun, Workbench, payloads
-from needle_verification.descendants import ran
+from needle_verification.checking import (
+    Check,
+    Finding,
+    SimulateRun,
+    Workbench,
+    payloads,
+    trial_outcomes,
+)
 
 STEPS = 10_000
 MOMENTS = 50
@@ -152,7 +156,11 @@ def faults(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
 def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
     """End every motion within its bound when a node of the graph is killed."""
     # Nominal 2 mm/s: the step under way ends, and at most one more was ordered already.
-    ways = {"plane_controller": 2.0, "stereo_tracker": 2.0, "simulated_operator": 2.0 * (0.25 + 0.07)}
+    ways = {
+        "plane_controller": 2.0,
+        "stereo_tracker": 2.0,
+        "simulated_operator": 2.0 * (0.25 + 0.07),
+    }
     for kind, way in ways.items():
         outcomes = _trials("kills", moments, kind)
         longest = max(float(outcome["distance_mm"]) for outcome in outcomes)
@@ -285,12 +293,4 @@ def _allowed(kind: str, outcome: dict[str, Any]) -> float:
 
 
 def _trials(*words: object) -> list[dict[str, Any]]:
-    """Run trials in a process of their own; return what each came to.
-
-    Raises
-    ------
-    UserError
-        If they do not end well.
-    """
-    command = [sys.executable, "-m", "needle_verification.ros.drive_trials", *map(str, words)]
-    return [json.loads(line) for line in ran(command).stdout.splitlines()]
+    return trial_outcomes("needle_verification.ros.drive_trials", *words)

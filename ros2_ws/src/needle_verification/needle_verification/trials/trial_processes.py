@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterable, Mapping
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
@@ -62,11 +63,20 @@ class TrialProcesses:
 
     def start(self, name: str) -> None:
         """Start a node, also again."""
+        self._run(name, [find_executable(PACKAGES[name], name)], self._file)
+
+    def start_module(self, name: str, module: str, values: Mapping[str, object]) -> None:
+        """Start a node that a module of this package runs, with these parameters."""
+        file = self._folder / f"{name}.yaml"
+        write_parameters(file, {name: dict(values)})
+        self._run(name, [sys.executable, "-m", module], file)
+
+    def _run(self, name: str, command: Sequence[str], file: Path) -> None:
         self.processes[name] = NodeProcess(
             name,
             [
-                find_executable(PACKAGES[name], name),
-                *("--ros-args", "--disable-external-lib-logs", "--params-file", str(self._file)),
+                *command,
+                *("--ros-args", "--disable-external-lib-logs", "--params-file", str(file)),
             ],
             environment=self._environment,
             log=self._folder / f"{name}.log",
@@ -80,9 +90,16 @@ class TrialProcesses:
 
     def kill(self, name: str) -> None:
         """End a node as a crash does, and wait until it is gone."""
-        process = self.processes[name]
-        os.kill(process.pid, signal.SIGKILL)
-        wait_for([process], _KILL_GRACE)
+        self.signal(name, signal.SIGKILL)
+        wait_for([self.processes[name]], _KILL_GRACE)
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        """Send a node a signal."""
+        os.kill(self.processes[name].pid, number)
+
+    def end(self, name: str) -> None:
+        """End a node in order."""
+        stop([self.processes.pop(name)])
 
     def say(self, fault: str) -> None:
         """Give the emulator a fault on command."""

@@ -1,0 +1,115 @@
+"""A foot pedal without hardware: its events come through a named pipe. No ROS in here."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import struct
+from pathlib import Path
+
+# struct input_event of a 64-bit kernel.
+_EVENT = struct.Struct("@llHHi")
+_SYN, _KEY = 0, 1
+_LAST_KEY = 0x2FF
+_LONGEST_READ = 65536
+
+
+class PipedPedal:
+    """The pedal: what a foot does to it, and its plug.
+
+    It is plugged in at first. Held down it repeats nothing, as a pedal does.
+
+    Parameters
+    ----------
+    path : Path
+        Where its device file appears.
+    key : int
+        Code of its key.
+    """
+
+    def __init__(self, path: Path, key: int) -> None:
+        self._path = path
+        self._key = key
+        self._down = False
+        self._pipe: int | None = None
+        self.plug()
+
+    def plug(self) -> None:
+        """Plug it in; a key that is down is so from the first look on."""
+        os.mkfifo(self._path)
+        # For both ways: one that writes alone would wait for a reader.
+        self._pipe = os.open(self._path, os.O_RDWR | os.O_NONBLOCK)
+        if self._down:
+            self._send(1)
+
+    def unplug(self) -> None:
+        """Pull its plug."""
+        if self._pipe is not None:
+            os.close(self._pipe)
+            self._path.unlink()
+        self._pipe = None
+
+    def press(self) -> None:
+        """Press it, also while it is unplugged."""
+        self._down = True
+        self._send(1)
+
+    def release(self) -> None:
+        """Let go of it."""
+        self._down = False
+        self._send(0)
+
+    def _send(self, value: int) -> None:
+        if self._pipe is not None:
+            events = _EVENT.pack(0, 0, _KEY, self._key, value) + _EVENT.pack(0, 0, _SYN, 0, 0)
+            os.write(self._pipe, events)
+
+
+class PipeDevice:
+    """What the kernel is to a device file, for the pipe of a `PipedPedal`.
+
+    As there, who opens it sees no event from before, but the state that came of it.
+
+    Parameters
+    ----------
+    path : str
+        The pipe.
+
+    Raises
+    ------
+    OSError
+        If it is not there.
+    """
+
+    def __init__(self, path: str) -> None:
+        self.keys = frozenset(range(_LAST_KEY + 1))
+        self._down: set[int] = set()
+        self._pipe = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+        with contextlib.suppress(OSError):
+            self.read()
+
+    def read(self) -> bytes:
+        """Return the events that wait; raises OSError where the pedal was unplugged."""
+        try:
+            data = os.read(self._pipe, _LONGEST_READ)
+        except BlockingIOError:
+            return b""
+        if not data:
+            raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+        for _, _, kind, code, value in _EVENT.iter_unpack(data):
+            if kind == _KEY:
+                (self._down.add if value else self._down.discard)(code)
+        return data
+
+    def keys_down(self) -> frozenset[int]:
+        """Return the codes of the keys that are down."""
+        return frozenset(self._down)
+
+    def axis(self, code: int) -> float:
+        """Refuse: a pedal has no axes."""
+        raise OSError(errno.EINVAL, f"axis {code} of a pedal")
+
+    def close(self) -> None:
+        """Let go of the pipe."""
+        os.close(self._pipe)
