@@ -1,7 +1,7 @@
 """Duration of each stage of a step or path, by when its messages were sent.
 
-A cycle of the driver ends with its joint_states: the first that were sent after a command follow the
-first set-points made from it.
+A cycle of the driver ends with its joint_states: the first sent after a command follow the first
+set-points made from it.
 """
 
 from __future__ import annotations
