@@ -3,15 +3,22 @@
 scripts/test sets NEEDLE_TEST_RUN, unique to the run and inherited by every process that a test
 starts. pytest-xdist runs the test files in lanes, each a process of its own; nodes of one lane must
 not hear those of another.
+
+Three lanes share two cores. Files that only reckon (`IN_BACKGROUND`) take what the others leave:
+those with nodes and watchdogs wait most of their time, and are late when nobody makes way for them.
+At most two of these run at a time.
 """
 
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import gc
 import os
+import re
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -31,7 +38,18 @@ LONG_FILES = (
     "ros2_ws/src/needle_analysis/test/ros/test_rerun_hearing.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
 )
+IN_BACKGROUND = re.compile(
+    r"tests/test_lint\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
+    r".*/needle_sim/test/(camera|needle|path_traced|studies)/.*|"
+    r".*/needle_analysis/test/(report|run|rerun)/.*|"
+    r".*/needle_verification/test/(studies|tracking|training|paper)/.*"
+)
+"""Test files without processes or watchdogs of their own."""
+_IN_FRONT = 2
 _left: list[str] = []
+_place = contextlib.ExitStack()
+_running: list[str] = []
+"""The file that has this lane's place; empty between two."""
 _reserved = contextlib.ExitStack()
 
 
@@ -52,6 +70,35 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected."""
     places = {file: place for place, file in enumerate(LONG_FILES)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[object]:
+    """Take a file's place, in front or in the background, for as long as it runs."""
+    file = item.nodeid.partition("::")[0]
+    if in_lane(item.config) and _running != [file]:
+        _take_place(file)
+        _running[:] = [file]
+    result = yield
+    if nextitem is None or nextitem.nodeid.partition("::")[0] != file:
+        _running.clear()
+        _place.close()
+    return result
+
+
+def _take_place(file: str) -> None:
+    policy = os.SCHED_IDLE if IN_BACKGROUND.fullmatch(file) else os.SCHED_OTHER
+    os.sched_setscheduler(0, policy, os.sched_param(0))
+    if policy == os.SCHED_IDLE:
+        return
+    names = [Path(os.environ["TMPDIR"], f"place_{n}") for n in range(_IN_FRONT)]
+    places = [_place.enter_context(name.open("wb")) for name in names]
+    while True:
+        for place in places:
+            with contextlib.suppress(BlockingIOError):
+                fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+        time.sleep(0.05)
 
 
 def pytest_collection_finish() -> None:
