@@ -32,7 +32,7 @@ NOT_TYPED = ("text", "mermaid")
 # Executables that go on until Ctrl-C, as anything with `--loop`.
 NODES = (
     "sim_rig", "stereo_tracker", "plane_controller", "recorder", "device_driver", "drive_emulator",
-    "stereo_camera", "operator",
+    "stereo_camera", "operator", "live_view",
 )  # fmt: skip
 # It types these pages itself.
 LEFT_OUT = ("scripts/test",)

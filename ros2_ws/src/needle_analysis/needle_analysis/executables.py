@@ -1,6 +1,7 @@
 """The package's executables."""
 
-from needle_common.commands.executables import command
+from needle_common.commands.executables import command, node
 
+live_view = node("needle_analysis.ros.live_view")
 report = command("needle_analysis.report.report")
 rerun = command("needle_analysis.ros.rerun")

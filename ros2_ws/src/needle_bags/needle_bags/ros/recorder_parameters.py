@@ -22,7 +22,7 @@ class RecorderParameters:
     )
     regex: str = fixed_parameter("", "-", "Topics in whose name this is found are recorded, too.")
     exclude_regex: str = fixed_parameter(
-        "/annotated_image$",
+        "/annotated_image$|/live_view/",
         "-",
         "Topics in whose name this is found are not recorded, unless `topics` names them.",
     )

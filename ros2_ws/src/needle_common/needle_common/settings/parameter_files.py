@@ -22,6 +22,7 @@ NODES = (
     "plane_controller",
     "operator",
     "simulated_operator",
+    "live_view",
     "player",
 )
 """Names of the rig's nodes."""

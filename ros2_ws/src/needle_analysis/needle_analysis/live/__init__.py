@@ -1,0 +1,1 @@
+"""What a person sees of a needle while it is steered: no ROS."""
