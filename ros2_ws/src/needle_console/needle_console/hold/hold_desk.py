@@ -1,0 +1,114 @@
+"""All pages and the one hold: who has it, and what it comes to."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+from needle_console.hold.hold_state import RELEASED, HoldState
+from needle_console.hold.page_message import GarbageError, read_message
+from needle_console.hold.page_session import PageSession
+from needle_console.hold.refusals import Refusal
+
+MOST_PAGES = 8
+SILENCE = 5.0
+"""A page that echoes nothing for so long is gone [s]."""
+
+IDLE = 30.0
+"""An owner that has not pressed for so long lets another page have the hold [s]."""
+
+
+@dataclasses.dataclass
+class _Page:
+    session: PageSession
+    # Why its last press did not count.
+    why: Refusal | None = None
+
+
+class HoldDesk:
+    """Takes what pages say. `now` is everywhere the steady clock [s].
+
+    The first page that presses owns the hold, until it is gone or has not pressed for `IDLE`: what
+    two people want who see two pages is not decided by who presses in the other's pause.
+
+    Parameters
+    ----------
+    make_nonce : callable
+        Returns a text that nobody can guess.
+    """
+
+    def __init__(self, make_nonce: Callable[[], str]) -> None:
+        self._make_nonce = make_nonce
+        self._pages: dict[int, _Page] = {}
+        self._last_page = 0
+        self._owner: int | None = None
+        self._held_at = -math.inf
+
+    @property
+    def until(self) -> float:
+        """When the hold ends unless more comes [s]; minus infinity without one."""
+        return -math.inf if self._owner is None else self._pages[self._owner].session.until
+
+    def open(self, now: float) -> int | None:
+        """Let a page in; return its number, or None where there are too many."""
+        if len(self._pages) >= MOST_PAGES:
+            return None
+        self._last_page += 1
+        self._pages[self._last_page] = _Page(PageSession(self._make_nonce, now))
+        return self._last_page
+
+    def close(self, page: int) -> None:
+        """Let a page go, and its hold with it."""
+        del self._pages[page]
+        if self._owner == page:
+            self._owner = None
+
+    def receive(self, page: int, data: str | bytes, now: float) -> Refusal | None:
+        """Take a page's message; return why it does not count. Garbage ends the page's hold."""
+        entry = self._pages[page]
+        try:
+            message = read_message(data)
+        except GarbageError:
+            entry.session.end()
+            return Refusal.GARBAGE
+        free = self._owner in (None, page) or self._owner_is_idle(now)
+        refusal = entry.session.receive(message, now, free=free)
+        if entry.session.state(now).pressed:
+            self._owner = page
+            self._held_at = now
+        entry.why = refusal if message.pressed else None
+        return refusal
+
+    def issue(self, page: int, now: float) -> str | None:
+        """Return a nonce to send to a page now; None while it is behind with answers."""
+        return self._pages[page].session.nonces.issue(now)
+
+    def tell(self, page: int, now: float) -> dict[str, object]:
+        """Return what a page should know."""
+        entry = self._pages[page]
+        owner = self._owner if not self._owner_is_idle(now) else None
+        return {
+            "heard": entry.session.heard,
+            "held": entry.session.state(now).pressed,
+            "owner": "nobody" if owner is None else "you" if owner == page else "other",
+            "why": "" if entry.why is None else entry.why.value,
+        }
+
+    def is_silent(self, page: int, now: float) -> bool:
+        """Return whether a page has echoed nothing for too long."""
+        return now - self._pages[page].session.heard_at > SILENCE
+
+    def lapses(self, now: float) -> bool:
+        """Return True once when the hold has ended by silence."""
+        if self._owner is None or not self._pages[self._owner].session.lapses(now):
+            return False
+        self._pages[self._owner].why = Refusal.LOST
+        return True
+
+    def state(self, now: float) -> HoldState:
+        """Return the hold that counts."""
+        return RELEASED if self._owner is None else self._pages[self._owner].session.state(now)
+
+    def _owner_is_idle(self, now: float) -> bool:
+        return not self.state(now).pressed and now - self._held_at > IDLE

@@ -1,0 +1,373 @@
+"""Whose press counts, and until when."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from needle_console.hold.hold_desk import IDLE, MOST_PAGES, SILENCE, HoldDesk
+from needle_console.hold.hold_state import RELEASED, HoldState, Mode
+from needle_console.hold.nonces import Nonces
+from needle_console.hold.page_session import LIFETIME
+from needle_console.hold.refusals import Refusal
+
+
+def counting() -> Callable[[], str]:
+    numbers = itertools.count()
+    return lambda: f"n{next(numbers)}"
+
+
+class Scene:
+    """A desk and its pages, in a time of their own."""
+
+    def __init__(self) -> None:
+        self.desk = HoldDesk(counting())
+        self.now = 100.0
+        self._sequences: dict[int, int] = {}
+
+    def page(self) -> int:
+        page = self.desk.open(self.now)
+        assert page is not None
+        self._sequences[page] = 0
+        return page
+
+    def message(self, page: int, pressed: bool, nonce: str | None = None, **changes: Any) -> str:
+        if nonce is None:
+            nonce = self.desk.issue(page, self.now)
+            assert nonce is not None
+        self._sequences[page] += 1
+        fields = {
+            "nonce": nonce,
+            "sequence": self._sequences[page],
+            "pressed": pressed,
+            "speed": 0.5,
+            "mode": "insert",
+        }
+        return json.dumps({**fields, **changes})
+
+    def say(self, page: int, pressed: bool, **changes: Any) -> Refusal | None:
+        return self.desk.receive(page, self.message(page, pressed, **changes), self.now)
+
+    def press(self, page: int) -> None:
+        assert self.say(page, False) is None
+        assert self.say(page, True) is None
+        assert self.pressed
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
+    @property
+    def pressed(self) -> bool:
+        return self.desk.state(self.now).pressed
+
+
+def test_a_press_after_a_release_counts_with_its_speed_and_mode() -> None:
+    scene = Scene()
+    page = scene.page()
+    assert scene.desk.state(scene.now) == RELEASED
+    scene.say(page, False)
+    assert scene.say(page, True, speed=0.25, mode="retract") is None
+    assert scene.desk.state(scene.now) == HoldState(True, 0.25, Mode.RETRACT)
+    assert scene.say(page, True, speed=0.75, mode="retract") is None
+    assert scene.desk.state(scene.now).speed == 0.75
+    assert scene.say(page, False) is None
+    assert scene.desk.state(scene.now) == RELEASED
+
+
+def test_a_page_that_comes_pressed_has_to_release_first() -> None:
+    scene = Scene()
+    page = scene.page()
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert not scene.pressed
+    scene.press(page)
+
+
+def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    for _ in range(100):
+        scene.wait(0.9 * LIFETIME)
+        assert scene.pressed
+        assert scene.say(page, True) is None
+    scene.wait(LIFETIME + 1e-6)
+    assert not scene.pressed
+    assert scene.desk.lapses(scene.now)
+    assert not scene.desk.lapses(scene.now)
+    # The finger that is still there counts for nothing.
+    for _ in range(10):
+        assert scene.say(page, True) is Refusal.NEW_PRESS
+        assert not scene.pressed
+        scene.wait(0.02)
+    scene.press(page)
+
+
+def test_a_hold_counts_from_its_nonce_however_late_the_message_comes() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    scene.wait(0.05)
+    late = scene.message(page, True)
+    scene.wait(0.04)
+    assert scene.desk.receive(page, late, scene.now) is None
+    scene.wait(0.055)
+    assert scene.pressed
+    scene.wait(0.01)
+    assert not scene.pressed
+
+
+def test_a_burst_after_a_stall_does_not_count() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    held_up = []
+    for _ in range(Nonces.MOST - 1):
+        scene.wait(0.02)
+        held_up.append(scene.message(page, True))
+    scene.wait(LIFETIME)
+    assert not scene.pressed
+    for data in held_up:
+        assert scene.desk.receive(page, data, scene.now) is not None
+        assert not scene.pressed
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+
+
+def test_a_release_and_press_within_a_stall_do_not_count() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    release, press = scene.message(page, False), scene.message(page, True)
+    scene.wait(LIFETIME + 1e-6)
+    assert scene.desk.receive(page, release, scene.now) is Refusal.STALE
+    assert scene.desk.receive(page, press, scene.now) is Refusal.STALE
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert not scene.pressed
+
+
+def test_a_press_that_is_too_old_when_it_comes_does_not_count_later() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.say(page, False)
+    press = scene.message(page, True)
+    scene.wait(LIFETIME + 1e-6)
+    assert scene.desk.receive(page, press, scene.now) is Refusal.STALE
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+
+
+def test_replayed_messages_do_not_count() -> None:
+    scene = Scene()
+    page = scene.page()
+    release, press = scene.message(page, False), scene.message(page, True)
+    for data in (release, press):
+        assert scene.desk.receive(page, data, scene.now) is None
+    assert scene.pressed
+    scene.say(page, False)
+    assert scene.desk.receive(page, release, scene.now) is Refusal.REPEATED
+    assert scene.desk.receive(page, press, scene.now) is Refusal.REPEATED
+    # With a higher number, but the nonce of an earlier one.
+    again = json.dumps({**json.loads(press), "sequence": 1000})
+    assert scene.desk.receive(page, again, scene.now) is Refusal.NONCE
+    # To another page.
+    other = scene.page()
+    assert scene.desk.receive(other, release, scene.now) is Refusal.NONCE
+    assert scene.desk.receive(other, press, scene.now) is Refusal.NONCE
+    assert not scene.pressed
+
+
+def test_a_release_ends_a_hold_even_if_it_does_not_count() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    assert scene.say(page, False, nonce="unknown") is Refusal.NONCE
+    assert not scene.pressed
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+
+
+@pytest.mark.parametrize("data", ["", "{}", b"\0", '{"speed": NaN}'])
+def test_garbage_ends_a_hold(data: str | bytes) -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    assert scene.desk.receive(page, data, scene.now) is Refusal.GARBAGE
+    assert not scene.pressed
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+
+
+def test_another_mode_takes_another_press() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    assert scene.say(page, True, mode="retract") is Refusal.NEW_PRESS
+    assert not scene.pressed
+    assert scene.say(page, True, mode="retract") is Refusal.NEW_PRESS
+    scene.press(page)
+
+
+def test_one_page_owns_the_hold_until_it_is_gone_or_idle() -> None:
+    scene = Scene()
+    first, second = scene.page(), scene.page()
+    scene.press(first)
+    scene.say(first, False)
+    assert scene.desk.tell(first, scene.now)["owner"] == "you"
+    assert scene.desk.tell(second, scene.now)["owner"] == "other"
+    scene.say(second, False)
+    assert scene.say(second, True) is Refusal.OTHER_PAGE
+    assert scene.desk.tell(second, scene.now)["why"] == "another page steers"
+    scene.desk.close(first)
+    # The finger that is still there counts for nothing.
+    assert scene.say(second, True) is Refusal.NEW_PRESS
+    scene.press(second)
+    scene.say(second, False)
+    third = scene.page()
+    scene.wait(IDLE + 1e-6)
+    assert scene.desk.tell(third, scene.now)["owner"] == "nobody"
+    scene.press(third)
+    assert scene.desk.tell(second, scene.now)["owner"] == "other"
+    # What the earlier owner says or does is nothing to the hold.
+    scene.say(second, False)
+    scene.desk.close(second)
+    assert scene.pressed
+
+
+def test_a_page_that_goes_takes_its_hold_along() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    scene.desk.close(page)
+    assert not scene.pressed
+
+
+def test_pages_are_few_and_not_silent() -> None:
+    scene = Scene()
+    pages = [scene.page() for _ in range(MOST_PAGES)]
+    assert scene.desk.open(scene.now) is None
+    scene.desk.close(pages[3])
+    page = scene.page()
+    scene.wait(SILENCE)
+    assert not scene.desk.is_silent(page, scene.now)
+    scene.wait(1e-6)
+    assert scene.desk.is_silent(page, scene.now)
+    scene.say(page, False)
+    assert not scene.desk.is_silent(page, scene.now)
+
+
+def test_a_page_that_does_not_answer_is_sent_no_more_than_a_burst() -> None:
+    scene = Scene()
+    page = scene.page()
+    for _ in range(3):
+        nonces = [scene.desk.issue(page, scene.now) for _ in range(2 * Nonces.MOST)]
+        assert sum(nonce is not None for nonce in nonces) == Nonces.MOST
+        assert nonces[Nonces.MOST :] == [None] * Nonces.MOST
+        scene.say(page, False, nonce=nonces[Nonces.MOST - 1])
+
+
+# ---- whatever comes ------------------------------------------------------------------------------
+
+PAGES = 2
+ACTIONS = st.one_of(
+    # An honest page: a nonce goes out, its echo comes back after so long.
+    st.tuples(st.just("echo"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.05)),
+    st.tuples(st.just("echo"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.3)),
+    st.tuples(st.just("wait"), st.integers(0, 0), st.booleans(), st.floats(0.0, 0.3)),
+    # A message is written, but comes at some later time, more than once, to any page.
+    st.tuples(st.just("write"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
+    st.tuples(st.just("replay"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 1.0)),
+    st.tuples(st.just("renumber"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 1.0)),
+    st.tuples(st.just("garbage"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
+    st.tuples(st.just("reload"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
+)
+
+
+class Witness(Scene):
+    """Keeps a record of its own, and judges each hold by it."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.pages = [self.page() for _ in range(PAGES)]
+        self.written: list[str] = []
+        # Nonce -> the page that it went to, and when.
+        self._sent: dict[str, tuple[int, float]] = {}
+        # By page: highest number heard; when the newest nonce of a pressed message was sent; at
+        # which event a fresh release was heard, and at which a hold was over.
+        self._heard: dict[int, int] = {}
+        self._proof: dict[int, float] = {}
+        self._released: dict[int, int] = {}
+        self._over: dict[int, int] = {}
+        self._event = 0
+        self._holder: int | None = None
+
+    def write(self, page: int, pressed: bool) -> str | None:
+        nonce = self.desk.issue(page, self.now)
+        if nonce is None:
+            return None
+        self._sent[nonce] = page, self.now
+        data = self.message(page, pressed, nonce)
+        self.written.append(data)
+        return data
+
+    def deliver(self, page: int, data: str) -> None:
+        self.look()
+        fields = json.loads(data)
+        to_page, sent = self._sent[fields["nonce"]]
+        if to_page == page and fields["sequence"] > self._heard.get(page, -1):
+            if fields["pressed"]:
+                self._proof[page] = max(self._proof.get(page, -1.0), sent)
+            elif self.now - sent <= LIFETIME:
+                self._released[page] = self._event
+        self._heard[page] = max(self._heard.get(page, -1), fields["sequence"])
+        self.desk.receive(page, data, self.now)
+        self.look()
+
+    def look(self) -> None:
+        """Look at the hold now, and judge it."""
+        holders = [page for page in self.pages if self.desk.tell(page, self.now)["held"]]
+        assert len(holders) == self.pressed
+        holder = holders[0] if holders else None
+        if holder is not None:
+            # Somebody pressed this page's button no longer ago than that, by our own clock.
+            assert self.now - self._proof[holder] <= LIFETIME
+            if self._holder is None:
+                # And it was seen released since its last hold was over.
+                assert self._released[holder] >= self._over.get(holder, -1)
+            else:
+                assert holder == self._holder
+        elif self._holder is not None:
+            self._over[self._holder] = self._event
+        self._holder = holder
+        self._event += 1
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(st.lists(ACTIONS, min_size=5, max_size=60))
+def test_nothing_resumes_by_itself_whatever_comes(
+    actions: list[tuple[str, int, bool, float]],
+) -> None:
+    scene = Witness()
+    for action, number, pressed, amount in actions:
+        page = scene.pages[number]
+        data: str | None = None
+        if action == "echo":
+            data = scene.write(page, pressed)
+            scene.wait(amount)
+        elif action == "wait":
+            scene.wait(amount)
+        elif action == "write":
+            scene.write(page, pressed)
+        elif action in ("replay", "renumber") and scene.written:
+            data = scene.written[int(amount * (len(scene.written) - 1))]
+            if action == "renumber":
+                data = json.dumps({**json.loads(data), "sequence": 2 * len(scene.written)})
+        elif action == "garbage":
+            scene.desk.receive(page, "{", scene.now)
+        elif action == "reload":
+            scene.desk.close(page)
+            scene.pages[number] = scene.page()
+        if data is not None:
+            scene.deliver(scene.pages[number], data)
+        scene.look()

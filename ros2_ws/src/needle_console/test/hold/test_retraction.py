@@ -1,0 +1,36 @@
+"""What a press to retract asks of the rig."""
+
+from __future__ import annotations
+
+from needle_console.hold.hold_state import RELEASED, HoldState, Mode
+from needle_console.hold.retraction import RETRACT, STOP_STEERING, Retraction, Todo
+
+INSERT = HoldState(True, 1.0, Mode.INSERT)
+OUT = HoldState(True, 1.0, Mode.RETRACT)
+
+
+def test_an_insertion_is_passed_on_as_it_is() -> None:
+    retraction = Retraction()
+    for steering in (True, False):
+        assert retraction.update(INSERT, steering=steering, hold_counts=True) == Todo(True)
+        assert retraction.update(RELEASED, steering=steering, hold_counts=False) == Todo(False)
+
+
+def test_steering_ends_before_the_hold_is_passed_on_and_each_call_is_made_once() -> None:
+    retraction = Retraction()
+    assert retraction.update(OUT, steering=True, hold_counts=False) == Todo(False, (STOP_STEERING,))
+    assert retraction.update(OUT, steering=True, hold_counts=False) == Todo(False)
+    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True)
+    # The needle is out, the finger is still there: no second time.
+    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True)
+    assert retraction.update(RELEASED, steering=False, hold_counts=False) == Todo(False)
+    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+
+
+def test_steering_that_begins_meanwhile_gets_no_hold() -> None:
+    retraction = Retraction()
+    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, steering=True, hold_counts=True) == Todo(False, (STOP_STEERING,))
