@@ -1,0 +1,226 @@
+// Hold to run over a WebSocket of its own: what the server sends is echoed with the state of the
+// button, 50 times a second. The server alone decides what counts (docs/safety.md).
+//
+// Elements with data-hold="insert" or data-hold="retract" are the buttons; they may come and go.
+
+const RETRY = 1000; // [ms]
+const SILENCE = 500; // Without a word for so long the link is not called open [ms].
+const WRONG_TOKEN = "wrong token";
+const STYLE =
+  "[data-hold] { touch-action: none; user-select: none; -webkit-user-select: none;" +
+  " -webkit-touch-callout: none; }";
+
+class Hold {
+  #address;
+  #token;
+  #speed = 0;
+  #socket = null;
+  #nonce = "";
+  #sequence = 0;
+  // The press under way: { mode, pointer (null: the space bar), sequence (of its first message) }.
+  #press = null;
+  // Whether a press has ended by itself, and no new one has begun.
+  #lost = false;
+  #told = { held: false, owner: "nobody", why: "" };
+  #heardAt = 0;
+  #refusal = "";
+  #shown = "";
+
+  constructor(port, token, speed) {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    this.#address = `${scheme}://${location.hostname}:${port}/hold`;
+    this.#token = token;
+    this.setSpeed(speed);
+    this.#listen();
+    this.#connect();
+    setInterval(() => this.#show(), SILENCE / 2);
+    this.#show();
+  }
+
+  setSpeed(speed) {
+    if (typeof speed === "number" && speed >= 0 && speed <= 1) this.#speed = speed;
+  }
+
+  release() {
+    if (!this.#press) return;
+    this.#press = null;
+    this.#send();
+    this.#show();
+  }
+
+  get status() {
+    const open = this.#nonce !== "" && performance.now() - this.#heardAt < SILENCE;
+    const told = open ? this.#told : { held: false, owner: "nobody", why: "" };
+    return {
+      link: open ? "open" : this.#refusal ? "refused" : "connecting",
+      owner: told.owner,
+      held: told.held && this.#press !== null,
+      mode: this.#press ? this.#press.mode : "insert",
+      why: open ? told.why || (this.#lost ? "press again" : "") : this.#refusal,
+    };
+  }
+
+  // ---- the socket ------------------------------------------------------------------------------
+
+  #connect() {
+    const socket = new WebSocket(this.#address);
+    this.#socket = socket;
+    socket.onopen = () => socket.send(JSON.stringify({ token: this.#token }));
+    socket.onmessage = (event) => this.#hear(JSON.parse(event.data));
+    socket.onclose = (event) => {
+      this.#drop();
+      this.#nonce = "";
+      this.#sequence = 0;
+      this.#refusal = event.reason;
+      this.#show();
+      if (event.reason !== WRONG_TOKEN) setTimeout(() => this.#connect(), RETRY);
+    };
+  }
+
+  #hear(told) {
+    this.#nonce = told.nonce;
+    this.#told = told;
+    this.#heardAt = performance.now();
+    this.#refusal = "";
+    // Once lost, a press is over, whatever the finger does.
+    if (this.#press && told.heard >= this.#press.sequence && !told.held) this.#drop();
+    if (document.visibilityState !== "visible" || !document.hasFocus()) this.#press = null;
+    this.#send();
+    this.#show();
+  }
+
+  #send() {
+    if (this.#nonce === "" || this.#socket.readyState !== WebSocket.OPEN) return;
+    this.#sequence += 1;
+    this.#socket.send(
+      JSON.stringify({
+        nonce: this.#nonce,
+        sequence: this.#sequence,
+        pressed: this.#press !== null,
+        speed: this.#speed,
+        mode: this.#press ? this.#press.mode : "insert",
+      }),
+    );
+  }
+
+  #begin(mode, pointer) {
+    this.#lost = false;
+    this.#press = { mode, pointer, sequence: this.#sequence + 1 };
+    this.#send();
+    this.#show();
+  }
+
+  #drop() {
+    if (!this.#press) return;
+    this.#press = null;
+    this.#lost = true;
+  }
+
+  // ---- the hand --------------------------------------------------------------------------------
+
+  #listen() {
+    const style = document.createElement("style");
+    style.textContent = STYLE;
+    document.head.append(style);
+    const on = (target, type, handler) => target.addEventListener(type, handler, true);
+    const release = () => this.release();
+    on(window, "pointerdown", (event) => this.#pointerDown(event));
+    on(window, "pointermove", (event) => this.#pointerMoved(event));
+    for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      on(window, type, (event) => {
+        if (this.#press && event.pointerId === this.#press.pointer) this.release();
+      });
+    }
+    on(window, "keydown", (event) => this.#keyDown(event));
+    on(window, "keyup", (event) => this.#keyUp(event));
+    on(window, "blur", (event) => {
+      if (event.target === window) this.release();
+    });
+    on(window, "pagehide", release);
+    on(document, "visibilitychange", release);
+    on(document, "freeze", release);
+    // A long touch is a hold, no request for a menu.
+    for (const type of ["contextmenu", "dragstart"]) {
+      on(window, type, (event) => {
+        if (buttonOf(event.target)) event.preventDefault();
+      });
+    }
+  }
+
+  #pointerDown(event) {
+    // A second finger, wherever it is, ends the hold.
+    if (this.#press) {
+      this.release();
+      return;
+    }
+    const button = buttonOf(event.target);
+    if (!button || !event.isPrimary || event.button !== 0) return;
+    button.setPointerCapture(event.pointerId);
+    this.#begin(button.dataset.hold, event.pointerId);
+  }
+
+  #pointerMoved(event) {
+    // A second button of a mouse comes as a movement.
+    if (this.#press && event.pointerId === this.#press.pointer && event.buttons !== 1) {
+      this.release();
+    }
+  }
+
+  #keyDown(event) {
+    const space = event.code === "Space";
+    if (this.#press) {
+      const same = space && this.#press.pointer === null;
+      if (same) event.preventDefault();
+      // Any other key ends the hold.
+      if (!same || !event.repeat) this.release();
+      return;
+    }
+    const button = space && !event.ctrlKey && !event.altKey && !event.metaKey && focused();
+    if (!button) return;
+    event.preventDefault();
+    if (!event.repeat) this.#begin(button.dataset.hold, null);
+  }
+
+  #keyUp(event) {
+    if (event.code !== "Space") return;
+    if (buttonOf(document.activeElement)) event.preventDefault();
+    if (this.#press && this.#press.pointer === null) this.release();
+  }
+
+  // ---- what is shown ---------------------------------------------------------------------------
+
+  #show() {
+    const status = this.status;
+    const shown = JSON.stringify(status);
+    if (shown === this.#shown) return;
+    this.#shown = shown;
+    const again = status.why === "press again" || status.why === "hold lost";
+    let state = "ready";
+    if (status.link !== "open") state = "offline";
+    else if (status.owner === "other") state = "other";
+    else if (status.held) state = "held";
+    else if (again) state = "again";
+    document.documentElement.dataset.holdState = state;
+    window.dispatchEvent(new CustomEvent("hold:status", { detail: status }));
+  }
+}
+
+// Return the button that an element belongs to; null: none, or one that is switched off.
+function buttonOf(element) {
+  const button = element instanceof Element ? element.closest("[data-hold]") : null;
+  return button && !button.matches(":disabled, [aria-disabled=true], .disabled") ? button : null;
+}
+
+// Return the button that the space bar holds: the focused one, or without any focus `insert`.
+function focused() {
+  const element = document.activeElement;
+  if (!element || element === document.body || element === document.documentElement) {
+    return buttonOf(document.querySelector('[data-hold="insert"]'));
+  }
+  return buttonOf(element);
+}
+
+// Connect to the hold's server, and make the page's hold buttons work.
+export function startHold({ port, token = "", speed }) {
+  return new Hold(port, token, speed);
+}
