@@ -197,6 +197,10 @@ def test_garbage_ends_a_hold(data: str | bytes) -> None:
     assert scene.desk.receive(page, data, scene.now) is Refusal.GARBAGE
     assert not scene.pressed
     assert scene.say(page, True) is Refusal.NEW_PRESS
+    # And what was heard before it.
+    scene.say(page, False)
+    scene.desk.receive(page, data, scene.now)
+    assert scene.say(page, True) is Refusal.NEW_PRESS
 
 
 def test_another_mode_takes_another_press() -> None:
