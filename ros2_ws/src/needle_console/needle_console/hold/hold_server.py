@@ -78,7 +78,9 @@ class HoldServer:
         self._socket = _listen(access.address, port)
         self._loop = asyncio.new_event_loop()
         self._ended = asyncio.Event()
-        self._thread = threading.Thread(target=self._run, name="hold", daemon=True)
+        self._thread = threading.Thread(
+            target=lambda: self._loop.run_until_complete(self._serve()), name="hold", daemon=True
+        )
 
     @property
     def port(self) -> int:
@@ -107,12 +109,6 @@ class HoldServer:
         return self._refusals.counts()
 
     # ---- the thread ---------------------------------------------------------------------------
-
-    def _run(self) -> None:
-        try:
-            self._loop.run_until_complete(self._serve())
-        finally:
-            self._on_state(RELEASED)
 
     async def _serve(self) -> None:
         # What it says of every broken connection is counted here.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import Any, NoReturn
+from typing import Any
 
 from needle_console.hold.hold_state import Mode
 
@@ -89,16 +89,12 @@ def _object(data: str | bytes) -> dict[str, Any]:
     if not isinstance(data, str) or len(data) > LONGEST:
         raise GarbageError("no short text")
     try:
-        found = json.loads(data, parse_constant=_no_number, object_pairs_hook=_once)
+        found = json.loads(data, object_pairs_hook=_once)
     except (ValueError, RecursionError) as error:
         raise GarbageError("no JSON") from error
     if not isinstance(found, dict):
         raise GarbageError("no object")
     return found
-
-
-def _no_number(name: str) -> NoReturn:
-    raise GarbageError(f"{name} is no number")
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
