@@ -37,6 +37,7 @@ LONG_FILES = (
     "ros2_ws/src/needle_analysis/test/ros/test_rerun.py",
     "ros2_ws/src/needle_analysis/test/ros/test_rerun_hearing.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
+    "ros2_ws/src/needle_verification/test/checks/test_check_console_hold.py",
 )
 IN_BACKGROUND = re.compile(
     r"tests/test_lint\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"

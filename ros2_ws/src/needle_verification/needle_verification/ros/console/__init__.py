@@ -1,0 +1,1 @@
+"""Trials of the console in a real browser."""

@@ -1,0 +1,170 @@
+"""Trials of the console's hold in a real browser, each printed as one JSON object.
+
+`python -m needle_verification.ros.console.console_trials 50 closed stalled`: a needle moves at
+5 mm/s while a page's button or the space bar is held; then, at a random moment, the page is closed,
+and so on. `... 5 hostile`: other pages try all that they should not.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import rclpy
+
+from needle_common.commands.cli import EXIT_DONE, run_command
+from needle_common.commands.options import CommandParser
+from needle_common.errors import UserError
+from needle_common.process.ros_domain import own_domain
+from needle_verification.ros.console.console_losses import LOSSES, let_go
+from needle_verification.ros.console.console_scene import Scene
+from needle_verification.ros.console.console_stand_in import TOKEN
+
+# Later motion began anew [ms].
+RESUMED_MS = 500.0
+# How long the needle has moved before the loss [s]; among hostile pages no hold lasts for long.
+_MOVES_BEFORE, _AMONG_HOSTILE = (0.1, 0.9), (0.05, 0.15)
+_REPLAYED = 0.3
+_REPLAYS, _BETWEEN_REPLAYS = 10, 0.3
+
+
+def console_trials(
+    folder: Path, domain: int, kinds: list[str], count: int, seed: int
+) -> Iterator[dict[str, Any]]:
+    """Yield what came of each trial, all with one rig.
+
+    Parameters
+    ----------
+    folder : Path
+        Takes profiles and logs.
+    domain : int
+        ROS_DOMAIN_ID.
+    kinds : list of str
+        Which of `LOSSES`.
+    count : int
+        Trials of each.
+    seed : int
+        Of moments and ways to press.
+    """
+    with closing(Scene(folder, domain)) as scene:
+        for kind in kinds:
+            scene.rng = random.Random(f"{seed} {kind}")
+            for number in range(count):
+                yield {"loss": kind, "number": number, **_trial(scene, LOSSES[kind], _MOVES_BEFORE)}
+
+
+def hostile_trials(folder: Path, domain: int, count: int, seed: int) -> Iterator[dict[str, Any]]:
+    """Yield what came of each trial among hostile pages: nobody holds, then the right page lets go.
+
+    Parameters
+    ----------
+    folder : Path
+        Takes profiles and logs.
+    domain : int
+        ROS_DOMAIN_ID.
+    count : int
+        How many.
+    seed : int
+        Of moments and ways to press.
+    """
+    with closing(Scene(folder, domain)) as scene:
+        scene.rng = random.Random(f"{seed} hostile")
+        for number in range(count):
+            # Something to replay.
+            scene.press_until(_REPLAYED)
+            scene.release()
+            with _hostile_pages(scene.console.ports):
+                # What had moved before may be heard only now.
+                since_ns = time.time_ns()
+                for _ in range(_REPLAYS):
+                    scene.proxy.replay()
+                    scene.hand.pause(_BETWEEN_REPLAYS)
+                moved = scene.hand.moves[-1].sent_ns > since_ns
+                outcome = _trial(scene, let_go, _AMONG_HOSTILE)
+            yield {
+                "loss": "hostile",
+                "number": number,
+                **outcome,
+                "moved_by_others": moved,
+                "refused": scene.console.refusals(),
+            }
+
+
+@contextlib.contextmanager
+def _hostile_pages(ports: Mapping[str, int]) -> Iterator[None]:
+    words = ["-m", "needle_verification.trials.hostile_pages"]
+    known = [str(ports["page"]), str(ports["hold"]), TOKEN]
+    # They would have a machine of their own.
+    command = ["nice", "-n", "19", sys.executable, *words, *known]
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    try:
+        yield
+        if process.poll() is not None:
+            raise UserError("the hostile pages have given up")
+    finally:
+        process.kill()
+        process.wait()
+
+
+def _trial(
+    scene: Scene, lose: Callable[[Scene], None], moves: tuple[float, float]
+) -> dict[str, Any]:
+    hand = scene.hand
+    lost_before = scene.press_until(scene.rng.uniform(*moves))
+    seen = len(hand.moves)
+    before = hand.insertion
+    lost_at_ns = time.time_ns()
+    lose(scene)
+    # What had moved before may be heard only now.
+    times_ms = [(move.sent_ns - lost_at_ns) * 1e-6 for move in hand.moves[seen:]]
+    return {
+        "pressed_by": scene.by,
+        "lost_before": lost_before,
+        "last_motion_ms": max([0.0, *times_ms]),
+        "way_mm": (hand.insertion - before) * 1e3,
+        "resumed": any(at_ms > RESUMED_MS for at_ms in times_ms),
+        "state": hand.status.get("state", ""),
+    }
+
+
+def main() -> int:
+    """Run trials; returns the exit code."""
+    parser = CommandParser("console_trials", __doc__ or "", "")
+    parser.add_argument("count", type=int)
+    parser.add_argument("kinds", nargs="*", help=f"{', '.join(LOSSES)}; all if none; or hostile")
+    parser.add_argument("--seed", type=int, default=1)
+
+    def run() -> int:
+        given = parser.parse_args()
+        kinds = given.kinds or list(LOSSES)
+        if unknown := [kind for kind in kinds if kind not in LOSSES and kinds != ["hostile"]]:
+            raise UserError(f"{unknown[0]!r} is not one of {', '.join(LOSSES)}")
+        with own_domain() as domain, tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
+            rclpy.init(args=[], domain_id=domain)
+            try:
+                where = Path(name), domain
+                outcomes = (
+                    hostile_trials(*where, given.count, given.seed)
+                    if kinds == ["hostile"]
+                    else console_trials(*where, kinds, given.count, given.seed)
+                )
+                for outcome in outcomes:
+                    print(json.dumps(outcome), flush=True)
+            finally:
+                rclpy.try_shutdown()
+        return EXIT_DONE
+
+    return run_command(run)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

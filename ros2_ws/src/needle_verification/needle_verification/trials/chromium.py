@@ -1,0 +1,226 @@
+"""A real browser without a screen, led by its DevTools protocol.
+
+Not by playwright, which makes every page believe that it is seen and focused: what a page does that
+is not is what is tried here.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import os
+import shutil
+import signal
+import subprocess
+import time
+from pathlib import Path
+from typing import Any
+
+from needle_common.errors import UserError
+
+_FLAGS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-gpu",
+    "--disable-quic",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-extensions",
+    "--disable-breakpad",
+    "--disable-dev-shm-usage",
+    "--remote-debugging-port=0",
+)
+_PATIENCE = 60.0
+_POLL = 0.02
+_KEY = {"key": " ", "code": "Space", "windowsVirtualKeyCode": 32}
+
+
+def chromium() -> str | None:
+    """Return the browser's path; None where it is not installed (Debian's package `chromium`)."""
+    return shutil.which("chromium")
+
+
+class Chromium:
+    """A browser of its own, with an empty profile.
+
+    Parameters
+    ----------
+    folder : Path
+        New folder for its profile.
+
+    Raises
+    ------
+    UserError
+        If there is no browser, or it does not start.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        # Only what tries a browser needs it.
+        from websockets.sync.client import connect  # noqa: PLC0415
+
+        path = chromium()
+        if path is None:
+            raise UserError("there is no chromium: apt-get install chromium")
+        folder.mkdir()
+        self._process = subprocess.Popen(
+            [path, *_FLAGS, f"--user-data-dir={folder}", "about:blank"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        self._open = contextlib.ExitStack()
+        self._open.callback(self.kill)
+        try:
+            port, endpoint = self._said(folder / "DevToolsActivePort").split()
+            self._socket = self._open.enter_context(
+                connect(f"ws://127.0.0.1:{port}{endpoint}", compression=None, max_size=None)
+            )
+        except BaseException:
+            self._open.close()
+            raise
+        self._numbers = itertools.count(1)
+
+    def open(self, url: str, *, window: bool = False) -> Tab:
+        """Open a page in front, in a new tab or a window of its own."""
+        target = str(self.call("Target.createTarget", url=url, newWindow=window)["targetId"])
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        tab = Tab(self, target, str(session))
+        tab.show()
+        return tab
+
+    def close_all_but(self, tab: Tab) -> None:
+        """Close all pages but one, which comes to the front."""
+        for target in self.call("Target.getTargets")["targetInfos"]:
+            if target["type"] == "page" and target["targetId"] != tab.target:
+                self.call("Target.closeTarget", targetId=target["targetId"])
+        tab.show()
+
+    def call(self, method: str, session: str = "", **parameters: object) -> dict[str, Any]:
+        """Send a command and return its answer.
+
+        Raises
+        ------
+        UserError
+            If the browser refuses, or says nothing.
+        """
+        number = self.post(method, session, **parameters)
+        while True:
+            try:
+                answer = json.loads(self._socket.recv(timeout=_PATIENCE))
+            except TimeoutError as error:
+                raise UserError(f"chromium does not answer {method}") from error
+            if answer.get("id") == number:
+                break
+        if "error" in answer:
+            raise UserError(f"chromium: {method}: {answer['error']['message']}")
+        return dict(answer["result"])
+
+    def post(self, method: str, session: str = "", **parameters: object) -> int:
+        """Send a command, and wait for nothing; return its number."""
+        number = next(self._numbers)
+        command = {"id": number, "method": method, "params": parameters}
+        self._socket.send(json.dumps({**command, "sessionId": session} if session else command))
+        return number
+
+    def signal(self, number: signal.Signals) -> None:
+        """Send a signal to all of its processes."""
+        os.killpg(self._process.pid, number)
+
+    def kill(self) -> None:
+        """End all of its processes at once."""
+        # Once only: later its number may be another's.
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                self.signal(signal.SIGKILL)
+            self._process.wait()
+
+    def close(self) -> None:
+        """End it."""
+        # What has ended says no farewell that would be waited for.
+        self.kill()
+        self._open.close()
+
+    def _said(self, file: Path) -> str:
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            with contextlib.suppress(FileNotFoundError):
+                text = file.read_text("utf-8")
+                if text.count("\n"):
+                    return text
+            if self._process.poll() is not None or time.monotonic() > deadline:
+                raise UserError("chromium does not start")
+            time.sleep(_POLL)
+
+
+class Tab:
+    """A page in it.
+
+    Parameters
+    ----------
+    browser : Chromium
+        Its browser.
+    target, session : str
+        Names of the page and of the connection to it.
+
+    Attributes
+    ----------
+    target : str
+        Name of the page.
+    """
+
+    def __init__(self, browser: Chromium, target: str, session: str) -> None:
+        self._browser = browser
+        self.target = target
+        self._session = session
+
+    def run(self, script: str) -> Any:
+        """Run a script; return what it comes to."""
+        answer = self._browser.call(
+            "Runtime.evaluate", self._session, expression=script, returnByValue=True
+        )
+        return answer["result"].get("value")
+
+    def post(self, script: str) -> None:
+        """Run a script, and wait for nothing."""
+        self._browser.post("Runtime.evaluate", self._session, expression=script)
+
+    def show(self) -> None:
+        """Bring it to the front."""
+        self._browser.post("Target.activateTarget", targetId=self.target)
+
+    def close(self) -> None:
+        """Close it, and wait for nothing."""
+        self._browser.post("Target.closeTarget", targetId=self.target)
+
+    def press_pointer(self, x: float, y: float) -> None:
+        """Press the mouse's button at a place [px]."""
+        self._mouse("mouseMoved", x, y, 0)
+        self._mouse("mousePressed", x, y, 1)
+
+    def release_pointer(self, x: float, y: float) -> None:
+        """Release it."""
+        self._mouse("mouseReleased", x, y, 0)
+
+    def press_space(self) -> None:
+        """Press the space bar."""
+        self._browser.post("Input.dispatchKeyEvent", self._session, type="keyDown", **_KEY)
+
+    def release_space(self) -> None:
+        """Release it."""
+        self._browser.post("Input.dispatchKeyEvent", self._session, type="keyUp", **_KEY)
+
+    def _mouse(self, kind: str, x: float, y: float, buttons: int) -> None:
+        self._browser.post(
+            "Input.dispatchMouseEvent",
+            self._session,
+            type=kind,
+            x=x,
+            y=y,
+            button="none" if kind == "mouseMoved" else "left",
+            buttons=buttons,
+            clickCount=1,
+        )

@@ -1,0 +1,37 @@
+"""A sample of what `scripts/verify I` runs at full size of the console's hold."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from needle_verification.checks import check_console_hold
+from needle_verification.trials.chromium import chromium
+
+pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
+
+
+# Chromium takes its time on a busy machine.
+@pytest.mark.timeout(300)
+@pytest.mark.skipif(chromium() is None, reason="there is no chromium: apt-get install chromium")
+def test_the_needle_stops_whatever_is_lost_and_a_fresh_press_moves_it_again() -> None:
+    # Each trial begins with a press that moves the needle, after the loss of the one before.
+    kinds = (*check_console_hold.LOSSES, "stalled")
+    outcomes = check_console_hold.trials(1, *kinds)
+    assert tuple(outcome["loss"] for outcome in outcomes) == kinds
+    findings = [check_console_hold.judge(outcome["loss"], [outcome]) for outcome in outcomes]
+    assert [finding for finding in findings if not finding.passed] == []
+
+
+def outcome(**changes: Any) -> dict[str, Any]:
+    """A trial that went well."""
+    return {"last_motion_ms": 120.0, "way_mm": 0.6, "resumed": False, **changes}
+
+
+@pytest.mark.parametrize(
+    ("change", "passed"),
+    [({}, True), ({"last_motion_ms": 171.0}, False), ({"resumed": True}, False)],
+)
+def test_what_falls_short_is_a_miss(change: dict[str, Any], passed: bool) -> None:
+    assert check_console_hold.judge("closed", [outcome(), outcome(**change)]).passed is passed
