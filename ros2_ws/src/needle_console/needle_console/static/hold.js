@@ -6,6 +6,7 @@
 const RETRY = 1000; // [ms]
 const SILENCE = 500; // Without a word for so long the link is not called open [ms].
 const WRONG_TOKEN = "wrong token";
+const FRAMED = "inside another page";
 const STYLE =
   "[data-hold] { touch-action: none; user-select: none; -webkit-user-select: none;" +
   " -webkit-touch-callout: none; }";
@@ -17,7 +18,8 @@ class Hold {
   #socket = null;
   #nonce = "";
   #sequence = 0;
-  // The press under way: { mode, pointer (null: the space bar), sequence (of its first message) }.
+  // The press under way: { mode, button, pointer (null: the space bar), sequence (of its first
+  // message) }.
   #press = null;
   // Whether a press has ended by itself, and no new one has begun.
   #lost = false;
@@ -31,8 +33,11 @@ class Hold {
     this.#address = `${scheme}://${location.hostname}:${port}/hold`;
     this.#token = token;
     this.setSpeed(speed);
-    this.#listen();
-    this.#connect();
+    // Another page must not lay this one under a finger that means something else.
+    if (window.top === window) {
+      this.#listen();
+      this.#connect();
+    } else this.#refusal = FRAMED;
     setInterval(() => this.#show(), SILENCE / 2);
     this.#show();
   }
@@ -84,7 +89,7 @@ class Hold {
     this.#refusal = "";
     // Once lost, a press is over, whatever the finger does.
     if (this.#press && told.heard >= this.#press.sequence && !told.held) this.#drop();
-    if (document.visibilityState !== "visible" || !document.hasFocus()) this.#press = null;
+    if (this.#press && !this.#canGoOn()) this.#press = null;
     this.#send();
     this.#show();
   }
@@ -103,9 +108,17 @@ class Hold {
     );
   }
 
-  #begin(mode, pointer) {
+  // What should have come as an event, and may not have: a button that is taken away says nothing.
+  #canGoOn() {
+    const { button } = this.#press;
+    const there = button.isConnected && buttonOf(button) === button;
+    return there && document.visibilityState === "visible" && document.hasFocus();
+  }
+
+  #begin(button, pointer) {
     this.#lost = false;
-    this.#press = { mode, pointer, sequence: this.#sequence + 1 };
+    const sequence = this.#sequence + 1;
+    this.#press = { mode: button.dataset.hold, button, pointer, sequence };
     this.#send();
     this.#show();
   }
@@ -156,7 +169,7 @@ class Hold {
     const button = buttonOf(event.target);
     if (!button || !event.isPrimary || event.button !== 0) return;
     button.setPointerCapture(event.pointerId);
-    this.#begin(button.dataset.hold, event.pointerId);
+    this.#begin(button, event.pointerId);
   }
 
   #pointerMoved(event) {
@@ -178,7 +191,7 @@ class Hold {
     const button = space && !event.ctrlKey && !event.altKey && !event.metaKey && focused();
     if (!button) return;
     event.preventDefault();
-    if (!event.repeat) this.#begin(button.dataset.hold, null);
+    if (!event.repeat) this.#begin(button, null);
   }
 
   #keyUp(event) {
