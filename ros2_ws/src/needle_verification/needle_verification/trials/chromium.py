@@ -205,22 +205,46 @@ class Tab:
         """Release it."""
         self._mouse("mouseReleased", x, y, 0)
 
-    def press_space(self) -> None:
-        """Press the space bar."""
-        self._browser.post("Input.dispatchKeyEvent", self._session, type="keyDown", **_KEY)
+    def press_other_button(self, x: float, y: float) -> None:
+        """Press the mouse's other button beside the first."""
+        self._mouse("mousePressed", x, y, 3, "right")
+
+    def touch(self, *places: tuple[float, float]) -> None:
+        """Have fingers at these places [px]; nowhere: lift them."""
+        points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(places)]
+        kind = "touchStart" if points else "touchEnd"
+        self._browser.post("Input.dispatchTouchEvent", self._session, type=kind, touchPoints=points)
+
+    def cancel_touch(self) -> None:
+        """Take the fingers away as a system does that has use for them."""
+        self._browser.post(
+            "Input.dispatchTouchEvent", self._session, type="touchCancel", touchPoints=[]
+        )
+
+    def press_key(self, key: str) -> None:
+        """Press a key that is called as it is."""
+        self._browser.post(
+            "Input.dispatchKeyEvent", self._session, type="keyDown", key=key, code=key
+        )
+
+    def press_space(self, *, repeat: bool = False) -> None:
+        """Press the space bar, or say that it still is."""
+        self._browser.post(
+            "Input.dispatchKeyEvent", self._session, type="keyDown", autoRepeat=repeat, **_KEY
+        )
 
     def release_space(self) -> None:
         """Release it."""
         self._browser.post("Input.dispatchKeyEvent", self._session, type="keyUp", **_KEY)
 
-    def _mouse(self, kind: str, x: float, y: float, buttons: int) -> None:
+    def _mouse(self, kind: str, x: float, y: float, buttons: int, button: str = "left") -> None:
         self._browser.post(
             "Input.dispatchMouseEvent",
             self._session,
             type=kind,
             x=x,
             y=y,
-            button="none" if kind == "mouseMoved" else "left",
+            button="none" if kind == "mouseMoved" else button,
             buttons=buttons,
             clickCount=1,
         )

@@ -23,17 +23,28 @@ def _closed(scene: Scene) -> None:
     scene.tab = scene.page()
 
 
-def _hidden(scene: Scene) -> None:
+def _hidden(scene: Scene) -> int:
+    scene.tab.run("window.lostAt = null")
     scene.browser.post("Target.createTarget", url="about:blank")
     scene.hand.pause(_WATCHED)
+    lost_at_ns = _lost_at_ns(scene)
     scene.browser.close_all_but(scene.tab)
     scene.hand.pause(_WATCHED)
+    return lost_at_ns
 
 
-def _unfocused(scene: Scene) -> None:
+def _unfocused(scene: Scene) -> int:
+    scene.tab.run("window.lostAt = null")
     scene.tab.post("window.frames[0].focus()")
     scene.hand.pause(_WATCHED)
+    lost_at_ns = _lost_at_ns(scene)
     scene.tab.run("window.focus()")
+    return lost_at_ns
+
+
+def _lost_at_ns(scene: Scene) -> int:
+    """Return when the page lost sight or focus: a browser that is told so takes its time."""
+    return int(float(scene.tab.run("window.lostAt")) * 1e6)
 
 
 def _stopped(scene: Scene) -> None:
@@ -63,7 +74,10 @@ def _asleep(scene: Scene) -> None:
     scene.hand.pause(_WATCHED)
 
 
-LOSSES: Mapping[str, Callable[[Scene], None]] = {
+Loss = Callable[[Scene], int | None]
+"""Loses something, looks what comes of it, and puts it right; returns when it was lost [ns]."""
+
+LOSSES: Mapping[str, Loss] = {
     "closed": _closed,
     "hidden": _hidden,
     "unfocused": _unfocused,

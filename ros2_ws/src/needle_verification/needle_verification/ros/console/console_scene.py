@@ -17,7 +17,7 @@ from pathlib import Path
 from needle_common.errors import UserError
 from needle_console.ros.hold_topic import OWNER
 from needle_verification.ros.console.console_hand import ConsoleHand
-from needle_verification.ros.console.console_stand_in import BUTTON
+from needle_verification.trials.button_page import BUTTON
 from needle_verification.trials.chromium import Chromium, Tab
 from needle_verification.trials.stalling_proxy import StallingProxy
 from needle_verification.trials.trial_processes import Parameters, TrialProcesses

@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -25,9 +25,9 @@ from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
-from needle_verification.ros.console.console_losses import LOSSES, let_go
+from needle_verification.ros.console.console_losses import LOSSES, Loss, let_go
 from needle_verification.ros.console.console_scene import Scene
-from needle_verification.ros.console.console_stand_in import TOKEN
+from needle_verification.trials.button_page import TOKEN
 
 # Later motion began anew [ms].
 RESUMED_MS = 500.0
@@ -115,15 +115,13 @@ def _hostile_pages(ports: Mapping[str, int]) -> Iterator[None]:
         process.wait()
 
 
-def _trial(
-    scene: Scene, lose: Callable[[Scene], None], moves: tuple[float, float]
-) -> dict[str, Any]:
+def _trial(scene: Scene, lose: Loss, moves: tuple[float, float]) -> dict[str, Any]:
     hand = scene.hand
     lost_before = scene.press_until(scene.rng.uniform(*moves))
     seen = len(hand.moves)
     before = hand.insertion
-    lost_at_ns = time.time_ns()
-    lose(scene)
+    begun_ns = time.time_ns()
+    lost_at_ns = lose(scene) or begun_ns
     # What had moved before may be heard only now.
     times_ms = [(move.sent_ns - lost_at_ns) * 1e-6 for move in hand.moves[seen:]]
     return {

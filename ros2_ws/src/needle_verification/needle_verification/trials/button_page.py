@@ -1,0 +1,86 @@
+"""A page of one button with the console's hold behind it, as any page of the console has it."""
+
+from __future__ import annotations
+
+import contextlib
+import http.server
+import threading
+from collections.abc import Callable, Iterator
+from http import HTTPStatus
+from pathlib import Path
+
+import needle_console
+from needle_console.access.access import Access
+from needle_console.hold.hold_server import HoldServer
+from needle_console.hold.hold_state import HoldState
+
+BUTTON = (100.0, 50.0)
+"""Middle of the page's button [px]."""
+
+TOKEN = "known to this page alone"
+
+_ADDRESS = "127.0.0.1"
+_PAGE = """<!doctype html>
+<title>hold</title>
+<button data-hold="insert" style="position: fixed; left: 0; top: 0; width: 200px; height: 100px">
+  hold to insert
+</button>
+<input style="position: fixed; left: 300px; top: 0">
+<iframe srcdoc="elsewhere" style="position: fixed; left: 0; top: 200px"></iframe>
+<script type="module">
+  import { startHold } from "/hold.js";
+  const port = Number(new URLSearchParams(location.search).get("port"));
+  window.needleHold = startHold({ port, token: "TOKEN", speed: 1.0 });
+  // When it lost sight or focus, system clock [ms].
+  const lost = (event) => {
+    window.lostAt ??= performance.timeOrigin + event.timeStamp;
+  };
+  document.addEventListener("visibilitychange", lost);
+  window.addEventListener("blur", lost);
+</script>
+""".replace("TOKEN", TOKEN)
+
+
+@contextlib.contextmanager
+def serving_button(
+    on_state: Callable[[HoldState], None], on_notice: Callable[[str], None]
+) -> Iterator[dict[str, int]]:
+    """Serve it; yields the ports of `page` and `hold`.
+
+    Parameters
+    ----------
+    on_state, on_notice : callable
+        As `HoldServer` takes them.
+    """
+    with http.server.ThreadingHTTPServer((_ADDRESS, 0), _Page) as pages:
+        serving = threading.Thread(target=pages.serve_forever)
+        serving.start()
+        hold = HoldServer(Access(_ADDRESS, pages.server_port, TOKEN), 0, on_state, on_notice)
+        hold.start()
+        try:
+            yield {"page": pages.server_port, "hold": hold.port}
+        finally:
+            hold.close()
+            pages.shutdown()
+            serving.join()
+
+
+class _Page(http.server.BaseHTTPRequestHandler):
+    def do_GET(self) -> None:
+        path = self.path.partition("?")[0]
+        if path == "/":
+            self._answer("text/html", _PAGE)
+        elif path == "/hold.js":
+            script = Path(needle_console.__path__[0]) / "static" / "hold.js"
+            self._answer("text/javascript", script.read_text("utf-8"))
+        else:
+            self.send_error(HTTPStatus.NOT_FOUND)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing of requests."""
+
+    def _answer(self, kind: str, text: str) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", f"{kind}; charset=utf-8")
+        self.end_headers()
+        self.wfile.write(text.encode())

@@ -1,0 +1,166 @@
+"""What hold.js makes of fingers, mouse and keys, in a real browser."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from needle_console.hold.hold_state import HoldState
+from needle_verification.trials.chromium import Chromium, Tab, chromium
+
+pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
+
+from needle_verification.trials.button_page import BUTTON, serving_button
+
+pytestmark = [
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(chromium() is None, reason="no chromium: apt-get install chromium"),
+]
+
+PATIENCE = 30.0
+ELSEWHERE = (400.0, 300.0)
+_STATE = "document.documentElement.dataset.holdState"
+
+
+class Scene:
+    """The page in a browser, and what the server hands on."""
+
+    def __init__(self, tab: Tab, states: list[HoldState]) -> None:
+        self.tab = tab
+        self.states = states
+
+    def until(self, condition: Callable[[], object], what: str) -> None:
+        deadline = time.monotonic() + PATIENCE
+        while not condition():
+            assert time.monotonic() < deadline, f"waited in vain: {what}"
+            time.sleep(0.005)
+
+    def until_released(self) -> None:
+        self.until(lambda: not self.states[-1].pressed, "released")
+
+    def let_pass(self, count: int) -> None:
+        """Let so many states be handed on."""
+        enough = len(self.states) + count
+        self.until(lambda: len(self.states) >= enough, "states")
+
+    def hold(self, press: Callable[[], None], let_go: Callable[[], None]) -> None:
+        """Press until it counts for a while: on a busy machine a hold may be lost at once."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            assert time.monotonic() < deadline, "no press counts"
+            let_go()
+            self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
+            press()
+            self.let_pass(15)
+            if self.states[-1].pressed:
+                return
+
+    def never_pressed(self, press: Callable[[], None]) -> bool:
+        """Press, and look whether that counts."""
+        self.until(lambda: self.tab.run(_STATE) in ("ready", "again"), "ready")
+        seen = len(self.states)
+        press()
+        # The browser has taken it when it answers.
+        self.tab.run("0")
+        self.let_pass(15)
+        return not any(state.pressed for state in self.states[seen:])
+
+    def hold_pointer(self) -> None:
+        self.hold(
+            lambda: self.tab.press_pointer(*BUTTON), lambda: self.tab.release_pointer(*BUTTON)
+        )
+
+    def hold_space(self) -> None:
+        self.hold(self.tab.press_space, self.tab.release_space)
+
+    def hold_touch(self) -> None:
+        self.hold(lambda: self.tab.touch(BUTTON), self.tab.touch)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    folder: Path = tmp_path_factory.mktemp("browser")
+    states: list[HoldState] = []
+    with serving_button(states.append, lambda _: None) as ports:
+        browser = Chromium(folder / "profile")
+        try:
+            tab = browser.open(f"http://127.0.0.1:{ports['page']}/?port={ports['hold']}")
+            yield Scene(tab, states)
+        finally:
+            browser.close()
+
+
+def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> None:
+    scene.hold_pointer()
+    assert scene.states[-1].speed == 1.0
+    scene.tab.run("needleHold.setSpeed(0.25); needleHold.setSpeed(NaN); needleHold.setSpeed(2)")
+    scene.until(lambda: scene.states[-1].speed in (0.25, 0.0), "the speed changes")
+    scene.tab.run("needleHold.setSpeed(1)")
+    scene.tab.release_pointer(*BUTTON)
+    scene.until_released()
+    scene.hold_space()
+    scene.tab.press_space(repeat=True)
+    scene.tab.release_space()
+    scene.until_released()
+    scene.hold_touch()
+    scene.tab.touch()
+    scene.until_released()
+
+
+def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
+    scene.hold_touch()
+    scene.tab.touch(BUTTON, ELSEWHERE)
+    scene.until_released()
+    scene.tab.touch()
+    scene.hold_touch()
+    scene.tab.cancel_touch()
+    scene.until_released()
+    scene.hold_pointer()
+    scene.tab.press_other_button(*BUTTON)
+    scene.until_released()
+    scene.hold_space()
+    scene.tab.press_key("Escape")
+    scene.until_released()
+
+
+def test_a_button_that_goes_ends_its_hold(scene: Scene) -> None:
+    scene.hold_pointer()
+    scene.tab.run(
+        "const old = document.querySelector('[data-hold]'); old.replaceWith(old.cloneNode(true))"
+    )
+    scene.until_released()
+    # What takes its place is a button like it.
+    scene.hold_pointer()
+    scene.tab.release_pointer(*BUTTON)
+    scene.until_released()
+
+
+def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
+    tab = scene.tab
+    tab.release_space()
+    assert scene.never_pressed(lambda: tab.press_space(repeat=True))
+    tab.release_space()
+    tab.run("document.querySelector('input').focus()")
+    assert scene.never_pressed(tab.press_space)
+    tab.release_space()
+    tab.run("document.activeElement.blur()")
+    tab.run("document.querySelector('[data-hold]').ariaDisabled = 'true'")
+    assert scene.never_pressed(lambda: tab.press_pointer(*BUTTON))
+    tab.release_pointer(*BUTTON)
+    assert scene.never_pressed(tab.press_space)
+    tab.release_space()
+    tab.run("document.querySelector('[data-hold]').ariaDisabled = 'false'")
+    assert scene.never_pressed(lambda: tab.press_pointer(*ELSEWHERE))
+    tab.release_pointer(*ELSEWHERE)
+
+
+def test_a_page_inside_another_page_does_not_connect(scene: Scene) -> None:
+    scene.tab.run(
+        "const frame = document.createElement('iframe'); frame.src = location.href;"
+        " document.body.append(frame)"
+    )
+    status = "JSON.stringify(frames[1].needleHold && frames[1].needleHold.status)"
+    scene.until(lambda: "inside another page" in str(scene.tab.run(status)), "it says why")
