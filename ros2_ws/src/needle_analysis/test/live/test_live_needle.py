@@ -73,14 +73,15 @@ def test_a_needle_drawn_back_lies_in_its_way_which_stays_until_it_is_out() -> No
 
 def test_the_ellipsoid_holds_as_many_as_it_says() -> None:
     rng = np.random.default_rng(5)
-    turned = Rotation.from_rotvec([0.3, -1.1, 0.6]).as_matrix()
-    covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
-    axes, lengths = ellipsoid(covariance)
-    assert np.linalg.det(axes) == pytest.approx(1.0)
-    drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
-    inside = np.sum((drawn @ axes / lengths) ** 2, axis=1) <= 1.0
-    assert inside.mean() == pytest.approx(0.95, abs=0.006)
-    assert lengths.max() == pytest.approx(SIGMAS * 3e-3)
+    for turned in Rotation.random(8, random_state=5).as_matrix():
+        covariance = turned @ np.diag([1e-8, 4e-8, 9e-6]) @ turned.T
+        axes, lengths = ellipsoid(covariance)
+        # Else no quaternion would turn them.
+        assert np.linalg.det(axes) == pytest.approx(1.0)
+        drawn = rng.multivariate_normal(np.zeros(3), covariance, 20_000)
+        inside = np.sum((drawn @ axes / lengths) ** 2, axis=1) <= 1.0
+        assert inside.mean() == pytest.approx(0.95, abs=0.007)
+        assert lengths.max() == pytest.approx(SIGMAS * 3e-3)
 
 
 def test_what_is_believed_in_the_plane_is_shown_in_the_rig() -> None:
@@ -153,6 +154,12 @@ def test_an_image_is_drawn_once_with_its_own_answer() -> None:
     assert images.next(20, 0.2) is None
     assert images.next(10, 0.2) is None
     assert images.next(30, 0.3) is not None
+    # One that waits for its answer is not drawn without, so soon after the last.
+    images.add(40, blank(40))
+    assert images.next(30, 0.7) is None
+    late = images.next(30, 0.9)
+    assert late is not None
+    assert late[:2] == (40, False)
 
 
 def test_without_answers_the_newest_image_is_drawn_as_it_is() -> None:

@@ -226,8 +226,14 @@ _HANDS: dict[str, Callable[[Path, TrialProcesses, HoldWitness], _Hand]] = {
 
 
 def _parameters(seed: int) -> Parameters:
+    # A needle that rests after each step would be at rest at many losses.
     options = SimulateOptions(
-        level="tip", controller="paper", depth_mm=_DEPTH_MM, real_time_factor=1.0, seed=seed
+        level="tip",
+        controller="paper",
+        insertion="continuous",
+        depth_mm=_DEPTH_MM,
+        real_time_factor=1.0,
+        seed=seed,
     )
     parameters = without_recorder(options)
     del parameters["simulated_operator"]
