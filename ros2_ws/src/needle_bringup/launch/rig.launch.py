@@ -3,9 +3,9 @@
     ros2 launch needle_bringup rig.launch.py calibration:=FILE drives:=FILE bag:=DIR
 
 Starts tracker, controller and recorder, and the driver where `drives` names its configuration
-(docs/hardware.md). The cameras and the person's hold switch come from elsewhere: nothing in here
-moves a needle by itself. A file that is missing ends the launch before a node starts, and a node
-that ends ends the others.
+(docs/hardware.md). The cameras and the person's hold (`ros2 run needle_bringup operator`) come from
+elsewhere: nothing in here moves a needle by itself. A file that is missing ends the launch before a
+node starts, and a node that ends ends the others.
 """
 
 from launch import LaunchDescription

@@ -57,6 +57,9 @@ Publishes   ~/tip, ~/path, ~/markers (shaft, tip, estimate, 95 % ellipsoid, plan
             ~/left/compressed, ~/right/compressed (JPEG, shaft and tip drawn in); /tf, /tf_static
             where tf2_msgs is installed
 """
+# Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.
+_FARTHEST = 10.0
+_QUOTED = 40  # characters of a text that is not understood
 OUTPUTS: dict[str, type[Any]] = {
     "~/tip": PoseStamped,
     "~/path": PathMessage,
@@ -132,7 +135,7 @@ class LiveViewNode(WholeNode):
 
     def _on_joints(self, message: JointState) -> None:
         insertion = insertion_of(message)
-        if insertion is not None and np.isfinite(insertion):
+        if insertion is not None and _is_near(insertion):
             self._needle.take_insertion(insertion)
 
     def _on_tip(self, message: PoseWithCovarianceStamped) -> None:
@@ -140,24 +143,25 @@ class LiveViewNode(WholeNode):
         place, _, covariance = _parts(message)
         q = message.pose.pose.orientation
         quaternion = np.array([q.x, q.y, q.z, q.w])
-        if all(np.all(np.isfinite(part)) for part in (place, covariance, quaternion)):
+        if _is_near(place, covariance, quaternion):
             self._needle.take_tip(SeenTip(stamp_ns, place, quaternion, covariance))
         else:
             self._needle.take_no_tip(stamp_ns)
 
     def _on_estimate(self, message: PoseWithCovarianceStamped) -> None:
         place, rotation, covariance = _parts(message)
-        if rotation is None or not np.all(np.isfinite([*place, *covariance.flat])):
-            raise ValueError("the estimate is not finite, or has no orientation")
+        if rotation is None or not _is_near(place, covariance):
+            raise ValueError("no needle can be there, or it has no orientation")
         self._needle.take_belief(Belief(place, rotation, covariance))
 
     def _on_controller(self, message: DiagnosticStatus) -> None:
         values = values_of(message)
-        point = values.get("target_point_m", "")
-        self._needle.take_targets(
-            float(values["target_offset_m"]) if values.get("target_offset_m") else None,
-            np.array([float(part) for part in point.split(",")]) if point else None,
-        )
+        offset, point = values.get("target_offset_m", ""), values.get("target_point_m", "")
+        beside = float(offset) if offset else None
+        x_y_z = np.array([float(part) for part in point.split(",")]) if point else None
+        if not _is_near(beside or 0.0) or (x_y_z is not None and not _is_place(x_y_z)):
+            raise ValueError(f"no target is at {offset[:_QUOTED]!r} and {point[:_QUOTED]!r}")
+        self._needle.take_targets(beside, x_y_z)
 
     def _on_plane(self, message: PoseStamped) -> None:
         p, q = message.pose.position, message.pose.orientation
@@ -233,6 +237,15 @@ class LiveViewNode(WholeNode):
             shaft = self._cameras[side].project(self._needle.shaft)
         data = marked_image(image, shaft, f"{side}: {note}")
         self._outputs[topic].publish(live_messages.to_image(data, side, stamp_ns))
+
+
+def _is_near(*parts: Any) -> bool:
+    """Return whether all numbers are finite, and such that a needle of a rig may have."""
+    return all(bool(np.all(np.abs(part) <= _FARTHEST)) for part in parts)
+
+
+def _is_place(values: Any) -> bool:
+    return values.shape == (3,) and _is_near(values)
 
 
 def _parts(message: PoseWithCovarianceStamped) -> tuple[Any, Any, Any]:

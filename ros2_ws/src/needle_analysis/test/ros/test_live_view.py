@@ -151,7 +151,16 @@ def test_the_needle_is_shown_to_who_looks(scene: Scene) -> None:
     graph.say("needle/tip_pose", graph.pose("rig", np.inf, 6_000_000_000))
     scene.last("~/markers", lambda m: shown(m)["tip"].color.r == pytest.approx(0.7))
     graph.say("target_plane", PoseStamped())
-    graph.say("needle/estimate", graph.pose("target_plane", np.nan, 7_000_000_000))
+    for sigma in (np.nan, 1e150):
+        graph.say("needle/estimate", graph.pose("target_plane", sigma, 7_000_000_000))
+    graph.say("joint_states", JointState(name=["insertion_joint"], position=[1e300]))
+    for key, text in (
+        ("target_point_m", "0.1, 0.2"),
+        ("target_offset_m", "nan"),
+        ("target_offset_m", "far"),
+    ):
+        pair = KeyValue(key=key, value=text)
+        graph.say("needle/controller_status", DiagnosticStatus(values=[pair]))
     markers = graph.heard["~/markers"]
     count = len(markers)
     scene.until(lambda: len(markers) > count + 3)
