@@ -152,11 +152,13 @@ class Hold {
     on(window, "pagehide", release);
     on(document, "visibilitychange", release);
     on(document, "freeze", release);
-    // A long touch is a hold, no request for a menu.
-    for (const type of ["contextmenu", "dragstart"]) {
-      on(window, type, (event) => {
+    // A long touch is a hold, no request for a menu. And Chromium keeps messages of sockets back for
+    // 100 ms after a touch that it may still have to scroll by: the hold would be lost each time.
+    for (const type of ["touchstart", "contextmenu", "dragstart"]) {
+      const mine = (event) => {
         if (buttonOf(event.target)) event.preventDefault();
-      });
+      };
+      window.addEventListener(type, mine, { capture: true, passive: false });
     }
   }
 
