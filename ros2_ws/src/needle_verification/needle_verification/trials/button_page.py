@@ -44,8 +44,8 @@ _PAGE = """<!doctype html>
 @contextlib.contextmanager
 def serving_button(
     on_state: Callable[[HoldState], None], on_notice: Callable[[str], None]
-) -> Iterator[dict[str, int]]:
-    """Serve it; yields the ports of `page` and `hold`.
+) -> Iterator[tuple[int, HoldServer]]:
+    """Serve it; yields the page's port, and the hold's server.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def serving_button(
         hold = HoldServer(Access(_ADDRESS, pages.server_port, TOKEN), 0, on_state, on_notice)
         hold.start()
         try:
-            yield {"page": pages.server_port, "hold": hold.port}
+            yield pages.server_port, hold
         finally:
             hold.close()
             pages.shutdown()

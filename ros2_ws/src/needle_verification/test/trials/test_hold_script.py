@@ -28,9 +28,10 @@ _STATE = "document.documentElement.dataset.holdState"
 class Scene:
     """The page in a browser, and what the server hands on."""
 
-    def __init__(self, tab: Tab, states: list[HoldState]) -> None:
+    def __init__(self, tab: Tab, states: list[HoldState], counts: Callable[[], dict[str, int]]):
         self.tab = tab
         self.states = states
+        self._counts = counts
 
     def until(self, condition: Callable[[], object], what: str) -> None:
         deadline = time.monotonic() + PATIENCE
@@ -56,6 +57,18 @@ class Scene:
             press()
             self.let_pass(15)
             if self.states[-1].pressed:
+                return
+
+    def ends(self, hold: Callable[[], None], act: Callable[[], object]) -> None:
+        """See a hold end by an act: one that a busy machine has lost meanwhile is held again."""
+        deadline = time.monotonic() + PATIENCE
+        while True:
+            assert time.monotonic() < deadline, "holds end by themselves alone"
+            hold()
+            lost = self._counts().get("hold lost", 0)
+            act()
+            self.until_released()
+            if self._counts().get("hold lost", 0) == lost:
                 return
 
     def never_pressed(self, press: Callable[[], None]) -> bool:
@@ -84,58 +97,47 @@ class Scene:
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
     folder: Path = tmp_path_factory.mktemp("browser")
     states: list[HoldState] = []
-    with serving_button(states.append, lambda _: None) as ports:
+    with serving_button(states.append, lambda _: None) as (page_port, hold):
         browser = Chromium(folder / "profile")
         try:
-            tab = browser.open(f"http://127.0.0.1:{ports['page']}/?port={ports['hold']}")
-            yield Scene(tab, states)
+            tab = browser.open(f"http://127.0.0.1:{page_port}/?port={hold.port}")
+            yield Scene(tab, states, hold.counts)
         finally:
             browser.close()
 
 
 def test_mouse_space_bar_and_finger_hold_until_they_are_let_go(scene: Scene) -> None:
+    tab = scene.tab
+    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
+    scene.ends(scene.hold_space, tab.release_space)
+    scene.ends(scene.hold_touch, tab.touch)
+
+
+def test_the_speed_is_what_was_set_last_and_is_one(scene: Scene) -> None:
     scene.hold_pointer()
     assert scene.states[-1].speed == 1.0
     scene.tab.run("needleHold.setSpeed(0.25); needleHold.setSpeed(NaN); needleHold.setSpeed(2)")
-    scene.until(lambda: scene.states[-1].speed in (0.25, 0.0), "the speed changes")
+    scene.hold_pointer()
+    assert scene.states[-1].speed == 0.25
     scene.tab.run("needleHold.setSpeed(1)")
     scene.tab.release_pointer(*BUTTON)
-    scene.until_released()
-    scene.hold_space()
-    scene.tab.press_space(repeat=True)
-    scene.tab.release_space()
-    scene.until_released()
-    scene.hold_touch()
-    scene.tab.touch()
     scene.until_released()
 
 
 def test_a_second_finger_or_button_or_key_ends_a_hold(scene: Scene) -> None:
-    scene.hold_touch()
-    scene.tab.touch(BUTTON, ELSEWHERE)
-    scene.until_released()
-    scene.tab.touch()
-    scene.hold_touch()
-    scene.tab.cancel_touch()
-    scene.until_released()
-    scene.hold_pointer()
-    scene.tab.press_other_button(*BUTTON)
-    scene.until_released()
-    scene.hold_space()
-    scene.tab.press_key("Escape")
-    scene.until_released()
+    tab = scene.tab
+    scene.ends(scene.hold_touch, lambda: tab.touch(BUTTON, ELSEWHERE))
+    tab.touch()
+    scene.ends(scene.hold_touch, tab.cancel_touch)
+    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
+    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
 
 
 def test_a_button_that_goes_ends_its_hold(scene: Scene) -> None:
-    scene.hold_pointer()
-    scene.tab.run(
-        "const old = document.querySelector('[data-hold]'); old.replaceWith(old.cloneNode(true))"
-    )
-    scene.until_released()
+    anew = "for (const old of document.querySelectorAll('button')) old.outerHTML = old.outerHTML"
+    scene.ends(scene.hold_pointer, lambda: scene.tab.run(anew))
     # What takes its place is a button like it.
-    scene.hold_pointer()
-    scene.tab.release_pointer(*BUTTON)
-    scene.until_released()
+    scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
 
 
 def test_what_is_no_press_does_not_hold(scene: Scene) -> None:

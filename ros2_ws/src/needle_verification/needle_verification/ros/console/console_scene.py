@@ -45,7 +45,7 @@ class Scene:
     rng : random.Random
         Of moments and ways to press.
     by : str
-        What was pressed last: pointer or space.
+        What was pressed last: pointer, touch or space.
     """
 
     def __init__(self, folder: Path, domain: int) -> None:
@@ -99,9 +99,11 @@ class Scene:
         for tries in range(_TRIES):
             self.release()
             self.wait_for_page(self.tab)
-            self.by = self.rng.choice(("pointer", "space"))
+            self.by = self.rng.choice(("pointer", "touch", "space"))
             if self.by == "pointer":
                 self.tab.press_pointer(*BUTTON)
+            elif self.by == "touch":
+                self.tab.touch(BUTTON)
             else:
                 self.tab.press_space()
             if self._moves(seconds):
@@ -127,6 +129,8 @@ class Scene:
         """Let go, and wait for nothing."""
         if self.by == "pointer":
             self.tab.release_pointer(*BUTTON)
+        elif self.by == "touch":
+            self.tab.touch()
         else:
             self.tab.release_space()
 

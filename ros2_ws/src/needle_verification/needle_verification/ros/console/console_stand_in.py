@@ -26,8 +26,8 @@ def main() -> int:
     def publish(state: HoldState) -> None:
         topic.publish(pressed=state.pressed, speed=state.speed)
 
-    with serving_button(publish, node.get_logger().warning) as ports:
-        print(json.dumps(ports), flush=True)
+    with serving_button(publish, node.get_logger().warning) as (page_port, hold):
+        print(json.dumps({"page": page_port, "hold": hold.port}), flush=True)
         sys.stdin.read()
     node.destroy_node()
     rclpy.try_shutdown()
