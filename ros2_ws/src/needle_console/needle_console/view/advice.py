@@ -1,0 +1,192 @@
+"""What to do next, in words, and which buttons make sense."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import math
+
+from needle_console.view.rig_state import ControllerState, DeviceState
+from needle_console.view.snapshot import Snapshot
+
+# As near to the home position the needle counts as out [m].
+_OUT = 1e-4
+STEERING = ("STEERING", "WAITING_FOR_TIP")
+"""States of a controller that steers."""
+
+
+class Button(enum.Enum):
+    """What a person can press; the value is what stands on it."""
+
+    CONFIRM = "Confirm needle out"
+    HOME = "Home"
+    ENABLE = "Enable"
+    START = "Start steering"
+    INSERT = "Hold to insert"
+    RETRACT = "Hold to retract"
+    RESET = "Reset"
+    SWITCH_OFF = "Switch off"
+
+
+@dataclasses.dataclass(frozen=True)
+class Advice:
+    """One sentence for the person, and the button that it is about.
+
+    Attributes
+    ----------
+    headline : str
+        What is the case.
+    text : str
+        What to do next.
+    button : Button or None
+        The one to press; None: none, or it is no button's matter.
+    """
+
+    headline: str
+    text: str
+    button: Button | None = None
+
+
+def advise(snapshot: Snapshot, name: str) -> Advice:
+    """Return what to do next.
+
+    Parameters
+    ----------
+    snapshot : Snapshot
+        The rig.
+    name : str
+        Whose hold the console's is.
+    """
+    device = snapshot.device
+    if device is None:
+        return Advice("No device", "Start device_driver, or sim_rig for a simulated needle.")
+    if device.state == "MOVING":
+        return _moving(device)
+    if device.state in ("DISABLED", "HOLDING") and math.isnan(snapshot.insertion):
+        what = "Its joints are not heard: nodes are starting, or gone."
+        return Advice("Waiting for the rig", what)
+    steers = snapshot.controller is not None and snapshot.controller.state in STEERING
+    if device.state == "HOLDING" and steers and device.press_again == name:
+        return Advice("The press does not count", "Let go, then press and hold again.")
+    ways = {
+        "UNCONFIGURED": _unconfigured,
+        "ESTOPPED": _estopped,
+        "FAULT": _fault,
+        "DISABLED": _disabled,
+        "HOLDING": _holding,
+    }
+    way = ways.get(device.state)
+    if way is None:
+        return Advice(f"Device: {device.state}", "This state is not known here.")
+    return way(snapshot, device)
+
+
+def sensible(snapshot: Snapshot) -> frozenset[Button]:
+    """Return the buttons that can do something in the present state; *Stop* always can."""
+    device, controller = snapshot.device, snapshot.controller
+    if device is None:
+        return frozenset()
+    if device.state == "DISABLED" and math.isnan(snapshot.insertion):
+        return frozenset({Button.RESET})
+    steering = controller is not None and controller.state in STEERING
+    found = {
+        "DISABLED": {Button.CONFIRM, Button.ENABLE, Button.RESET},
+        "HOLDING": {Button.CONFIRM, Button.RETRACT, Button.SWITCH_OFF, Button.RESET},
+        "MOVING": {Button.INSERT, Button.RETRACT, Button.SWITCH_OFF},
+        "FAULT": {Button.RESET},
+        "ESTOPPED": {Button.RESET},
+    }.get(device.state, set())
+    if device.state == "DISABLED" and device.needle_out_confirmed:
+        found.add(Button.HOME)
+    if device.state == "HOLDING" and steering:
+        found.add(Button.INSERT)
+    elif device.state == "HOLDING" and device.homed and controller is not None:
+        found.add(Button.START)
+    return frozenset(found)
+
+
+def _unconfigured(_: Snapshot, device: DeviceState) -> Advice:
+    return Advice("The drives are not set up", device.trouble or "Configure device_driver.")
+
+
+def _estopped(_: Snapshot, device: DeviceState) -> Advice:
+    return Advice(
+        "Emergency stop",
+        "Find out why. Release the emergency stop and every hold, then press Reset.",
+        Button.RESET,
+    )
+
+
+def _fault(_: Snapshot, device: DeviceState) -> Advice:
+    return Advice(
+        f"Fault: {device.trouble or 'no reason given'}",
+        "Put right what it says, let go of every hold, then press Reset.",
+        Button.RESET,
+    )
+
+
+def _moving(device: DeviceState) -> Advice:
+    if device.activity == "homing":
+        return Advice("Homing", "The axes look for their switches. Keep clear; Stop ends it.")
+    what = "goes in" if device.activity == "step" else "is drawn out"
+    return Advice(f"The needle {what}", "Let go to stop it.")
+
+
+def _disabled(_: Snapshot, device: DeviceState) -> Advice:
+    if device.homed:
+        return Advice("Ready, switched off", "Switching on moves nothing.", Button.ENABLE)
+    if not device.needle_out_confirmed:
+        return Advice(
+            "Not homed",
+            "Look: is the needle out of the tissue? Then confirm it. If it is in: Enable, and "
+            "Hold to retract.",
+            Button.CONFIRM,
+        )
+    return Advice("Not homed", "Homing moves and turns the needle without a hold.", Button.HOME)
+
+
+def _holding(snapshot: Snapshot, device: DeviceState) -> Advice:
+    controller = snapshot.controller
+    if not device.homed:
+        return Advice(
+            "Not homed, switched on",
+            "Only the way out is open. When the needle is out: Switch off, confirm, Home.",
+            Button.RETRACT,
+        )
+    if controller is None:
+        return Advice("No controller", "Start plane_controller.")
+    if controller.state in STEERING:
+        return _steering(snapshot, controller, device)
+    return _not_steering(controller, is_in=snapshot.insertion > _OUT)
+
+
+def _not_steering(controller: ControllerState, *, is_in: bool) -> Advice:
+    if controller.state == "DONE":
+        return Advice("The depth is reached", "Draw the needle out at last.", Button.RETRACT)
+    if controller.state == "FAULT":
+        headline = f"Steering failed: {controller.reason}"
+        if is_in:
+            return Advice(headline, "Draw the needle out, then start again.", Button.RETRACT)
+        return Advice(headline, "Start again.", Button.START)
+    if is_in:
+        return Advice(
+            "The needle is in, not steered",
+            "Steering begins outside the tissue: draw the needle out first.",
+            Button.RETRACT,
+        )
+    return Advice("Ready to steer", "Starting moves nothing yet.", Button.START)
+
+
+def _steering(snapshot: Snapshot, controller: ControllerState, device: DeviceState) -> Advice:
+    if controller.state == "WAITING_FOR_TIP":
+        return Advice(
+            f"The tip is not seen: {controller.reason or 'no reason given'}",
+            "Steering waits. Look at the images; Hold to retract is possible.",
+        )
+    if device.hold_owner:
+        return Advice(f"Held by {device.hold_owner}", "The next step is being worked out.")
+    return Advice(
+        "Steering waits for you",
+        "Press and hold to insert (or the space bar); let go to stop.",
+        Button.INSERT,
+    )

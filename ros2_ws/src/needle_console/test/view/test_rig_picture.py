@@ -1,0 +1,123 @@
+"""What is heard becomes snapshots; what is old or makes no sense does not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from needle_console.view.readings import readings
+from needle_console.view.rig_picture import RigPicture
+from needle_console.view.rig_state import controller_state, device_state
+from needle_console.view.snapshot import Snapshot
+
+COVARIANCE = np.diag([1e-8, 4e-8, 9e-8])
+
+
+def seen(*depths: float) -> RigPicture:
+    picture = RigPicture()
+    picture.see_controller({"state": "STEERING", "starts": "1", "target_offset_m": "0.003"})
+    for depth in depths:
+        picture.see_joints(depth, 0.1, now=0.0)
+        picture.see_estimate(np.array([-0.003 + depth / 50, 0.0, depth]), COVARIANCE)
+    return picture
+
+
+def test_joints_that_fall_silent_are_not_shown_as_if_they_were_there() -> None:
+    picture = seen(0.01)
+    assert picture.snapshot(0.9).insertion == 0.01
+    assert math.isnan(picture.snapshot(1.1).insertion)
+    assert readings(picture.snapshot(1.1))["Depth"] == "\N{EN DASH}"
+
+
+def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
+    (point,) = seen(0.05).snapshot(0.0).course
+    assert point.r1 == pytest.approx(-0.002)
+    assert point.position == pytest.approx([0.001, 0.0, 0.05])
+    assert point.sigma == pytest.approx(1e-4)
+
+
+def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
+    picture = seen(0.01)
+    tilted = np.eye(4)
+    tilted[:3, 0], tilted[:3, 2] = (0.8, 0.0, -0.6), (0.6, 0.0, 0.8)
+    tilted[:3, 3] = tilted[:3, 0] * 0.009
+    picture.see_plane(tilted)
+    assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
+    picture.see_controller({"state": "STEERING", "starts": "1", "target_offset_m": "0.009"})
+    assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
+
+
+def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
+    picture = seen(0.010, 0.011, 0.0111, 0.012)
+    assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0111, 0.012]
+    picture.see_joints(0.0105, 0.1, now=0.0)
+    assert len(picture.snapshot(0.0).shaft) == 2
+    picture.see_estimate(np.array([0.0, 0.0, 0.0105]), COVARIANCE)
+    assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0105]
+    picture.see_controller({"state": "STEERING", "starts": "2"})
+    assert picture.snapshot(0.0).course == ()
+
+
+def test_a_tip_that_is_lost_says_for_how_long() -> None:
+    picture = seen(0.01)
+    picture.see_tip(np.array([0.0, 0.0, 0.01]), COVARIANCE, now=1.0)
+    assert picture.snapshot(1.5).tip_lost_for == 0.0
+    for now in (2.0, 3.0):
+        picture.see_tip(np.zeros(3), np.full((3, 3), np.inf), now=now)
+    assert picture.snapshot(4.5).tip_lost_for == pytest.approx(2.5)
+    assert readings(picture.snapshot(4.5))["Tip"] == "not found for 2.5 s"
+
+
+def test_numbers_that_are_none_change_nothing() -> None:
+    picture = seen(0.01)
+    before = picture.snapshot(0.5)
+    picture.see_joints(math.nan, 0.0, now=0.5)
+    picture.see_estimate(np.array([math.inf, 0.0, 0.0]), COVARIANCE)
+    picture.see_plane(np.full((4, 4), math.nan))
+    after = picture.snapshot(0.5)
+    assert after.insertion == before.insertion
+    assert len(after.course) == len(before.course)
+    assert np.isfinite(after.T_rig_plane).all()
+
+
+def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
+    picture = RigPicture()
+    picture.see_health("a: x", bad=True, message="broken\x07", now=0.0)
+    picture.see_health("b: y", bad=True, message="late", now=0.0)
+    assert picture.snapshot(0.1).troubles == ("a: x: broken?", "b: y: late")
+    picture.see_health("b: y", bad=False, message="ok", now=0.2)
+    assert picture.snapshot(0.3).troubles == ("a: x: broken?",)
+    assert picture.snapshot(9.0).troubles == ()
+
+
+def test_statuses_that_say_nothing_sensible_become_states_without_numbers() -> None:
+    controller = controller_state({"state": "IDLE", "depth_m": "nan", "target_point_m": "1, x, 3"})
+    assert math.isnan(controller.depth)
+    assert controller.target_point is None
+    assert controller.reachable is None
+    assert device_state({"simulated": "yes"}).simulated is False
+    assert set(readings(Snapshot(device_state({}), controller)).values()) == {"\N{EN DASH}"}
+
+
+def test_readings_are_in_mm_and_degrees() -> None:
+    picture = seen(0.05)
+    picture.see_controller(
+        {
+            "state": "STEERING",
+            "starts": "1",
+            "depth_m": "0.12",
+            "target_offset_m": "0.003",
+            "r1_low_m": "-0.0025",
+            "r1_high_m": "-0.0015",
+            "reachable": "true",
+            "reachable_depth_m": "0.043",
+        }
+    )
+    minus = "\N{MINUS SIGN}"
+    told = readings(picture.snapshot(0.0))
+    assert told["Depth"] == "50.0 mm of 120 mm"
+    assert told["Off the plane"] == f"{minus}2.00 mm (95 %: {minus}2.50 to {minus}1.50)"
+    assert told["Turn of the base"].startswith("5.7")
+    assert told["Reach"] == "the plane can be reached, from 43 mm on"
