@@ -2,14 +2,16 @@
 
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
-numpy that apt's message packages were compiled against). Only files that Linux x86-64 with CPython
-3.10-3.13 can install are hashed; no address of an index goes into a lock. Needs Python 3.11 or
-newer with `packaging` (as in `.venv`), and `uv`.
+numpy that apt's message packages were compiled against), `requirements-console.lock` and
+`requirements-console-test.lock` (what the web console and its tests need beside either of them).
+Only files that Linux x86-64 with CPython 3.10-3.13 can install are hashed; no address of an index
+goes into a lock. Needs Python 3.11 or newer with `packaging` (as in `.venv`), and `uv`.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -104,14 +106,38 @@ def write(
     print(f"{name}: {len(packages)} packages")
 
 
-def main() -> int:
-    """Renew both lock files."""
-    wanted = [
+def wanted_of(*names: str) -> list[str]:
+    """Return the requirements that files name."""
+    return [
         line
-        for name in ("requirements.in", "requirements-dev.in")
+        for name in names
         for line in (ROOT / name).read_text("utf-8").splitlines()
         if line and not line.startswith("#")
     ]
+
+
+def pins_of(lock: str) -> list[str]:
+    """Return a lock's requirements without their hashes."""
+    lines = (ROOT / lock).read_text("utf-8").splitlines()
+    return [line.removesuffix(" \\") for line in lines if re.match(r"[\w.-]+==", line)]
+
+
+def write_extra(name: str, *below: str) -> None:
+    """Write the lock of an extra: what it needs beside the locks below it, as they pin it."""
+    with tempfile.TemporaryDirectory() as folder:
+        pins = Path(folder, "constraints.txt")
+        pins.write_text("\n".join(line for lock in below for line in pins_of(lock)) + "\n")
+        packages = resolve(
+            wanted_of(f"requirements-{name}.in"), "--python-version", "3.10", "-c", str(pins)
+        )
+    there = {line.partition("==")[0] for lock in below for line in pins_of(lock)}
+    packages = [package for package in packages if package["name"] not in there]
+    write(f"requirements-{name}.lock", "Beside requirements.lock.", packages, PYTHONS)
+
+
+def main() -> int:
+    """Renew the lock files."""
+    wanted = wanted_of("requirements.in", "requirements-dev.in")
     write(
         "requirements.lock",
         "Linux x86-64, CPython 3.10-3.13.",
@@ -125,6 +151,8 @@ def main() -> int:
         resolve(without_ros, "--python-version", "3.12"),
         ("312",),
     )
+    write_extra("console", "requirements.lock")
+    write_extra("console-test", "requirements.lock", "requirements-console.lock")
     return 0
 
 
