@@ -26,6 +26,7 @@ ROSDEP_KEYS = {
 FROM_THE_LOCK_ALONE = {
     "canopen",
     "drjit",
+    "fastapi",
     "lz4",
     "mcap",
     "mitsuba",

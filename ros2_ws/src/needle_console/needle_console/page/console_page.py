@@ -1,0 +1,86 @@
+"""One browser's page: laid out once, then told what has changed."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+from nicegui import ui
+
+from needle_console.page.controls import Controls
+from needle_console.page.desk import Desk
+from needle_console.page.needle_scene import NeedleScene
+from needle_console.page.r1_chart import R1Chart
+from needle_console.page.status_bar import StatusBar
+from needle_console.view.camera_feed import SIDES
+
+_TEXT_PERIOD, _DRAWING_PERIOD = 0.2, 0.5
+_HEAD = """
+<link rel="stylesheet" href="/static/console.css">
+<script type="module">
+  import { startPage } from "/static/page.js";
+  startPage(OPTIONS);
+</script>
+"""
+
+
+@dataclasses.dataclass(frozen=True)
+class HoldLink:
+    """Where a page's hold connects to.
+
+    Attributes
+    ----------
+    port : int
+        Of the hold's own server, on the host that the page came from.
+    token : str
+        For its first message; empty on loopback. Only who has given it gets a page.
+    """
+
+    port: int
+    token: str
+
+
+class ConsolePage:
+    """Builds the page of the client that NiceGUI serves at the moment.
+
+    Parameters
+    ----------
+    desk : Desk
+        The rig.
+    hold : HoldLink
+        Where the hold goes.
+    """
+
+    def __init__(self, desk: Desk, hold: HoldLink) -> None:
+        self._desk = desk
+        options = json.dumps({"port": hold.port, "token": hold.token, "speed": Controls.SPEED})
+        # A script must not end where a text in it says so.
+        ui.add_head_html(_HEAD.replace("OPTIONS", options.replace("<", "\\u003c")))
+        ui.dark_mode(None)
+        with ui.element("main").classes("console"):
+            # First in the order of the keyboard; the style sheet says where they stand.
+            self._controls = Controls(desk)
+            self._status = StatusBar()
+            for side in SIDES:
+                with ui.element("figure").classes(f"tile view-{side}"):
+                    ui.html(
+                        f'<img data-view="{side}" alt="{side} camera, tip and shaft drawn in">'
+                        f"<figcaption>{side} camera</figcaption>",
+                        sanitize=False,
+                    )
+            self._scene = NeedleScene()
+            self._chart = R1Chart()
+        self._refresh_text()
+        self._refresh_drawings()
+        ui.timer(_TEXT_PERIOD, self._refresh_text)
+        ui.timer(_DRAWING_PERIOD, self._refresh_drawings)
+
+    def _refresh_text(self) -> None:
+        snapshot = self._desk.snapshot()
+        self._controls.show(snapshot)
+        self._status.show(snapshot)
+
+    def _refresh_drawings(self) -> None:
+        snapshot = self._desk.snapshot()
+        self._scene.show(snapshot)
+        self._chart.show(snapshot)

@@ -1,0 +1,141 @@
+"""What a person can do: buttons, hold, speed, stop, targets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from nicegui import events, ui
+
+from needle_common.errors import UserError
+from needle_console.page.desk import Desk
+from needle_console.view.advice import Button, advise, sensible
+from needle_console.view.snapshot import Snapshot
+from needle_console.view.targets import plane_pose, target_point
+
+_STEPS = (Button.CONFIRM, Button.HOME, Button.ENABLE, Button.START)
+_OTHERS = (Button.RESET, Button.SWITCH_OFF)
+_HOLDS = {Button.INSERT: "insert", Button.RETRACT: "retract"}
+_LET_GO = "() => window.needleHold && window.needleHold.release()"
+_SET_SPEED = "(value) => window.needleHold && window.needleHold.setSpeed(value / 100)"
+
+
+class Controls:
+    """The column of controls.
+
+    Parameters
+    ----------
+    desk : Desk
+        What they act on.
+    """
+
+    SPEED = 0.5
+    """Share of the nominal speed that a new page begins with."""
+
+    def __init__(self, desk: Desk) -> None:
+        self._desk = desk
+        self._other_steers = False
+        self._buttons: dict[Button, Any] = {}
+        with ui.element("section").classes("controls").props('aria-label="Controls"'):
+            with ui.element("div").classes("advice").props('role="status" aria-live="polite"'):
+                self._headline = ui.label().classes("headline")
+                self._text = ui.label()
+            with ui.element("div").classes("pairs"):
+                for button in _STEPS:
+                    self._add_button(button)
+            self._build_hold(desk)
+            with ui.element("div").classes("pairs"):
+                for button in _OTHERS:
+                    self._add_button(button)
+            self._answer = ui.label().classes("answer").props('role="status"')
+            self._build_targets()
+        ui.on("hold_owner", self._on_owner)
+
+    def show(self, snapshot: Snapshot) -> None:
+        """Show what to do next, and which buttons make sense."""
+        advice = advise(snapshot, self._desk.name)
+        self._headline.set_text(advice.headline)
+        self._text.set_text(advice.text)
+        self._answer.set_text(snapshot.answer)
+        possible = sensible(snapshot)
+        for button, element in self._buttons.items():
+            usable = button in possible and not self._other_steers
+            if button not in _HOLDS:
+                element.set_enabled(usable)
+            # What is held must stay what it is until it is let go: no hold is ever disabled.
+            _mark(element, "dim", not usable)
+            _mark(element, "next", button is advice.button and usable)
+
+    def _build_hold(self, desk: Desk) -> None:
+        for button, mode in _HOLDS.items():
+            hold = ui.element("button").props(f'type="button" data-hold="{mode}"')
+            hold.classes(f"hold {mode}")
+            with hold:
+                ui.label(button.value)
+                if button is Button.INSERT:
+                    # hold.js' words, written by page.js.
+                    ui.element("div").props('id="hold-words"')
+            self._buttons[button] = hold
+        # Grey, and no more than its name: it is no emergency stop (docs/safety.md).
+        stop = ui.button("Stop", color="grey-7", on_click=desk.stop)
+        stop.props('id="stop" no-caps unelevated').classes("stop")
+        stop.on("click", js_handler=_LET_GO)
+        with ui.element("div").classes("speed"):
+            ui.label("Speed")
+            slider = ui.slider(min=5, max=100, step=5, value=self.SPEED * 100)
+            slider.props('aria-label="Speed in percent" label label-value="" dense')
+            slider.on("update:model-value", js_handler=_SET_SPEED)
+            ui.label().bind_text_from(slider, "value", lambda value: f"{value:.0f} %")
+
+    def _build_targets(self) -> None:
+        with ui.element("div").classes("targets"):
+            offset = _number("Plane offset [mm]", 3.0)
+            tilt = _number("Tilt [deg]", 0.0)
+            self._add_target(
+                "Set plane", lambda: self._desk.send_plane(plane_pose(_of(offset), _of(tilt)))
+            )
+        with ui.element("div").classes("targets point"):
+            x, y = _number("Point x [mm]", 10.0), _number("y [mm]", -5.0)
+            z = _number("z [mm]", 100.0)
+            self._add_target(
+                "Set point", lambda: self._desk.send_point(target_point(_of(x), _of(y), _of(z)))
+            )
+
+    def _add_button(self, button: Button) -> None:
+        element = ui.button(button.value, color=None, on_click=lambda: self._press(button))
+        self._buttons[button] = element.props("no-caps unelevated")
+
+    def _add_target(self, name: str, send: Callable[[], None]) -> None:
+        def set_target() -> None:
+            if self._other_steers:
+                ui.notify("Another page steers.")
+                return
+            try:
+                send()
+            except UserError as error:
+                ui.notify(str(error))
+
+        ui.button(name, color=None, on_click=set_target).props("no-caps unelevated")
+
+    def _press(self, button: Button) -> None:
+        if not self._other_steers:
+            self._desk.press(button)
+
+    def _on_owner(self, event: events.GenericEventArguments) -> None:
+        self._other_steers = event.args == "other"
+
+
+def _number(label: str, value: float) -> ui.number:
+    return ui.number(label, value=value, step=0.5).props("dense outlined").classes("number")
+
+
+def _of(field: ui.number) -> float:
+    """Return what was typed; nothing is no number."""
+    if field.value is None:
+        raise UserError("a number is missing")
+    return float(field.value)
+
+
+def _mark(element: Any, name: str, there: bool) -> None:
+    if there != (name in element.classes):
+        element.classes(add=name) if there else element.classes(remove=name)

@@ -1,0 +1,96 @@
+"""Serves the page in a thread and loop of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import threading
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI, Response
+from nicegui import app, ui
+
+from needle_common.errors import UserError
+from needle_console.access.access import Access
+from needle_console.page.console_page import ConsolePage, HoldLink
+from needle_console.page.desk import Desk
+from needle_console.page.gate import Gate
+from needle_console.view.camera_feed import SIDES
+
+STATIC = Path(__file__).resolve().parents[1] / "static"
+_JOIN = 1.0
+
+
+class WebServer:
+    """The page's server; one a process, for NiceGUI is one.
+
+    Parameters
+    ----------
+    desk : Desk
+        What the pages show and do.
+    access : Access
+        Who may open one.
+    address : str
+        Where to listen.
+    port : int
+        0 takes any that is free.
+    hold : HoldLink
+        Where the page's hold connects to.
+
+    Raises
+    ------
+    UserError
+        The port is taken, or the address is none of this machine's.
+    """
+
+    def __init__(
+        self, desk: Desk, access: Access, *, address: str, port: int, hold: HoldLink
+    ) -> None:
+        self._socket = _listen(address, port)
+        self.port = int(self._socket.getsockname()[1])
+        server = FastAPI(docs_url=None, redoc_url=None, openapi_url=None)
+
+        def picture(side: str) -> Response:
+            data = desk.picture(side) if side in SIDES else None
+            if data is None:
+                return Response(status_code=204)
+            return Response(data, media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+        server.get("/view/{side}.jpg")(picture)
+        app.add_static_files("/static", str(STATIC), max_cache_age=0)
+        ui.page("/", title="Needle console")(lambda: ConsolePage(desk, hold))
+        ui.run_with(server, dark=None, show_welcome_message=False, reconnect_timeout=3.0)
+        server.add_middleware(Gate, access=access)
+        self._server = uvicorn.Server(
+            uvicorn.Config(server, log_level="warning", access_log=False, log_config=None)
+        )
+        self._thread = threading.Thread(target=self._run, name="page", daemon=True)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End; pages that are open see that nobody answers."""
+        self._server.should_exit = self._server.force_exit = True
+        if self._thread.is_alive():
+            self._thread.join(_JOIN)
+        with contextlib.suppress(OSError):
+            self._socket.close()
+
+    def _run(self) -> None:
+        self._server.run(sockets=[self._socket])
+
+
+def _listen(address: str, port: int) -> socket.socket:
+    family: Any = socket.AF_INET6 if ":" in address else socket.AF_INET
+    listening = socket.socket(family, socket.SOCK_STREAM)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((address, port))
+    except OSError as error:
+        listening.close()
+        raise UserError(f"cannot listen on {address}:{port}: {error.strerror}") from error
+    return listening

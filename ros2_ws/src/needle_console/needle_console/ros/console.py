@@ -1,0 +1,43 @@
+"""console: the rig in a browser, and a hold to steer it by."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+
+from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_common.process.end_request import EndRequest
+from needle_common.ros.base_node import LOOK_PERIOD, executor_of, run_node
+from needle_console.ros.console_parameters import ConsoleParameters
+
+HELP = """\
+console: serves a page that shows what the rig sees and believes, with a hold to steer it by.
+
+Publishes   device/hold (always; pressed only while a person holds), target_plane, target_point
+Subscribes  device/status, needle/controller_status, joint_states, needle/tip_pose, needle/estimate,
+            target_plane, /diagnostics, and while a page is open stereo/{left,right}/image_raw
+Calls       device/{confirm_needle_out,home,enable,stop,retract,reset},
+            plane_controller/{start,stop}
+"""
+
+
+def main() -> int:
+    """Run the console; returns its exit code."""
+    if importlib.util.find_spec("nicegui") is None:
+        print("error: NiceGUI is not installed; scripts/console installs it", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    # What cannot be imported without NiceGUI is imported where it is there.
+    from needle_console.ros.console_node import ConsoleNode  # noqa: PLC0415
+
+    def spin(node: ConsoleNode, end: EndRequest) -> int:
+        with executor_of(node) as executor:
+            while not end.wanted:
+                executor.spin_once(timeout_sec=LOOK_PERIOD)
+            node.close()
+        return EXIT_DONE
+
+    return run_node(ConsoleNode, help_text=HELP, parameters=ConsoleParameters, spin=spin)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
