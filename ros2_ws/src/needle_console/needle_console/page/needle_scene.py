@@ -34,7 +34,7 @@ class NeedleScene:
         self._cloud: Any = None
         self._told: dict[str, tuple[float, ...]] = {}
         with ui.element("figure").classes("tile space"):
-            self._scene = ui.scene(grid=False, background_color="#cfd6de", fps=10)
+            self._scene = ui.scene(grid=False, background_color="#b4bdc8", fps=10)
             self._scene.classes("drawing").props(
                 'role="img" aria-label="The needle in space with its target and uncertainty"'
             )

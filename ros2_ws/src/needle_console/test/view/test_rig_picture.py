@@ -11,6 +11,7 @@ from needle_console.view.readings import readings
 from needle_console.view.rig_picture import RigPicture
 from needle_console.view.rig_state import controller_state, device_state
 from needle_console.view.snapshot import Snapshot
+from needle_console.view.targets import plane_pose
 
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8])
 
@@ -38,11 +39,22 @@ def test_estimates_are_placed_in_rig_by_the_plane_in_force() -> None:
     assert point.sigma == pytest.approx(1e-4)
 
 
+def test_estimates_in_a_tilted_plane_are_turned_into_rig() -> None:
+    picture = seen()
+    picture.see_plane(plane_pose(3.0, 30.0))
+    picture.see_joints(0.05, 0.1, now=0.0)
+    # On the plane, 50 mm along it.
+    picture.see_estimate(np.array([0.0, 0.0, 0.05]), np.diag([0.0, 0.0, 1e-6]))
+    (point,) = picture.snapshot(0.0).course
+    along = np.array([0.5, 0.0, math.sqrt(0.75)])
+    normal = np.array([math.sqrt(0.75), 0.0, -0.5])
+    assert point.position == pytest.approx(0.003 * normal + 0.05 * along)
+    assert point.covariance == pytest.approx(1e-6 * np.outer(along, along))
+
+
 def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     picture = seen(0.01)
-    tilted = np.eye(4)
-    tilted[:3, 0], tilted[:3, 2] = (0.8, 0.0, -0.6), (0.6, 0.0, 0.8)
-    tilted[:3, 3] = tilted[:3, 0] * 0.009
+    tilted = plane_pose(9.0, 36.0)
     picture.see_plane(tilted)
     assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
     picture.see_controller({"state": "STEERING", "starts": "1", "target_offset_m": "0.009"})
