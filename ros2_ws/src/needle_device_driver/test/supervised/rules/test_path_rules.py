@@ -324,8 +324,9 @@ def test_max_rotation_rate_pushed_too_fast_is_said_at_once_and_no_longer_when_it
     assert "pushed too fast: the rotation is 0.44 rad behind" in bench.status.reason
     assert bench.last_rule is Rule.MAX_ROTATION_RATE
     bench.cycle(10, holding=True)
-    assert bench.status.rotation_owed == 0.0
-    assert bench.positions == (pytest.approx(1.5e-3), pytest.approx(0.5))
+    after = bench.status
+    assert after.rotation_owed == 0.0
+    assert bench.positions == pytest.approx((1.5e-3, 0.5))
     assert len([notice for notice in bench.notices if "pushed too fast" in notice.text]) == 1
 
 
