@@ -49,6 +49,7 @@ class Gate:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
+        send = _in_no_frame(send)
         why = self._why_not(scope)
         if why:
             await _refuse(scope, send, 403, why)
@@ -93,6 +94,18 @@ class Gate:
         await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
 
 
+def _in_no_frame(send: _Send) -> _Send:
+    """Let no page be shown inside another one, which could lay it under a finger."""
+
+    async def send_so(message: MutableMapping[str, Any]) -> None:
+        if message["type"] == "http.response.start":
+            headers = [*message.get("headers", ()), (b"x-frame-options", b"DENY")]
+            message = {**message, "headers": headers}
+        await send(message)
+
+    return send_so
+
+
 def _header(scope: _Scope, name: bytes) -> str:
     for key, value in scope["headers"]:
         if key == name:
@@ -111,7 +124,6 @@ async def _answer(send: _Send, status: int, page: str, *headers: tuple[bytes, by
     more = [
         (b"content-type", b"text/html; charset=utf-8"),
         (b"cache-control", b"no-store"),
-        (b"x-frame-options", b"DENY"),
         *headers,
     ]
     await send({"type": "http.response.start", "status": status, "headers": more})

@@ -56,6 +56,15 @@ def closed_gate() -> Gate:
     return Gate(_behind, Access("0.0.0.0", 8080, TOKEN, ["127.0.0.1"]))
 
 
+def test_no_page_is_shown_inside_another_one(closed_gate: Gate) -> None:
+    async def page(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"a", b"b")]})
+
+    for gate in (Gate(page, Access("127.0.0.1", 8080)), closed_gate):
+        start = asked(gate, HOST)[0]
+        assert (b"x-frame-options", b"DENY") in start["headers"]
+
+
 @pytest.mark.parametrize(
     "headers",
     [
