@@ -45,7 +45,9 @@ class RigTopics:
         self._feed = feed
         self._images: list[Subscription[Any]] = []
         self._hear(DiagnosticStatus, "device/status", self._on_device, LATCHED)
-        self._hear(DiagnosticStatus, "needle/controller_status", self._on_controller, LATCHED)
+        self._controller = self._hear(
+            DiagnosticStatus, "needle/controller_status", self._on_controller, LATCHED
+        )
         self._hear(JointState, "joint_states", self._on_joints, RELIABLE)
         self._hear(PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip, RELIABLE)
         self._hear(PoseWithCovarianceStamped, "needle/estimate", self._on_estimate, RELIABLE)
@@ -53,7 +55,13 @@ class RigTopics:
         self._hear(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
 
     def look(self, now: float) -> None:
-        """Begin or end to hear images, as somebody looks or not."""
+        """Begin or end to hear images, as somebody looks or not; see whether a controller is there.
+
+        One that was killed while it steered must not keep the needle in: a press to retract waits
+        until steering has ended.
+        """
+        if not self._controller.get_publisher_count():
+            self._picture.lose_controller()
         wanted = self._feed.wanted(now)
         if wanted and not self._images:
             self._images = [

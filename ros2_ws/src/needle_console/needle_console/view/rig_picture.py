@@ -76,6 +76,10 @@ class RigPicture:
                 self._told, controller=state, T_rig_plane=self._plane(state.target_offset)
             )
 
+    def lose_controller(self) -> None:
+        """Take that there is no controller any more: what it said last holds no longer."""
+        self._tell(controller=None)
+
     def see_joints(self, insertion: float, rotation: float, now: float) -> None:
         """Take the joints [m], [rad]; numbers that are none are left out."""
         if math.isfinite(insertion) and math.isfinite(rotation):

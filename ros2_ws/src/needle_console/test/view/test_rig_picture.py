@@ -61,6 +61,15 @@ def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
+def test_a_controller_that_is_gone_steers_no_longer() -> None:
+    picture = seen(0.01)
+    picture.lose_controller()
+    assert picture.states().controller is None
+    assert picture.snapshot(0.0).controller is None
+    picture.see_controller({"state": "STEERING", "starts": "1"})
+    assert picture.states().controller is not None
+
+
 def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
     picture = seen(0.010, 0.011, 0.0111, 0.012)
     assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0111, 0.012]
