@@ -16,12 +16,13 @@ from typing import Any, NamedTuple
 
 import pytest
 import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from needle_common.ros.conversions import JOINT_STATES
+from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
 
 CHROMIUM = "/usr/bin/chromium"
 MISSING = [name for name in ("nicegui", "playwright") if importlib.util.find_spec(name) is None]
@@ -61,8 +62,8 @@ def free_port() -> int:
             return port
 
 
-class Joints:
-    """What a rig's joint_states say, heard by a thread of its own."""
+class Heard:
+    """What a rig's joints and its controller say, heard by a thread of its own."""
 
     def __init__(self, domain: int) -> None:
         self._context = Context()
@@ -70,8 +71,12 @@ class Joints:
         self._heard = threading.Condition()
         self._count = 0
         self._insertion = float("nan")
-        self._node = Node("joints_of_the_test", context=self._context)
+        self._node = Node("listening_test", context=self._context)
         self._node.create_subscription(JointState, "joint_states", self._take, JOINT_STATES)
+        self._told: dict[str, str] = {}
+        self._node.create_subscription(
+            DiagnosticStatus, "needle/controller_status", self._take_status, LATCHED
+        )
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)
         self._thread = threading.Thread(target=self._spin, daemon=True)
@@ -107,6 +112,16 @@ class Joints:
         while not self._ended:
             self._executor.spin_once(timeout_sec=0.1)
 
+    def wait_for_word(self, key: str, text: str) -> None:
+        """Wait until the controller's status says so."""
+        with self._heard:
+            assert self._heard.wait_for(lambda: self._told.get(key) == text, LIMIT), self._told
+
+    def _take_status(self, message: DiagnosticStatus) -> None:
+        with self._heard:
+            self._told = values_of(message)
+            self._heard.notify_all()
+
     def _take(self, message: JointState) -> None:
         with self._heard:
             self._insertion = message.position[list(message.name).index("insertion_joint")]
@@ -121,7 +136,7 @@ class Rig(NamedTuple):
     """A simulated rig with a console on it."""
 
     address: str
-    joints: Joints
+    heard: Heard
 
 
 @pytest.fixture(scope="module")
@@ -136,9 +151,9 @@ def rig() -> Iterator[Rig]:
             assert console.stdout is not None
             said = re.match(r"(\S+) .*ROS_DOMAIN_ID (\d+)", console.stdout.readline())
             assert said
-            joints = Joints(int(said[2]))
-            yield Rig(said[1], joints)
-            joints.close()
+            heard = Heard(int(said[2]))
+            yield Rig(said[1], heard)
+            heard.close()
         finally:
             console.send_signal(signal.SIGINT)
             _, complaints = console.communicate(timeout=LIMIT)
@@ -161,14 +176,15 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         context.close()
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def page(browser: Any, rig: Rig) -> Iterator[Page]:
-    """Return a fresh page of the console; what its scripts complain of fails the test."""
+    """Return a page, ready to steer; what its scripts complain of fails the last test."""
     opened = browser.new_page()
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
     opened.goto(rig.address)
     expect(opened.locator(".kind")).to_have_text("SIMULATED")
+    make_ready(opened)
     yield opened
     opened.close()
     assert errors == []
@@ -186,7 +202,7 @@ def press(page: Page, name: str) -> None:
 def check_stands_still(rig: Rig, page: Page) -> float:
     """Fail unless the needle stays where it is once nothing moves; return where [m]."""
     expect(reading(page, "Device")).to_have_text("HOLDING")
-    places = rig.joints.next_ones(STANDS)
+    places = rig.heard.next_ones(STANDS)
     assert max(places) - min(places) < 1e-6
     return places[-1]
 
@@ -199,7 +215,7 @@ def hold_until(rig: Rig, press: Hand, let_go: Hand, wanted: Callable[[float], bo
     """
     for _ in range(int(LIMIT)):
         press()
-        if rig.joints.comes(wanted, 1.0):
+        if rig.heard.comes(wanted, 1.0):
             return
         let_go()
     raise AssertionError("the needle does not get there")
@@ -220,7 +236,7 @@ def make_ready(page: Page) -> None:
 
 
 def test_a_needle_is_steered_by_the_space_bar_and_stops_with_it(rig: Rig, page: Page) -> None:
-    make_ready(page)
+    # Not one of the buttons on the way here has moved it.
     assert check_stands_still(rig, page) == pytest.approx(0.0, abs=1e-6)
     page.evaluate("document.activeElement.blur()")
     space = page.keyboard
@@ -247,14 +263,14 @@ def test_a_pointer_holds_and_stop_ends_it_until_a_new_press(rig: Rig, page: Page
 def test_another_page_sees_and_can_stop_but_not_move(rig: Rig, page: Page, browser: Any) -> None:
     page.locator("[data-hold=insert]").hover()
     begin = check_stands_still(rig, page)
-    hold_until(rig, page.mouse.down, page.mouse.up, lambda at: at > begin + 5e-4)
     other = browser.new_page()
     try:
         other.goto(rig.address)
+        hold_until(rig, page.mouse.down, page.mouse.up, lambda at: at > begin + 5e-4)
         expect(other.locator("#hold-words")).to_have_text("another page steers")
         expect(other.get_by_role("button", name="Reset")).to_be_disabled()
-        expect(other.get_by_role("button", name="Stop")).to_be_enabled()
-        # A page that is not in front loses its hold: that is enough to stop.
+        press(other, "Stop")
+        check_stands_still(rig, other)
         other.locator("[data-hold=insert]").hover()
         other.mouse.down()
         check_stands_still(rig, other)
@@ -264,14 +280,18 @@ def test_another_page_sees_and_can_stop_but_not_move(rig: Rig, page: Page, brows
     page.mouse.up()
 
 
-def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(page: Page) -> None:
+def test_a_target_is_changed_in_the_middle_and_nonsense_is_refused(rig: Rig, page: Page) -> None:
+    press(page, "Set point")
+    rig.heard.wait_for_word("target_point_m", "0.01, -0.005, 0.1")
+    expect(reading(page, "Reach")).to_contain_text("point")
     offset = page.get_by_label("Plane offset [mm]")
-    offset.fill("4.5")
-    press(page, "Set plane")
-    expect(reading(page, "Off the plane")).not_to_have_text("\N{EN DASH}")
     offset.fill("80")
     press(page, "Set plane")
     expect(page.get_by_text("offset = 80 mm is outside [-50, 50] mm")).to_be_visible()
+    offset.fill("4")
+    press(page, "Set plane")
+    rig.heard.wait_for_word("target_offset_m", "0.004")
+    rig.heard.wait_for_word("target_point_m", "")
 
 
 def test_the_needle_is_drawn_out_by_a_hold_too(rig: Rig, page: Page) -> None:
