@@ -39,7 +39,7 @@ def test_the_exit_code_of_a_command_comes_through() -> None:
     assert subprocess.run(words, capture_output=True, text=True, check=True).stdout == "1\n0\n"
 
 
-@pytest.mark.parametrize("script", ["simulate", "verify", "paper", "bench", "test"])
+@pytest.mark.parametrize("script", ["simulate", "console", "verify", "paper", "bench", "test"])
 def test_every_script_that_starts_others_runs_them_so(script: str) -> None:
     text = (JOBS.parents[1] / script).read_text("utf-8")
     assert "lib/jobs.sh" in text

@@ -32,6 +32,7 @@ LONG_FILES = (
     "tests/test_lint.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
+    "ros2_ws/src/needle_bringup/test/graph/test_console.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
     "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
     "ros2_ws/src/needle_analysis/test/ros/test_rerun.py",

@@ -268,8 +268,11 @@ def test_another_page_sees_and_can_stop_but_not_move(rig: Rig, page: Page, brows
         other.goto(rig.address)
         hold_until(rig, page.mouse.down, page.mouse.up, lambda at: at > begin + 5e-4)
         expect(other.locator("#hold-words")).to_have_text("another page steers")
-        expect(other.get_by_role("button", name="Reset")).to_be_disabled()
+        expect(other.get_by_role("button", name="Switch off")).to_be_disabled()
+        expect(page.get_by_role("button", name="Switch off")).to_be_enabled()
         press(other, "Stop")
+        # Whether the first page's hold had ended before or not, the device was told.
+        expect(other.locator(".answer")).to_contain_text("device/stop: ")
         check_stands_still(rig, other)
         other.locator("[data-hold=insert]").hover()
         other.mouse.down()
