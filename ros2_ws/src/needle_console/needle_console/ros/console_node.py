@@ -120,6 +120,7 @@ class ConsoleNode(WholeNode):
         rig = self._picture.states()
         todo = self._retraction.update(
             state,
+            time.monotonic(),
             steering=rig.controller is not None and rig.controller.state in STEERING,
             hold_counts=rig.device is not None
             and rig.device.hold_owner == OWNER

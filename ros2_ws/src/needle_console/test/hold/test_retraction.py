@@ -12,25 +12,37 @@ OUT = HoldState(True, 1.0, Mode.RETRACT)
 def test_an_insertion_is_passed_on_as_it_is() -> None:
     retraction = Retraction()
     for steering in (True, False):
-        assert retraction.update(INSERT, steering=steering, hold_counts=True) == Todo(True)
-        assert retraction.update(RELEASED, steering=steering, hold_counts=False) == Todo(False)
+        assert retraction.update(INSERT, 0.0, steering=steering, hold_counts=True) == Todo(True)
+        assert retraction.update(RELEASED, 9.0, steering=steering, hold_counts=False) == Todo(False)
 
 
 def test_steering_ends_before_the_hold_is_passed_on_and_each_call_is_made_once() -> None:
     retraction = Retraction()
-    assert retraction.update(OUT, steering=True, hold_counts=False) == Todo(False, (STOP_STEERING,))
-    assert retraction.update(OUT, steering=True, hold_counts=False) == Todo(False)
-    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
-    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
-    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True)
-    # The needle is out, the finger is still there: no second time.
-    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
-    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True)
-    assert retraction.update(RELEASED, steering=False, hold_counts=False) == Todo(False)
-    assert retraction.update(OUT, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+    assert retraction.update(OUT, 0.0, steering=True, hold_counts=False) == Todo(
+        False, (STOP_STEERING,)
+    )
+    assert retraction.update(OUT, 0.0, steering=True, hold_counts=False) == Todo(False)
+    assert retraction.update(OUT, 0.0, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == Todo(True)
+    # The needle is out, the finger is still there: no second time, and no hold either.
+    assert retraction.update(OUT, 8.0, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, 8.1, steering=False, hold_counts=True) == Todo(False)
+    assert retraction.update(OUT, 8.2, steering=True, hold_counts=False) == Todo(False)
+    assert retraction.update(RELEASED, 9.0, steering=False, hold_counts=False) == Todo(False)
+    assert retraction.update(OUT, 9.1, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+
+
+def test_a_needle_that_is_out_already_leaves_no_hold() -> None:
+    retraction = Retraction()
+    assert retraction.update(OUT, 0.0, steering=False, hold_counts=True) == Todo(True, (RETRACT,))
+    assert retraction.update(OUT, 0.9, steering=False, hold_counts=True) == Todo(True)
+    assert retraction.update(OUT, 1.1, steering=False, hold_counts=True) == Todo(False)
 
 
 def test_steering_that_begins_meanwhile_gets_no_hold() -> None:
     retraction = Retraction()
-    assert retraction.update(OUT, steering=False, hold_counts=False) == Todo(True)
-    assert retraction.update(OUT, steering=True, hold_counts=True) == Todo(False, (STOP_STEERING,))
+    assert retraction.update(OUT, 0.0, steering=False, hold_counts=False) == Todo(True)
+    assert retraction.update(OUT, 0.0, steering=True, hold_counts=True) == Todo(
+        False, (STOP_STEERING,)
+    )
