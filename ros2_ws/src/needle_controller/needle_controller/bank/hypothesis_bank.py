@@ -27,7 +27,6 @@ from needle_controller.bank.tip_motion import LARGEST_TURN, MOTION_ROWS, move
 from needle_controller.bank.tip_update import FOUND, READING_ROWS, UPDATE_ROWS, take_tip
 from needle_controller.model.arrays import Array
 
-_SUSPECTED = 0.5
 _NEWEST_SHARE = 0.1
 
 
@@ -141,16 +140,17 @@ def _judge(bank: Bank, n: int, limits: Limits) -> None:
         tile[WEIGHT, h] = weight if weight > limits.smallest_weight else 0.0
     bank.refused[n] = refused
     bank.unexplained[n] += _NEWEST_SHARE * (refused - bank.unexplained[n])
-    if refused > _SUSPECTED:
-        _suspect_jump(state, first, end, limits)
+    share = limits.jump_share * refused
+    if share > limits.smallest_weight:
+        _suspect_jump(state, first, end, share, limits)
 
 
 @compiled
-def _suspect_jump(state: Array, first: int, end: int, limits: Limits) -> None:
+def _suspect_jump(state: Array, first: int, end: int, share: float, limits: Limits) -> None:
     """Let an estimate that has ended be the likeliest one again, but displaced nobody knows where.
 
-    If the tip was an outlier it will end soon; if the needle was displaced the next tips will be
-    where it expects them, and the others will end.
+    It weighs a share of what the likeliest does. If the needle was not displaced it will end soon;
+    if it was, the next tips will be where it expects them, and the others will end.
     """
     likeliest = free = -1
     for e in range(first, end):
@@ -164,7 +164,7 @@ def _suspect_jump(state: Array, first: int, end: int, limits: Limits) -> None:
     tile, h = state[free // LANES], free % LANES
     for row in range(ROWS):
         tile[row, h] = state[likeliest // LANES, row, likeliest % LANES]
-    tile[WEIGHT, h] = limits.jump_share
+    tile[WEIGHT, h] = share
     for axis in range(3):
         tile[PLACE[axis, axis], h] += limits.jump_variance
         tile[PLACE[E_TURN + axis, E_TURN + axis], h] += limits.jump_turn_variance

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_controller.bank.estimate_tiles import SCALE, rows
+from needle_controller.bank.estimate_tiles import PLACE, SCALE, WEIGHT, rows
 from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.bank.hypotheses import (
     NoiseHypothesis,
@@ -269,6 +269,20 @@ def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
     np.testing.assert_allclose(moved.position, path(turns)[46, :3, 3] + far, atol=0.0008)
     assert not moved.warnings
     assert not moved.doubtful
+
+
+def test_a_jump_is_thought_of_as_likely_as_the_tip_is_an_outlier() -> None:
+    turns, settings = turns_for(41), FilterSettings()
+    tips = noisy(path(turns))
+    tips[41, 0] += 0.0008
+    estimator = HypothesisFilter(settings)
+    drive(estimator, turns, tips)
+    bank = estimator._bank
+    refused = bank.refused[0]
+    assert 0.05 < refused < 0.5
+    displaced = rows(bank.tiles, PLACE[0, 0], 1)[:, 0] > settings.jump_std**2
+    weights = rows(bank.tiles, WEIGHT, 1)[:, 0]
+    assert np.sum(weights[displaced]) == pytest.approx(settings.jump_share * refused)
 
 
 def test_learns_that_the_needle_lags_behind_the_stage() -> None:
