@@ -162,7 +162,7 @@ class ContinuousSteering(Steering):
             slowly = self.trust.is_doubtful
             ahead = self._ahead = PathAhead(joints, update.command, self.settings, slowly=slowly)
             if ahead.is_done:
-                return actions + self._end_at(joints)
+                return actions + self._end(update, joints)
         elif self.state is SteeringState.WAITING_FOR_TIP:
             self.state, self.reason = SteeringState.STEERING, ""
             actions.append(Log("info", "STEERING: a good tip came"))

@@ -10,7 +10,7 @@ import numpy as np
 
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.model.kinematics import X, rotation_from_angles
 from needle_controller.model.point_reach import point_reachability
 from needle_controller.model.reachability import Reachability, reachability
 from needle_controller.model.target_motion import TargetMotion
@@ -27,12 +27,11 @@ from needle_controller.presets.steering_settings import (
 )
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_covariance import TipCovariance
+from needle_controller.protocol.trust import TARGET_TOLERANCE
 
 LARGEST_START_ROLL = np.deg2rad(80.0)
 """Of presets whose coordinates end at roll +-90 deg [rad]."""
 _FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
-TARGET_TOLERANCE = 1e-3
-"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,6 +48,8 @@ class ControlUpdate:
         Rotation of the base since the first tip [rad].
     reach : Reachability
         Of the plane, or the point.
+    distance : float
+        Of the tip from the plane, or from where the point is expected [m].
     blocked : bool
         Whether no way on is clear of the obstacles: no further step then.
     """
@@ -57,6 +58,7 @@ class ControlUpdate:
     command: SteeringCommand
     turned: float
     reach: Reachability
+    distance: float
     blocked: bool = False
 
 
@@ -219,13 +221,11 @@ class PlaneControl:
         estimate = self._estimator.estimate()
         turned = joints.rotation - self._first_joints.rotation
         command = self._command(estimate, joints)
-        reach = self._reach(estimate, joints)
+        reach, distance = self._reach(estimate, joints), self._distance(estimate)
         if command is None:
-            still = np.zeros(())
-            return ControlUpdate(
-                estimate, SteeringCommand(still, still), turned, reach, blocked=True
-            )
-        return ControlUpdate(estimate, command, turned, reach)
+            still = SteeringCommand(np.zeros(()), np.zeros(()))
+            return ControlUpdate(estimate, still, turned, reach, distance, blocked=True)
+        return ControlUpdate(estimate, command, turned, reach, distance)
 
     def _advance(self, joints: JointSample) -> None:
         assert self._joints is not None
@@ -274,6 +274,12 @@ class PlaneControl:
             return reachability(estimate.reduced, estimate.curvature, **limits)
         offset = self._plane.from_rig(self._points.aim) - estimate.position
         return point_reachability(estimate.rotation.T @ offset, estimate.curvature, **limits)
+
+    def _distance(self, estimate: Estimate) -> float:
+        if self._points is None:
+            return abs(float(estimate.coordinates[X]))
+        offset = self._plane.from_rig(self._points.aim) - estimate.position
+        return float(np.linalg.norm(offset))
 
     def _correct(self, position: Array, known: TipCovariance | None) -> None:
         estimator, settings = self._estimator, self._settings

@@ -317,7 +317,7 @@ class Steering:
             tip.stamp_ns, joints, update.command, self.settings, slowly=self.trust.is_doubtful
         )
         if self._ready_step is None:
-            return actions + self._end_at(joints)
+            return actions + self._end(update, joints)
         return actions + self._send()
 
     def _use(
@@ -340,7 +340,8 @@ class Steering:
             actions += self._leave(SteeringState.IDLE, why, "warning")
         return update, actions
 
-    def _end_at(self, joints: JointSample) -> list[Action]:
+    def _end(self, update: ControlUpdate, joints: JointSample) -> list[Action]:
+        self.trust = trust_of(update.estimate, update.distance)
         text = f"insertion {joints.insertion:.6g} m reached; {self.trust.summary}"
         return self._leave(SteeringState.DONE, text, "info")
 

@@ -1,4 +1,4 @@
-"""How sure an estimate is of the needle's distance from the plane, for a person to read."""
+"""How far a person can rely on an estimate, and on where a needle ended."""
 
 from __future__ import annotations
 
@@ -6,17 +6,21 @@ import dataclasses
 import math
 
 import numpy as np
+import numpy.typing as npt
 
+from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import X
 from needle_controller.observers.estimator import Estimate
 
+TARGET_TOLERANCE = 1e-3
+"""Distance from plane or point at which the needle counts as there, [KC09] IV-A [m]."""
 _95_PERCENT = 1.959964
 """Half an interval that holds 95 % of a normal distribution [standard deviations]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Trust:
-    """Whether the estimate of one needle can be relied on.
+    """Whether the estimate of one needle, and in the end the needle, is where it should be.
 
     Attributes
     ----------
@@ -42,11 +46,30 @@ class Trust:
         return f"{said}, {self.verdict}" if self.verdict else said
 
 
-def trust_of(estimate: Estimate) -> Trust:
-    """Return how sure the estimate of one needle is."""
+def trust_of(estimate: Estimate, ended_off: float = 0.0) -> Trust:
+    """Return how sure the estimate of one needle is, and whether that is where it should be.
+
+    Parameters
+    ----------
+    estimate : Estimate
+        Of the needle.
+    ended_off : float
+        Its distance from plane or point where it is to go no farther; 0 on the way [m].
+    """
     x = float(estimate.coordinates[X])
     half = _95_PERCENT * float(np.sqrt(max(estimate.covariance[X, X], 0.0)))
     verdict = "" if estimate.doubtful is None else "trusted"
-    if estimate.doubts:
-        verdict = f"doubtful: {'; '.join(estimate.doubts)}"
-    return Trust(verdict, bool(estimate.doubts), x, x - half, x + half)
+    doubts = list(estimate.doubts)
+    if verdict and ends_elsewhere(ended_off):
+        doubts.append(f"the needle ends {ended_off:.2g} m from its target")
+    if doubts:
+        verdict = f"doubtful: {'; '.join(doubts)}"
+    return Trust(verdict, bool(doubts), x, x - half, x + half)
+
+
+def ends_elsewhere(distance: Array | float) -> npt.NDArray[np.bool_]:
+    """Return whether needles that end so far from plane or point, (...) [m], are not there.
+
+    However well it is known where they are: nobody must take such an end for a good one.
+    """
+    return np.asarray(np.abs(distance) > TARGET_TOLERANCE)

@@ -34,6 +34,18 @@ def test_the_interval_holds_what_the_covariance_says() -> None:
     assert not trust_of(unjudged).verdict
 
 
+def test_an_end_that_is_elsewhere_is_not_trusted_however_well_it_is_known() -> None:
+    estimator = HypothesisFilter(FilterSettings())
+    estimator.reset([0.002, 0.0, 0.0], np.zeros(2))
+    estimate = estimator.estimate()
+    there, elsewhere = trust_of(estimate, 0.00099), trust_of(estimate, 0.0072)
+    assert (there.verdict, there.is_doubtful) == ("trusted", False)
+    assert elsewhere.verdict == "doubtful: the needle ends 0.0072 m from its target"
+    assert elsewhere.is_doubtful
+    unjudged = dataclasses.replace(estimate, doubtful=None, doubts=())
+    assert not trust_of(unjudged, 0.0072).verdict
+
+
 def test_in_doubt_it_goes_on_at_half_the_speed() -> None:
     joints, settings = JointSample(0, 0.01, 0.0), SteeringSettings()
     still = SteeringCommand(np.zeros(()), np.zeros(()))

@@ -14,6 +14,8 @@ from needle_sim.studies.beliefs import BeliefTally
 
 BAND = 1e-3
 """Half width of what counts as in the plane [m]: the paper's +-1 mm."""
+FAR_OFF = 5e-3
+"""Distance from plane or point at which an end must not be trusted [m]."""
 LAST_STEPS = 20
 """Steps at the end over which a run is judged."""
 
@@ -168,6 +170,7 @@ def figures(outcomes: Outcomes) -> dict[str, float | None]:
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
         "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
+        "trusted_far_off": trusted_far_off(outcomes.x_end, outcomes.doubtful),
     }
 
 
@@ -175,3 +178,18 @@ def mean_of_what_is_said(values: FloatArray) -> float | None:
     """Return the mean; None where nothing is said, which is NaN."""
     mean = float(np.mean(values))
     return None if np.isnan(mean) else mean
+
+
+def trusted_far_off(distance: FloatArray, doubtful: FloatArray) -> float | None:
+    """Return how many runs end beyond `FAR_OFF` and are not called doubtful; None: nothing is said.
+
+    Parameters
+    ----------
+    distance : ndarray, shape (N,)
+        From plane or point at the end, either side [m].
+    doubtful : ndarray, shape (N,)
+        See `Outcomes`.
+    """
+    if np.any(np.isnan(doubtful)):
+        return None
+    return float(np.sum((np.abs(distance) > FAR_OFF) & (doubtful == 0.0)))

@@ -11,7 +11,13 @@ import numpy as np
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import BeliefTally
 from needle_sim.studies.disturbed_needles import DisturbedNeedles
-from needle_sim.studies.figures_of_merit import BAND, BoolArray, joined, mean_of_what_is_said
+from needle_sim.studies.figures_of_merit import (
+    BAND,
+    BoolArray,
+    joined,
+    mean_of_what_is_said,
+    trusted_far_off,
+)
 from needle_sim.studies.point_targets import INSERTION_SPEED, NEAREST, MovingTargets
 from needle_sim.studies.study import CHUNK, Controller, StudySettings, needle_chunks
 
@@ -109,6 +115,7 @@ def point_figures(outcomes: PointOutcomes) -> dict[str, float | None]:
         "inside_2_sigma": mean_of_what_is_said(outcomes.inside_2_sigma),
         "inside_3_sigma": mean_of_what_is_said(outcomes.inside_3_sigma),
         "doubtful_at_end": mean_of_what_is_said(outcomes.doubtful),
+        "trusted_far_off": trusted_far_off(outcomes.error, outcomes.doubtful),
     }
 
 

@@ -4,7 +4,13 @@ import numpy as np
 import pytest
 
 from needle_sim.needle.se3 import FloatArray
-from needle_sim.studies.figures_of_merit import Outcomes, Tally, figures, joined
+from needle_sim.studies.figures_of_merit import (
+    Outcomes,
+    Tally,
+    figures,
+    joined,
+    trusted_far_off,
+)
 
 
 def outcomes(paths: list[FloatArray], turns: float = 0.0) -> Outcomes:
@@ -75,3 +81,10 @@ def test_no_run_settled_is_no_figure() -> None:
 def test_parts_join_in_order() -> None:
     parts = [outcomes([path(30, (0, 0.001 * k))]) for k in range(3)]
     np.testing.assert_allclose(joined(parts).x_end, [0.0, 0.001, 0.002])
+
+
+def test_ends_that_are_far_off_and_trusted_are_counted_on_both_sides() -> None:
+    distance = np.array([0.0, 0.0049, 0.0051, -0.0051, -0.02])
+    assert trusted_far_off(distance, np.zeros(5)) == 3.0
+    assert trusted_far_off(distance, np.array([0.0, 0.0, 1.0, 0.0, 1.0])) == 1.0
+    assert trusted_far_off(distance, np.full(5, np.nan)) is None

@@ -16,6 +16,7 @@ from needle_verification.checking import Finding
 
 AT_END = "converged_at_end"
 LAST_20 = "converged_last_20"
+TRUSTED_FAR_OFF = "trusted_far_off"
 SEED = "20090201"
 RUNS_A_DRAW = 1000
 ALL_TROUBLES = ("--outliers", "0.05", "--dropped", "0.2", "--delay", "1", "--kappa-patches", "0.2")
@@ -79,10 +80,11 @@ BEST = Study(
         "settle_median_mm": 40.0,
         "settle_p95_mm": 70.0,
         "rotation_mean_deg": 1500.0,
+        TRUSTED_FAR_OFF: 0.0,
     },
 )
 TROUBLE = tuple(
-    Study(key, "best", options, {AT_END: least})
+    Study(key, "best", options, {AT_END: least}, {TRUSTED_FAR_OFF: 0.0})
     for key, options, least in (
         ("kappa_08", ("--kappa-scale", "0.8"), 0.998),
         ("kappa_12", ("--kappa-scale", "1.2"), 0.998),
@@ -106,6 +108,7 @@ TOLD_WRONG = tuple(
         "best",
         options,
         {AT_END: least, "inside_2_sigma": 0.93, "inside_3_sigma": 0.99},
+        {TRUSTED_FAR_OFF: 0.0},
     )
     for key, options, least in (
         ("normal_noise", NORMAL, 0.999),
@@ -138,31 +141,31 @@ POINTS = (
         "best",
         (),
         {REACHED: 0.999},
-        {"rms_point_mm": 0.20, "rotation_mean_deg": 1300.0},
+        {"rms_point_mm": 0.20, "rotation_mean_deg": 1300.0, TRUSTED_FAR_OFF: 0.0},
     ),
     Study(
         "points_budget",
         "best",
         ("--rotation-deg", "1300"),
         {REACHED: 0.99},
-        {"rotation_p95_deg": 1300.0},
+        {"rotation_p95_deg": 1300.0, TRUSTED_FAR_OFF: 0.0},
     ),
     Study(
         "points_seen_well",
         "best",
         ("--noise-mm", "0.05", "--claimed-mm", "0.05"),
         {REACHED: 0.999},
-        {"rms_point_mm": 0.10},
+        {"rms_point_mm": 0.10, TRUSTED_FAR_OFF: 0.0},
     ),
     Study(
         "points_moving",
         "best",
         ("--target-drift-mm", "2", "--target-breath-mm", "3"),
         {REACHED: 0.97},
-        {"rms_point_mm": 0.40},
+        {"rms_point_mm": 0.40, TRUSTED_FAR_OFF: 0.0},
     ),
     *(
-        Study(f"points_{key}", "best", options, {REACHED: 0.97})
+        Study(f"points_{key}", "best", options, {REACHED: 0.97}, {TRUSTED_FAR_OFF: 0.0})
         for key, options in (
             ("normal_noise", NORMAL),
             ("noise_13", ("--noise-mm", "1.3")),

@@ -49,6 +49,7 @@ LABELS = {
     "inside_2_sigma": "truth within 2 sigma",
     "inside_3_sigma": "truth within 3 sigma",
     "doubtful_at_end": "called doubtful at the end",
+    "trusted_far_off": "  more than 5 mm off, and not",
     "wall_s": "time [s]",
 }
 

@@ -42,7 +42,9 @@ figures (--json FILE has all of them, flat; null where there is none):
   inside_N_sigma      share of x and of pitch (the mean of both shares), over the last 20 steps of
                       all runs, within N of the estimate's own standard deviations from the truth;
                       null for paper and open_loop, whose estimate makes no use of them
-  doubtful_at_end     share of runs whose estimate says at the end that it cannot be relied on
+  doubtful_at_end     share of runs that say at the end that they cannot be relied on, or that the
+                      needle is not within 1 mm of where it should be
+  trusted_far_off     how many end more than 5 mm off and do not say so
 with --targets, in place of all that speaks of the plane:
   rms_point           of the tip's distance from its point at the end (p95, max likewise)
   within_1_mm_point   share that ends within 1 mm of it; a point counts as one that can be reached

@@ -24,6 +24,7 @@ from needle_controller.presets.steering_settings import (
     PRESETS,
     SteeringSettings,
 )
+from needle_controller.protocol.trust import ends_elsewhere
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.point_targets import INSERTION_SPEED
@@ -107,14 +108,21 @@ class SteeredNeedles:
         estimate = self._estimate
         if estimate is None or isinstance(self._estimator, LuenbergerObserver):
             return None
-        uncertainty = hypotheses_of(estimate).uncertainty
+        uncertainty, doubtful = hypotheses_of(estimate).uncertainty, estimate.doubtful
+        if doubtful is not None:
+            # The last word counts, as of a node that is done.
+            doubtful = doubtful | ends_elsewhere(self._distance(estimate))
         return Belief(
             x=estimate.linearized[..., 0],
             x_std=np.sqrt(np.maximum(uncertainty[..., 0], 0.0)),
             sin_pitch=estimate.linearized[..., 1],
             sin_pitch_std=np.sqrt(np.maximum(uncertainty[..., 2], 0.0)),
-            doubtful=estimate.doubtful,
+            doubtful=doubtful,
         )
+
+    def _distance(self, estimate: Estimate) -> FloatArray:
+        """Return how far each needle is from where it is to end, (N,) [m]."""
+        return np.asarray(estimate.linearized[..., 0])
 
     def _rate(self) -> FloatArray:
         self._estimate = self._estimator.estimate()
@@ -155,6 +163,9 @@ class NeedlesToPoints(SteeredNeedles):
     def insertion_left(self) -> FloatArray:
         """Return how far each needle has to go; see `point_study.PointController`."""
         return self._left
+
+    def _distance(self, estimate: Estimate) -> FloatArray:
+        return np.asarray(np.linalg.norm(estimate.position - self._motion.last, axis=-1))
 
     def _command(self, estimate: Estimate, _: float) -> SteeringCommand:
         command = self._point_law(

@@ -24,6 +24,7 @@ KEYS = {
     "inside_2_sigma",
     "inside_3_sigma",
     "doubtful_at_end",
+    "trusted_far_off",
     "within_1_mm_point",
     "rms_point_mm",
 }
@@ -42,6 +43,7 @@ def test_open_loop_s_known_answer_in_json_and_csv(tmp_path: Path) -> None:
     assert figures["rotation_mean_deg"] == 0.0
     assert figures["inside_2_sigma"] is None
     assert figures["doubtful_at_end"] is None
+    assert figures["trusted_far_off"] is None
     with (tmp_path / "f.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     assert len(rows) == 1000
@@ -72,6 +74,9 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path) ->
     # 10 mm are not enough for any of them
     assert figures["within_1_mm_point"] == 0.0
     assert figures["missed_runs"] == 7
+    # It knows where it is, and says that this is not the point.
+    assert figures["doubtful_at_end"] == 1.0
+    assert figures["trusted_far_off"] == 0.0
     with (tmp_path / "f.csv").open(encoding="utf-8") as stream:
         rows = list(csv.DictReader(stream))
     error = np.array([float(row["error_mm"]) for row in rows])

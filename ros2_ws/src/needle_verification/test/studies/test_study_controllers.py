@@ -12,7 +12,11 @@ from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_verification.studies import study_controllers
-from needle_verification.studies.study_controllers import SteeredNeedles, controller_factory
+from needle_verification.studies.study_controllers import (
+    SteeredNeedles,
+    controller_factory,
+    point_controller_factory,
+)
 
 TIPS = np.array([[0.0005, 0.0, 0.001], [-0.0005, 0.0, 0.0012]])
 
@@ -78,6 +82,21 @@ def test_needles_say_what_their_estimate_says() -> None:
     )
     assert belief.doubtful is not None
     assert not np.any(belief.doubtful)
+
+
+def test_needles_that_are_not_where_they_are_to_be_say_so() -> None:
+    tips = np.array([[0.0005, 0.0, 0.0], [-0.003, 0.0, 0.0]])
+    needles = SteeredNeedles(HypothesisFilter(FilterSettings()), still)
+    needles.start(tips)
+    belief = needles.belief()
+    assert belief is not None
+    np.testing.assert_array_equal(belief.doubtful, [False, True])
+    to_points = point_controller_factory("best", 0.001)()
+    to_points.see_targets(0.0, tips + np.array([[0.0, 0.0009, 0.0], [0.0, 0.0, 0.06]]))
+    to_points.start(tips)
+    belief = to_points.belief()
+    assert belief is not None
+    np.testing.assert_array_equal(belief.doubtful, [False, True])
 
 
 @pytest.mark.parametrize(("name", "says"), [("best", True), ("paper", False)])
