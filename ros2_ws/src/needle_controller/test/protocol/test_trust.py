@@ -63,4 +63,5 @@ def test_the_end_says_how_sure_it_is() -> None:
     assert rig.steering.state is SteeringState.DONE
     # This needle does not bend at all.
     assert "m (95 %), doubtful: the curvature is at its limit" in rig.steering.reason
+    assert rig.steering.reason.endswith("m from its target")
     assert rig.steering.trust.low < rig.steering.trust.r1 < rig.steering.trust.high
