@@ -20,7 +20,8 @@ from needle_console.page.gate import Gate
 from needle_console.view.camera_feed import SIDES
 
 STATIC = Path(__file__).resolve().parents[1] / "static"
-_JOIN = 1.0
+# So long a page has to hear that the end has come; then without it, and at last by force [s].
+_PATIENCE, _JOIN = 0.2, 1.0
 
 
 class WebServer:
@@ -64,7 +65,13 @@ class WebServer:
         ui.run_with(server, dark=None, show_welcome_message=False, reconnect_timeout=3.0)
         server.add_middleware(Gate, access=access)
         self._server = uvicorn.Server(
-            uvicorn.Config(server, log_level="warning", access_log=False, log_config=None)
+            uvicorn.Config(
+                server,
+                log_level="warning",
+                access_log=False,
+                log_config=None,
+                timeout_graceful_shutdown=_PATIENCE,
+            )
         )
         self._thread = threading.Thread(target=self._run, name="page", daemon=True)
 
@@ -74,7 +81,7 @@ class WebServer:
 
     def close(self) -> None:
         """End; pages that are open see that nobody answers."""
-        self._server.should_exit = self._server.force_exit = True
+        self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(_JOIN)
         with contextlib.suppress(OSError):
