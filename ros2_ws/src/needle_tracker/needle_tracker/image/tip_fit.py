@@ -66,6 +66,11 @@ class ImageTip:
     bright: bool = False
     allowance: float = 1.0
 
+    @property
+    def doubt_across(self) -> float:
+        """Return how badly its line is known [px], as one that is as bad for a line."""
+        return self.sigma_across / self.allowance
+
 
 @dataclasses.dataclass(frozen=True)
 class Expected:
@@ -132,7 +137,7 @@ def fit_tip(
         tip = (fit or fit_expected)(image, expected, path.bright, settings)
         if tip is None:
             continue
-        if tip.clear and tip.sigma_across < _SURE_PX:
+        if tip.clear and tip.doubt_across < _SURE_PX:
             return tip
         if best is None or (tip.clear, -tip.sigma_across) > (best.clear, -best.sigma_across):
             best = tip

@@ -61,7 +61,7 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
 
 def shows_lines(found: Found) -> bool:
     """Return whether both views show at least the needle's line."""
-    return all(tip is not None and tip.sigma_across <= CLEAR_PX for tip in found)
+    return all(tip is not None and tip.doubt_across <= CLEAR_PX for tip in found)
 
 
 def is_half_sound(found: Found) -> bool:
@@ -69,13 +69,13 @@ def is_half_sound(found: Found) -> bool:
     left, right = found
     if left is None or right is None or not look_alike(left, right):
         return False
-    lines = max(left.sigma_across, right.sigma_across) <= _NEAR_PX
+    lines = max(left.doubt_across, right.doubt_across) <= _NEAR_PX
     return lines and (shows_end_well(left) or shows_end_well(right))
 
 
 def look_alike(left: ImageTip, right: ImageTip) -> bool:
     """Return whether the lines that both views show can be of one needle."""
-    disturbed = max(left.sigma_across, right.sigma_across) > SOUND_PX
+    disturbed = max(left.doubt_across, right.doubt_across) > SOUND_PX
     fainter, plainer = sorted((left.visibility, right.visibility))
     return plainer <= (_DISTURBED_RATIO if disturbed else _VISIBILITY_RATIO) * fainter
 
@@ -116,7 +116,7 @@ class VisibilityAverage:
     def _allows_in(self, i: int, tip: ImageTip) -> bool:
         if self._levels is None:
             return True
-        plainest = _PLAINEST if tip.sigma_across <= _UNDISTURBED_PX else _PLAINER
+        plainest = _PLAINEST if tip.doubt_across <= _UNDISTURBED_PX else _PLAINER
         return _DIM < tip.visibility / self._levels[i] < plainest
 
     def doubted(self, tips: tuple[ImageTip, ImageTip]) -> tuple[ImageTip, ImageTip]:
@@ -139,13 +139,14 @@ class VisibilityAverage:
         return left, right
 
     def _is_mixed_in(self, i: int, tip: ImageTip) -> bool:
-        if self._levels is None or tip.sigma_across <= SOUND_PX:
+        if self._levels is None or tip.doubt_across <= SOUND_PX:
             return False
         return not _MIXED < tip.visibility / self._levels[i] < _PLAINER
 
 
 def _hardly_known(tip: ImageTip) -> ImageTip:
-    return dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, _UNLIKE_PX))
+    unlike = tip.allowance * _UNLIKE_PX
+    return dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, unlike))
 
 
 def sights_to_contradict(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:

@@ -292,7 +292,7 @@ class StereoTracker:
                 or insertion is None
                 or abs(insertion - self._sound_at) > _ALONE_WAY
             )
-            loose = sights is not None and any(tip.sigma_across > _LOOSE_PX for tip in sights.tips)
+            loose = sights is not None and any(tip.doubt_across > _LOOSE_PX for tip in sights.tips)
             alone = (contradicted or loose) and (far or not self.track.is_unbroken)
             if sights is None or alone or self._contradicted > _CONTRADICTED:
                 return None
@@ -311,7 +311,7 @@ class StereoTracker:
         """Return whether two shafts without ends are enough: the stage says how far they go."""
         if self._clear_at is None or insertion is None:
             return False
-        lines = all(tip.sigma_across <= _HIDDEN_LINE_PX for tip in found)
+        lines = all(tip.doubt_across <= _HIDDEN_LINE_PX for tip in found)
         return lines and abs(insertion - self._clear_at) <= _HIDDEN_WAY
 
     def _look(self, view: RefractedCamera) -> DetectionSettings:

@@ -20,6 +20,7 @@ from needle_tracker.tracking.evidence import (
     VisibilityAverage,
     is_half_sound,
     is_sound,
+    look_alike,
     shows_lines,
     sights_to_confirm,
     sights_to_contradict,
@@ -60,6 +61,24 @@ def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> Non
     longer = dataclasses.replace(GOOD, sigma_along=3.5)
     for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (longer, GOOD), (GOOD, None)):
         assert sights_to_contradict(state, found, alike=True, on_way=True) == 0
+
+
+def test_how_badly_a_line_may_be_known_grows_with_what_is_allowed_it() -> None:
+    """Take what a line shows four times as badly of a map that may: it counts as much."""
+    usual = VisibilityAverage()
+    usual.see((GOOD, GOOD))
+    for across in (0.05, 0.25, 0.5, 0.7, 0.9):
+        line = dataclasses.replace(GOOD, sigma_across=across, visibility=0.33)
+        wide = dataclasses.replace(line, sigma_across=4.0 * across, allowance=4.0)
+        for seen in (
+            look_alike,
+            lambda *tips: shows_lines(tips),
+            lambda *tips: is_half_sound(tips),
+        ):
+            assert seen(GOOD, wide) is seen(GOOD, line)
+        assert usual.allows((GOOD, wide)) is usual.allows((GOOD, line))
+        mixed = usual.unmixed((line, wide))
+        assert mixed[1].sigma_across == pytest.approx(4.0 * mixed[0].sigma_across)
 
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
