@@ -148,7 +148,12 @@ class StereoTrackerParameters:
         0.05,
     )
     confirm_pairs: int = fixed_parameter(
-        3, "-", "Pairs in a row that must agree, where the insertion is not known.", 1, 100
+        3,
+        "-",
+        "Pairs in a row that must agree, where the insertion is not known and nothing shows that "
+        "the needle has come since the first pair.",
+        1,
+        100,
     )
     lost_after: int = fixed_parameter(
         10, "-", "Pairs in a row without a tip after which the track is lost.", 1, 1000

@@ -110,19 +110,24 @@ class Background:
         """Whether there was no needle at all."""
         return self._least_new is None
 
-    def is_seam(self, point: Array, room: float) -> bool:
-        """Return whether a point is where both maps meet: a line that ends there may go on.
+    def beyond_seam(self, point: Array) -> float:
+        """Return how far a point is beyond where both maps meet; infinite where only one counts.
+
+        A line that ends there may go on. What lies beyond has come since the image before.
 
         Parameters
         ----------
         point : ndarray, shape (2,)
             In the image [px].
-        room : float
-            How near is near [px].
+
+        Returns
+        -------
+        float
+            Positive where the map is that of the difference alone [px].
         """
         if self._seam is None:
-            return False
-        return abs(float(np.hypot(*(point - self._entry))) - self._seam) < room
+            return np.inf if self.is_empty else -np.inf
+        return float(np.hypot(*(point - self._entry))) - self._seam
 
 
 @lru_cache(maxsize=2)

@@ -117,12 +117,12 @@ class MapLook:
         before = self._map_before.draw(background.before, box)
         return background.joined(self._map.draw(image, box), new, before)
 
-    def _is_seam(self, image: Image, point: NDArray[np.float64], room: float) -> bool:
-        """Return whether the map is put together near a point [px]: no end is believed there."""
+    def _beyond_seam(self, image: Image, point: NDArray[np.float64]) -> float:
+        """Return how far a point is beyond where the map is put together [px]."""
         background = self.background
         if background is None or background.difference(image) is None:
-            return False
-        return background.is_seam(point, room)
+            return -math.inf
+        return background.beyond_seam(point)
 
     def find_paths(
         self,
@@ -185,7 +185,8 @@ class MapLook:
         along = math.hypot(along, _END_SYSTEMATIC * width)
         across = math.hypot(across, _LINE_SYSTEMATIC * width)
         clear = inside > _CLEAR_INSIDE and along < CLEAR_WIDTHS * width
-        clear = clear and not self._is_seam(image, point, width)
+        beyond = self._beyond_seam(image, point)
+        clear = clear and abs(beyond) > width
         if expected.sigma_along > 0.0:
             off = abs(float((point - expected.point) @ expected.direction))
             clear = clear and off < 3.0 * math.hypot(expected.sigma_along, along)
@@ -202,6 +203,7 @@ class MapLook:
             clear=clear,
             bright=True,
             allowance=_ALLOWANCE * width,
+            come=beyond > width,
         )
 
 

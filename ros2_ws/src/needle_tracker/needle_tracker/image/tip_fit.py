@@ -53,6 +53,8 @@ class ImageTip:
     allowance : float
         How many times worse than a line's it may be known and count as much. A line's end is where
         it is seen to end, and finely; a map's covers what a ground face hides.
+    come : bool
+        Whether it is seen where there was nothing of it in an earlier image.
     """
 
     point: Array
@@ -65,6 +67,7 @@ class ImageTip:
     clear: bool = True
     bright: bool = False
     allowance: float = 1.0
+    come: bool = False
 
     @property
     def doubt_across(self) -> float:

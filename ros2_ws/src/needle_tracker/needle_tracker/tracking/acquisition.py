@@ -27,6 +27,7 @@ from needle_tracker.optics.calibration import SIDES
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
+    has_come,
     is_half_sound,
     is_sound,
     look_alike,
@@ -300,7 +301,8 @@ class Acquisition:
         if self._is_borne_out(measured.tip, found, insertion, on_way=on_way):
             return 0
         near = on_way and track.fits(measured.tip, insertion, on_way=True)
-        if self._begins_at_entry(measured, insertion):
+        come = insertion is None and has_come(found)
+        if come or self._begins_at_entry(measured, insertion):
             return 0
         return sights_to_confirm(
             track.state,

@@ -59,6 +59,12 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
     return all(shows_end(tip, across_px, along_px) for tip in (left, right))
 
 
+def has_come(found: Found) -> bool:
+    """Return whether both views show an end where nothing was before: it needs no further sight."""
+    each = all(tip is not None and tip.come for tip in found)
+    return each and is_sound(found, CLEAR_PX, CLEAR_ALONG_PX)
+
+
 def shows_lines(found: Found) -> bool:
     """Return whether both views show at least the needle's line."""
     return all(tip is not None and tip.doubt_across <= CLEAR_PX for tip in found)

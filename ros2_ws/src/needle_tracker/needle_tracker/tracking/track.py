@@ -169,6 +169,7 @@ class Track:
         anew: bool = False,
         certain: bool = True,
         seen: bool = True,
+        come: bool = False,
     ) -> SpatialTip | None:
         """Take a tip that passed `judge`.
 
@@ -184,6 +185,8 @@ class Track:
             Whether one such tip is enough to begin with, if the insertion is known.
         seen : bool
             Whether both views show the end.
+        come : bool
+            Whether they show it where nothing was before: one such tip is enough, too.
 
         Returns
         -------
@@ -197,7 +200,7 @@ class Track:
             agreed = self._agreeing if self.state is TrackState.CONFIRMING else 0
             # What has won has been seen in agreement with itself before.
             self._agreeing = max(agreed, self._next_rivals - 1 if anew else 0) + 1
-            wanted = self._settings.confirm_pairs
+            wanted = 1 if come else self._settings.confirm_pairs
             if insertion is not None:
                 wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
             confirmed = self._agreeing >= wanted

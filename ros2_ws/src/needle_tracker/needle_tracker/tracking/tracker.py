@@ -17,7 +17,13 @@ from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 from needle_tracker.tracking.acquisition import Acquisition
-from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, VisibilityAverage, is_sound
+from needle_tracker.tracking.evidence import (
+    CLEAR_ALONG_PX,
+    CLEAR_PX,
+    VisibilityAverage,
+    has_come,
+    is_sound,
+)
 from needle_tracker.tracking.following import (
     FOLLOW_AHEAD,
     PLAIN_ALONG_PX,
@@ -230,7 +236,10 @@ class StereoTracker:
         beyond_doubt = is_sound(measured.image_tips, PLAIN_PX, PLAIN_ALONG_PX)
         sound = is_sound(measured.image_tips, SOUND_PX, SOUND_ALONG_PX)
         seen = is_sound(measured.image_tips, CLEAR_PX, CLEAR_ALONG_PX)
-        believed = self.track.accept(tip, insertion, anew=anew, certain=beyond_doubt, seen=seen)
+        come = has_come(measured.image_tips)
+        believed = self.track.accept(
+            tip, insertion, anew=anew, certain=beyond_doubt, seen=seen, come=come
+        )
         self._believed = believed or self._believed
         left_tip, right_tip = measured.image_tips
         if left_tip is not None and right_tip is not None:

@@ -51,7 +51,7 @@ def test_a_camera_that_was_touched_leaves_the_image_as_it_is() -> None:
 def test_an_empty_phantom_has_no_seam() -> None:
     background = Background(floor(1, lines=True), ENTRY, None)
     assert background.is_empty
-    assert not background.is_seam(ENTRY, 5.0)
+    assert background.beyond_seam(ENTRY) == np.inf
 
 
 def line_map(begin: int, end: int) -> Image:
@@ -68,8 +68,8 @@ def test_beyond_what_is_new_there_is_no_needle_though_it_is_not_known_where_it_w
     joined = background.joined(whole, line_map(180, 220), before)
     assert (joined[120, 25:220] > 128).all()
     assert not joined[:, 222:].any()
-    assert background.is_seam(np.array([182.0, 120.0]), 5.0)
-    assert not background.is_seam(np.array([220.0, 120.0]), 5.0)
+    assert background.beyond_seam(np.array([182.0, 120.0])) == pytest.approx(2.0, abs=1.0)
+    assert background.beyond_seam(np.array([150.0, 120.0])) == pytest.approx(-30.0, abs=1.0)
     assert not background.is_empty
 
 
@@ -78,7 +78,7 @@ def test_too_little_that_is_new_says_nothing() -> None:
     whole = line_map(25, 300)
     joined = background.joined(whole, line_map(180, 190), line_map(25, 180))
     assert (joined == whole).all()
-    assert not background.is_seam(np.array([182.0, 120.0]), 5.0)
+    assert background.beyond_seam(np.array([182.0, 120.0])) == -np.inf
 
 
 def test_where_a_needle_has_gone_nothing_is_new() -> None:

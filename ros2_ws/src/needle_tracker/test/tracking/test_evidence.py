@@ -18,6 +18,7 @@ from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking import acquisition
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
+    has_come,
     is_half_sound,
     is_sound,
     look_alike,
@@ -79,6 +80,14 @@ def test_how_badly_a_line_may_be_known_grows_with_what_is_allowed_it() -> None:
         assert usual.allows((GOOD, wide)) is usual.allows((GOOD, line))
         mixed = usual.unmixed((line, wide))
         assert mixed[1].sigma_across == pytest.approx(4.0 * mixed[0].sigma_across)
+
+
+def test_what_has_come_is_new_in_both_views_and_seen_in_both() -> None:
+    new = dataclasses.replace(GOOD, come=True)
+    assert has_come((new, new))
+    for other in (GOOD, hidden(new), dataclasses.replace(new, sigma_along=3.5), None):
+        assert not has_come((new, other))
+        assert not has_come((other, new))
 
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:

@@ -115,6 +115,14 @@ def test_over_graph_paper_the_empty_phantom_is_what_helps(calibration: StereoCal
     assert sum(found) < len(found) - 1
 
 
+def test_what_was_not_in_the_empty_phantom_is_believed_at_once_without_the_insertion(
+    calibration: StereoCalibration,
+) -> None:
+    tip, truth = tracked(calibration, "steel_on_graph_paper", empty=True, insertion=False)[0]
+    assert tip is not None
+    assert np.linalg.norm(tip.position - truth) < 0.5e-3
+
+
 TOLD = [
     {"empty": True, "insertion": True},
     {"empty": False, "insertion": True},

@@ -114,6 +114,12 @@ def test_without_it_several_must_agree(gates: GateSettings) -> None:
     assert track.anchor is None
 
 
+def test_what_has_come_is_confirmed_by_one_sight_without_the_insertion(gates: GateSettings) -> None:
+    track = Track(gates)
+    assert track.accept(tip(), None, come=True) is not None
+    assert track.state is TrackState.TRACKING
+
+
 @pytest.mark.parametrize(("missed", "confirmed"), [(2, True), (3, False)])
 def test_what_is_seen_twice_within_a_few_pairs_is_confirmed(
     gates: GateSettings, missed: int, confirmed: bool
