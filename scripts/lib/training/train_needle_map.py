@@ -10,19 +10,22 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+import tempfile
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 from torch import nn
 from torch.nn import functional
 from tqdm import tqdm
 
-from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.camera.stereo_rig import StereoRig, load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba
+from needle_sim.sequences.boxes import draw_box
 from needle_tracker.image.needle_map import normalized
 from needle_verification.training.patches import SIZE, patch
 from needle_verification.training.traced_patches import BORDER, traced_patch
@@ -32,13 +35,16 @@ Batch = tuple[NDArray[Any], NDArray[Any]]
 
 TRACKER = Path(__file__).parents[3] / "ros2_ws/src/needle_tracker"
 WEIGHTS = TRACKER / "needle_tracker/image/needle_map.onnx"
-CALIBRATION = TRACKER / "config/calibration.yaml"
+CALIBRATIONS = (
+    TRACKER / "config/calibration.yaml",
+    TRACKER / "config/calibration_top_and_side.yaml",
+)
 _CHANNELS, _FINE_CHANNELS = 16, 8
 _DILATIONS = (1, 2, 4, 8, 4, 2, 1)
 _SHARD = 256
 _TRACED_SHARE = 0.6  # of a batch
-_PLAIN_WIDTH_PX = 4.6  # of a needle where there is none
 _BATCH, _RATE, _DECAY = 16, 3e-3, 1e-4
+_RATE_ON = 1e-3  # of a net that has learned before
 _NEEDLE_WEIGHT = 4.0  # most pixels are floor
 
 
@@ -96,10 +102,20 @@ def draw_all(shards: int) -> Batch:
 
 
 def trace_all(count: int) -> list[TracedScene]:
-    """Return path-traced scenes."""
-    mitsuba, rig = load_mitsuba(), load_stereo_rig(CALIBRATION)
+    """Return path-traced scenes: on the bench, from above and beside, and in every other a box."""
+    mitsuba = load_mitsuba()
     bar = tqdm(range(count), "tracing scenes", unit="scene")
-    return [trace_scene(mitsuba, rig, seed, _PLAIN_WIDTH_PX) for seed in bar]
+    return [trace_scene(mitsuba, rig_of(seed), seed) for seed in bar]
+
+
+def rig_of(seed: int) -> StereoRig:
+    """Return the cameras of a scene."""
+    if seed % 2 == 0:
+        return load_stereo_rig(CALIBRATIONS[seed // 2 % 2])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "box.yaml")
+        path.write_text(draw_box(seed), encoding="utf-8")
+        return load_stereo_rig(path)
 
 
 def batch(rng: np.random.Generator, drawn: Batch, scenes: list[TracedScene]) -> Batch:
@@ -120,15 +136,30 @@ def batch(rng: np.random.Generator, drawn: Batch, scenes: list[TracedScene]) -> 
     return seen, wanted
 
 
-def train(drawn: Batch, scenes: list[TracedScene], steps: int) -> NeedleNet:
-    """Return a net trained on these."""
+def stored(weights: Path) -> dict[str, torch.Tensor]:
+    """Return the numbers of a stored net, by their names in `NeedleNet`."""
+    numbers = onnx.load(weights).graph.initializer
+    return {
+        number.name.partition(".")[2]: torch.tensor(onnx.numpy_helper.to_array(number))
+        for number in numbers
+    }
+
+
+def train(
+    drawn: Batch, scenes: list[TracedScene], steps: int, begin_with: Path | None
+) -> NeedleNet:
+    """Return a net trained on these, anew or from stored weights on."""
     torch.manual_seed(0)
     # More threads than that wait for each other longer than they work.
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
     net: NeedleNet = NeedleNet().to(memory_format=torch.channels_last)
-    optimizer = torch.optim.AdamW(net.parameters(), _RATE, weight_decay=_DECAY)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, _RATE, total_steps=steps)
+    rate = _RATE
+    if begin_with is not None:
+        net.load_state_dict(stored(begin_with))
+        rate = _RATE_ON
+    optimizer = torch.optim.AdamW(net.parameters(), rate, weight_decay=_DECAY)
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
     bar = tqdm(range(steps), "training", unit="step")
     mean = 0.0
     for step in bar:
@@ -152,9 +183,13 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=20000, metavar="N", help="default: 20000")
     parser.add_argument("--shards", type=int, default=72, metavar="N", help="x256; default: 72")
     parser.add_argument("--scenes", type=int, default=140, metavar="N", help="default: 140")
+    parser.add_argument(
+        "--begin-with", type=Path, metavar="FILE.onnx", help="learn on from these; default: anew"
+    )
     parser.add_argument("--output", type=Path, default=WEIGHTS, metavar="FILE.onnx")
     given = parser.parse_args()
-    net = train(draw_all(given.shards), trace_all(given.scenes), given.steps).eval()
+    drawn, scenes = draw_all(given.shards), trace_all(given.scenes)
+    net = train(drawn, scenes, given.steps, given.begin_with).eval()
     size = {2: "height", 3: "width"}
     torch.onnx.export(
         NeedleMapNet(net),

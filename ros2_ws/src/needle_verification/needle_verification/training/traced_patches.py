@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.image.background import Background
 from needle_verification.training.patches import LIKE, SIZE, WIDTH
 from needle_verification.training.traced_scenes import TracedScene
 
@@ -14,6 +15,7 @@ Array = NDArray[np.float64]
 BORDER = 32
 """Margin rendered around a patch [px]."""
 _AT_END, _ON_SHAFT = 0.55, 0.3  # so often there; else anywhere
+_NEW = 0.35  # so often what has come since an earlier image
 _BESIDE_PX = 38.0  # so far from the middle may be what a patch is about
 _SMALLER, _BLUR = 0.8, 0.45  # images made smaller than that are blurred, by so many new pixels
 
@@ -39,7 +41,9 @@ def traced_patch(
     """
     i = int(rng.integers(len(scene.images)))
     image, share = scene.images[i], scene.shares[i]
-    scale = WIDTH * rng.uniform(*LIKE) / scene.width_px
+    if i > 1 and rng.random() < _NEW:
+        image, share = new_part(scene, i, int(rng.choice(np.arange(i % 2, i, 2))))
+    scale = WIDTH * rng.uniform(*LIKE) / scene.widths_px[i]
     angle = rng.uniform(0.0, 2.0 * np.pi) if rng.random() < 0.4 else 0.0
     place = _place(rng, scene, i) + rng.uniform(-_BESIDE_PX, _BESIDE_PX, 2) / scale
     if scale < _SMALLER:
@@ -50,6 +54,23 @@ def traced_patch(
     cut = cv2.warpAffine(image, to, (size, size), borderMode=cv2.BORDER_REFLECT)
     wanted = cv2.warpAffine(share, to, (size, size))[BORDER:-BORDER, BORDER:-BORDER]
     return _exposed_anew(rng, cut), wanted.astype(np.float32) / np.float32(255.0)
+
+
+def new_part(scene: TracedScene, i: int, k: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return what one image has beside an earlier one of its camera, and the shaft in that.
+
+    Parameters
+    ----------
+    scene : TracedScene
+        Where from.
+    i, k : int
+        The image, and the earlier one. Where nothing is gained the image itself is returned.
+    """
+    image, share = scene.images[i], scene.shares[i]
+    difference = Background(scene.images[k], np.zeros(2), None).difference(image)
+    if difference is None:
+        return image, share
+    return difference, np.asarray(cv2.subtract(share, scene.shares[k]), np.uint8)
 
 
 def _place(rng: np.random.Generator, scene: TracedScene, i: int) -> Array:
