@@ -221,12 +221,12 @@ def _parts(drawn: Image, path: Path, least: int, width: float) -> list[Path]:
     if not len(seen):
         return []
     pitch = max(float(np.linalg.norm(np.diff(path.pixels, axis=0), axis=1).mean()), 1e-6)
-    gaps = np.diff(seen, prepend=0) * pitch / width
+    gaps = np.diff(seen, prepend=seen[0]) * pitch / width
     too_long = np.flatnonzero(gaps > _HIDDEN_WIDTHS)
     reached = too_long[0] if len(too_long) else len(seen)
-    lasts = [i - 1 for i in np.flatnonzero(gaps[:reached] > _GAP_WIDTHS) if i > 0]
-    if reached:
-        lasts.append(reached - 1)
+    lasts = [*(np.flatnonzero(gaps[:reached] > _GAP_WIDTHS) - 1), reached - 1]
+    # Where it enters, a box's edge may hide more of it, as long as most of it is seen.
+    whole = 0 if seen[0] * pitch <= _HIDDEN_WIDTHS * width else 2 * seen[0]
     return [
         dataclasses.replace(
             path,
@@ -237,5 +237,5 @@ def _parts(drawn: Image, path: Path, least: int, width: float) -> list[Path]:
             evidence=path.evidence * (i + 1) / len(seen),
         )
         for i in lasts
-        if (count := int(seen[i]) + 1) > least
+        if (count := int(seen[i]) + 1) > max(least, whole)
     ]
