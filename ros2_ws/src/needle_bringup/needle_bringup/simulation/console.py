@@ -31,6 +31,8 @@ _POLL = 0.1
 _RIG = ("sim_rig", "drive_emulator", "device_driver", "stereo_tracker", "plane_controller")
 _CONSOLE = "console"
 _PARAMETERS = "parameters.yaml"
+# As often as a page shows them: to draw and track more leaves two cores no time for the hold [Hz].
+_CAMERA_RATE = 10.0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -83,6 +85,7 @@ def console_parameters(options: ConsoleOptions) -> Parameters:
     parameters = {node: values for node, values in rig.items() if node in _RIG}
     for values in parameters.values():
         values.pop("wait_for_recorder", None)
+    parameters["sim_rig"]["camera_rate"] = _CAMERA_RATE
     ports = {"port": options.port, "hold_port": options.port + 1}
     return {**parameters, _CONSOLE: {"address": LOOPBACK, **ports}}
 

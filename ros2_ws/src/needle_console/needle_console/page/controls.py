@@ -58,12 +58,15 @@ class Controls:
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
         possible = sensible(snapshot)
+        device = snapshot.device
+        must_let_go = device is not None and device.press_again == self._desk.name
         for button, element in self._buttons.items():
             usable = button in possible and not self._other_steers
             if button not in _HOLDS:
                 element.set_enabled(usable)
             # What is held must stay what it is until it is let go: no hold is ever disabled.
             _mark(element, "dim", not usable)
+            _mark(element, "again", must_let_go and button in _HOLDS)
             _mark(element, "next", button is advice.button and usable)
 
     def _build_hold(self, desk: Desk) -> None:
