@@ -196,6 +196,8 @@ class Steering:
         if status.state in _DISABLED_DEVICE:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
+            # Who presses anew has looked; who lets go soon has not made a command fail.
+            self._failed.forget()
             actions += self._ask()
         elif self.awaiting is Awaiting.DEVICE:
             actions += self._send()

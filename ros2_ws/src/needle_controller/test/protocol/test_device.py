@@ -8,7 +8,7 @@ import pytest
 from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
 from needle_controller.protocol.step_watch import MOST_REFUSALS
 
-from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
+from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
 
 def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
@@ -129,6 +129,16 @@ def test_commands_that_never_move_end_in_a_fault() -> None:
         actions = rig.steering.on_result(step.stamp_ns, "aborted: beyond a limit")
     assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
     assert "beyond a limit" in logged(actions)
+
+
+def test_a_person_who_lets_go_at_once_many_times_is_no_fault() -> None:
+    rig = Rig()
+    for _ in range(2 * MOST_REFUSALS):
+        step = sent(rig.expose())
+        rig.steering.on_result(step.stamp_ns, "aborted: hold released")
+        rig.steering.on_device(FREE)
+        rig.steering.on_device(HELD)
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
 
 
 def test_commands_follow_data_alone() -> None:
