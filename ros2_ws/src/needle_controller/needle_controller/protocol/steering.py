@@ -186,6 +186,9 @@ class Steering:
 
     def on_device(self, status: DeviceReport) -> list[Action]:
         """Take the driver's state."""
+        if not status.hold_owner:
+            # Who lets go has not made a command fail, and who presses anew has looked.
+            self._failed.forget()
         self._device = status
         actions = self._heard()
         if not self._steering:
@@ -196,8 +199,6 @@ class Steering:
         if status.state in _DISABLED_DEVICE:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")
         if self.awaiting is Awaiting.HOLD and status.hold_owner:
-            # Who presses anew has looked; who lets go soon has not made a command fail.
-            self._failed.forget()
             actions += self._ask()
         elif self.awaiting is Awaiting.DEVICE:
             actions += self._send()

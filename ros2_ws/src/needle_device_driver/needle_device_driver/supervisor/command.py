@@ -125,7 +125,7 @@ def check_command(
         return Refusal(
             Rule.COMMAND_ONE_PUBLISHER, f"{context.publishers} nodes publish commands, wanted 1"
         )
-    wrong = _check_form(command) or _check_time(command, context, limits)
+    wrong = check_form(command) or _check_time(command, context, limits)
     if wrong is not None:
         return wrong
     if not context.homed:
@@ -137,7 +137,8 @@ def check_command(
     return _check_bounds(way, context, limits) or _ahead(way, context.insertion)
 
 
-def _check_form(command: Command) -> Refusal | None:
+def check_form(command: Command) -> Refusal | None:
+    """Return what is wrong with a command wherever the device is; None if nothing is."""
     names, points = command.joint_names, command.points
     if set(names) != {INSERTION_JOINT, ROTATION_JOINT} or len(names) != 2:
         return Refusal(

@@ -6,7 +6,13 @@ import dataclasses
 
 from needle_device_driver.axes.axis_pair import PairSnapshot
 from needle_device_driver.rules import Rule
-from needle_device_driver.supervisor.command import Command, CommandContext, Refusal, check_command
+from needle_device_driver.supervisor.command import (
+    Command,
+    CommandContext,
+    Refusal,
+    check_command,
+    check_form,
+)
 from needle_device_driver.supervisor.command_stamps import CommandStamps
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold
@@ -82,6 +88,10 @@ class CommandDesk:
         """Take a command, nothing checked; return whether it moves the needle from now on."""
         self.newest_ns = command.stamp_ns
         if command.is_path and not self._is_due(command):
+            wrong = check_form(command)
+            if wrong is not None:
+                self._refuse(command, wrong)
+                return False
             self._waiting = _Waiting(command, publishers, self._hold.presses)
             return False
         return self._start(command, now, publishers)
@@ -114,7 +124,9 @@ class CommandDesk:
             self._core.abort(text)
 
     def _is_due(self, command: Command) -> bool:
-        return self._stamps.newest_ns >= command.stamp_ns + self._delay_ns
+        # One from the future is for the rules to refuse.
+        waits = command.stamp_ns <= self._stamps.newest_ns < command.stamp_ns + self._delay_ns
+        return not waits
 
     def _start(self, command: Command, now: float, publishers: int) -> bool:
         at = self._ready_for(command, now)

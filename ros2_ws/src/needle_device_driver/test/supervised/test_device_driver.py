@@ -79,7 +79,7 @@ def test_bad_commands_are_refused_whole_and_disturb_nothing(make_rig: Make) -> N
         "not newer": rig.message(stamp_ns=rig.time_ns - 10_000_000_000),
         "future": rig.message(stamp_ns=rig.time_ns + 5_000_000_000),
         "wanted insertion_joint": rig.message(names=["insertion_joint", "roll_joint"]),
-        "2 points": rig.message(points=2),
+        "does not rise": rig.message(points=2),
         "0 points": rig.message(points=0),
         "positions": rig.message([0.001]),
         "step 3 mm": rig.message([here[0] + 0.003, here[1]]),

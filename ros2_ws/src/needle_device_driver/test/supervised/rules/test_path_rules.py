@@ -229,6 +229,16 @@ def test_no_motion_by_itself_in_lock_step_a_path_takes_effect_a_stated_time_afte
     assert moved == [False, True, True, True][late:] if late < 2 else [True, True]
 
 
+def test_command_form_and_age_of_a_path_that_would_wait_are_refused_at_once() -> None:
+    bench = delayed()
+    path(bench, (0.0, 0.0), (1.0, 0.0), (0.9, 0.0))
+    assert bench.last_rule is Rule.COMMAND_FORM
+    stamp = path(bench, (0.0, 0.0), (1.0, 0.0), (2.0, 0.0), stamp_ns=bench.ros_ns + 5_000_000_000)
+    assert (bench.results[-1].stamp_ns, bench.last_rule) == (stamp, Rule.TIP_AGE)
+    bench.cycle(5, holding=True)
+    assert bench.positions == (0.0, 0.0)
+
+
 def test_hold_new_press_a_path_that_waits_is_not_for_another_press() -> None:
     bench = delayed()
     stamp = path(bench, (0.0, 0.0), (1.0, 0.1), (2.0, 0.1))
