@@ -110,8 +110,12 @@ def test_command_state_a_step_never_takes_the_place_of_a_path_nor_a_path_of_a_st
     bench.cycle(30, holding=True)
     path(bench, (1.0, 0.1), (2.0, 0.1), (3.0, 0.1))
     bench.cycle(2, holding=True)
-    bench.command()
-    assert bench.last_rule is Rule.COMMAND_STATE
+    stamp = bench.command()
+    refusal = bench.results[-1]
+    assert (refusal.stamp_ns, refusal.outcome) == (
+        stamp,
+        "aborted: the device is MOVING, not HOLDING",
+    )
     assert in_state(bench, State.MOVING)
 
 
