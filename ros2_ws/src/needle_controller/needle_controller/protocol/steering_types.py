@@ -67,6 +67,11 @@ class SendStep:
     rotation: float
     duration: float
 
+    @property
+    def points(self) -> tuple[tuple[float, float, float], ...]:
+        """Its one point, as `SendPath` has several."""
+        return ((self.insertion, self.rotation, self.duration),)
+
 
 @dataclasses.dataclass(frozen=True)
 class SendPath:

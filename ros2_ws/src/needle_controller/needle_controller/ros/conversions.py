@@ -113,14 +113,8 @@ def _number(text: str) -> float | None:
 
 def to_trajectory(command: SendStep | SendPath) -> JointTrajectory:
     """Return a step as a trajectory of one point, a path as one of several."""
-    if isinstance(command, SendStep):
-        points: tuple[tuple[float, float, float], ...] = (
-            (command.insertion, command.rotation, command.duration),
-        )
-    else:
-        points = command.points
     message = JointTrajectory(joint_names=[INSERTION_JOINT, ROTATION_JOINT])
-    for insertion, rotation, time in points:
+    for insertion, rotation, time in command.points:
         point = JointTrajectoryPoint(positions=[insertion, rotation])
         nanoseconds = round(time * 1e9)
         point.time_from_start.sec, point.time_from_start.nanosec = divmod(nanoseconds, 10**9)

@@ -11,7 +11,6 @@ import heapq
 import itertools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -229,13 +228,8 @@ def rms_at_end(needle: SteeredNeedle, offset: float, length: float = 0.02) -> fl
 
 
 def _command(action: SendStep | SendPath) -> Command:
-    points: Any = (
-        ((action.insertion, action.rotation, action.duration),)
-        if isinstance(action, SendStep)
-        else action.points
-    )
     return Command(
         action.stamp_ns,
         (INSERTION_JOINT, ROTATION_JOINT),
-        tuple(CommandPoint((at, rotation), (), time) for at, rotation, time in points),
+        tuple(CommandPoint((at, rotation), (), time) for at, rotation, time in action.points),
     )
