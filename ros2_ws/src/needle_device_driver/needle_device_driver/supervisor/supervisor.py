@@ -86,6 +86,11 @@ class MotionSupervisor:
         """Kind of the motion under way."""
         return self._core.activity
 
+    @property
+    def command_ns(self) -> int:
+        """Stamp of the newest command, whatever became of it [ns]; 0: none yet."""
+        return self._commands.newest_ns
+
     def take_events(self) -> tuple[Event, ...]:
         """Return what happened since the last call."""
         return self._core.take_events()
@@ -123,7 +128,7 @@ class MotionSupervisor:
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
             needs_time=self.may_move(now) or self._switching() or self._commands.needs_time(now),
-            command_ns=self._commands.newest_ns,
+            command_ns=self.command_ns,
             rotation_owed=self._core.rotation_owed,
         )
 

@@ -110,7 +110,7 @@ class DriveFollower:
         """Return whether somebody's hold counts."""
         return self._status.get("hold_owner", "") != ""
 
-    def heard_command(self, _: float) -> int:
+    def heard_command(self) -> int:
         """Return the stamp of the newest command that the device has heard [ns]."""
         return int(self._status.get("command_ns") or 0)
 

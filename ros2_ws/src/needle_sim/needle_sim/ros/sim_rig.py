@@ -184,7 +184,7 @@ class SimRigNode(WholeNode):
         trips = self._lock_step.watchdog_trips
         action = self._lock_step.next_action(
             time_ns=self._time_ns,
-            heard_command_ns=self._device.heard_command(now),
+            heard_command_ns=self._device.heard_command(),
             under_way=self._device.under_way(),
             may_move=self._device.may_move(now),
             held=self._device.held(now),

@@ -113,9 +113,9 @@ class SimulatedDevice:
         """Return whether somebody's hold counts."""
         return bool(self._supervisor.status(now).hold_owner)
 
-    def heard_command(self, now: float) -> int:
+    def heard_command(self) -> int:
         """Return the stamp of the newest command that the device has heard [ns]."""
-        return self._supervisor.status(now).command_ns
+        return self._supervisor.command_ns
 
     def begin_tick(self, time_ns: int, period: float, now: float) -> None:
         """Let `period` [s] go by that ends at `time_ns` [ns]."""
