@@ -22,8 +22,9 @@ _COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.
 def compiled(function: Function) -> Function:
     """Compile a function of numbers and arrays at its first call; a decorator.
 
-    Divisions follow IEEE 754, as numpy's do, and nothing is reordered: results do not depend on how
-    many elements a call has. A product and a sum may become one rounding (FMA).
+    All follows IEEE 754, as Python's floats do: nothing is reordered, and a product and a sum stay
+    two roundings. So results depend neither on how many elements a call has nor on what the
+    compiler put into the caller, which differs between the process that compiles and those after it.
 
     What was compiled is kept in the user's cache, in a folder named after all files of the
     function's package, from its root down, that hold compiled functions or are marked as read by
@@ -60,7 +61,6 @@ def _compile(function: Function, *, always_inline: bool) -> Function:
         result = numba.njit(
             cache=bool(folder),
             error_model="numpy",
-            fastmath={"contract"},
             forceinline=always_inline,
         )(function)
     finally:

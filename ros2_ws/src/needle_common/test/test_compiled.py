@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pwd
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -97,3 +98,15 @@ def test_an_edited_callee_in_another_room_is_compiled_anew(tmp_path: Path) -> No
         said.append(subprocess.check_output(command, env=environment, text=True, timeout=60))
     assert list((tmp_path / "cache").rglob("*.nbi"))
     assert said == ["1\n", "2\n"]
+
+
+@compiled.compiled
+def _weighted(weight: float, one: float, other: float) -> float:
+    return one + weight * (other - one)
+
+
+def test_products_and_sums_are_rounded_as_pythons_are() -> None:
+    draw = random.Random(4).gauss
+    for _ in range(1000):
+        numbers = draw(0.0, 1.0), draw(0.0, 1.0), draw(0.0, 1.0)
+        assert _weighted(*numbers) == _weighted.__wrapped__(*numbers)  # type: ignore[attr-defined]
