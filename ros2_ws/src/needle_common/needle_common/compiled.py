@@ -24,7 +24,8 @@ def compiled(function: Function) -> Function:
 
     All follows IEEE 754, as Python's floats do: nothing is reordered, and a product and a sum stay
     two roundings. So results depend neither on how many elements a call has nor on what the
-    compiler put into the caller, which differs between the process that compiles and those after it.
+    compiler put into the caller, which is not the same where a function is compiled and where it
+    comes from the cache.
 
     What was compiled is kept in the user's cache, in a folder named after all files of the
     function's package, from its root down, that hold compiled functions or are marked as read by

@@ -226,10 +226,7 @@ class CanLink:
         self.lost = self.other_master = ""
         self._heard_at = self.clock()
         self.openings += 1
-        self._thread = threading.Thread(
-            target=self._receive, args=(bus, self._network), name="can-receive", daemon=True
-        )
-        self._thread.start()
+        self._begin_to_receive(bus, self._network)
 
     def close(self) -> None:
         """Let go of the adapter. May be called twice."""
@@ -287,11 +284,21 @@ class CanLink:
         if self._network is None or not self.is_open:
             raise LinkError(self.lost or f"{self.settings} is not open")
         if node_id not in self._sdo:
-            client = PatientSdoClient(node_id, self.beat, _HEARTBEAT_PERIOD)
+            client = PatientSdoClient(node_id, self.beat, _HEARTBEAT_PERIOD, self._wait_for)
             client.network = self._network
             self._network.subscribe(client.tx_cobid, client.on_response)
             self._sdo[node_id] = client
         return self._sdo[node_id]
+
+    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+        self._thread = threading.Thread(
+            target=self._receive, args=(bus, network), name="can-receive", daemon=True
+        )
+        self._thread.start()
+
+    def _wait_for(self, predicate: Callable[[], bool], timeout: float) -> bool:
+        with self.arrival:
+            return self.arrival.wait_for(predicate, timeout)
 
     def _greet_again(self) -> None:
         bus = self._bus
@@ -338,6 +345,8 @@ class CanLink:
         for callback in self._callbacks.get(message.arbitration_id, ()):
             callback(bytes(data), now)
         network.notify(message.arbitration_id, data, now)
+        with self.arrival:
+            self.arrival.notify_all()
 
 
 def _close_port(bus: can.BusABC) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import queue
 from collections.abc import Callable
+from typing import Any
 
 from canopen import SdoAbortedError, SdoCommunicationError
 from canopen.objectdictionary import ObjectDictionary
@@ -33,13 +34,22 @@ class PatientSdoClient(SdoClient):
         Sends the computer's heartbeat.
     period : float
         Of the heartbeat [s].
+    wait : callable
+        Waits until what it is given returns true, at most so long [s].
     """
 
-    def __init__(self, node_id: int, beat: Callable[[], None], period: float) -> None:
+    def __init__(
+        self,
+        node_id: int,
+        beat: Callable[[], None],
+        period: float,
+        wait: Callable[[Callable[[], bool], float], Any],
+    ) -> None:
         # Entries are addressed by number: canopen needs to know none by name.
         super().__init__(0x600 + node_id, 0x580 + node_id, ObjectDictionary())  # type: ignore[no-untyped-call]
         self._beat = beat
         self._period = period
+        self._wait = wait
 
     def request_response(self, sdo_request: bytes) -> bytes:
         """Send a request and return the answer to it.
@@ -65,14 +75,13 @@ class PatientSdoClient(SdoClient):
 
     def _await(self, request: bytes) -> bytes | None:
         for _ in range(round(_RESPONSE_WAIT / self._period)):
-            try:
-                while True:
-                    # Eight bytes; not every drive sends those that it does not need.
-                    response = bytes(self.responses.get(timeout=self._period)).ljust(8, b"\0")
-                    if _answers(response, request):
-                        return response
-            except queue.Empty:
-                self._beat()
+            self._wait(lambda: not self.responses.empty(), self._period)
+            while not self.responses.empty():
+                # Eight bytes; not every drive sends those that it does not need.
+                response = bytes(self.responses.get_nowait()).ljust(8, b"\0")
+                if _answers(response, request):
+                    return response
+            self._beat()
         return None
 
 

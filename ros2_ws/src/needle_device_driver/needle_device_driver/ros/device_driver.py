@@ -7,6 +7,7 @@ import gc
 import logging
 import sys
 import time
+from collections.abc import Callable
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
@@ -37,7 +38,7 @@ from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
-from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.ros.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.states import State
@@ -76,11 +77,17 @@ class DeviceDriverNode(WholeLifecycleNode):
 
     Parameters
     ----------
+    make_link : callable
+        Makes the link to the drives, of its settings and the steady clock.
     node_arguments : dict
         Passed on to rclpy's Node (a context of its own, parameter overrides).
     """
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(
+        self,
+        make_link: Callable[[LinkSettings, Callable[[], float]], CanLink] = CanLink,
+        **node_arguments: Any,
+    ) -> None:
         # A long request would hold the cycle up: `ParameterDesk` answers.
         super().__init__("device_driver", start_parameter_services=False, **node_arguments)
         values = NodeParameters(self, DeviceDriverParameters).values
@@ -88,7 +95,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         if values.lock_step and not self._sim_time:
             raise UserError(f"{self.get_fully_qualified_name()}: lock_step wants use_sim_time")
-        self._link = CanLink(values.link_settings, time.monotonic)
+        self._link = make_link(values.link_settings, time.monotonic)
         insertion, rotation = (
             Cia402Axis(
                 name, values.drive(name), self._link, period=PERIOD, watchdog=values.watchdog

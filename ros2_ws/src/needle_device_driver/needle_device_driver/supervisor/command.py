@@ -236,9 +236,11 @@ def _check_bounds(
             f"insertion {back.leg.insertion * 1e3:.4g} mm is not ahead of the point before, "
             f"{back.start[0] * 1e3:.4g} mm",
         )
-    speed = max(piece.length / piece.leg.duration for piece in way)
+    # Who commands counts from where the axes are, which may be beside where they were told to be,
+    # and a message's times are whole nanoseconds. The motion itself is held to both bounds.
+    speed = max((piece.length - limits.insertion_tolerance) / piece.leg.duration for piece in way)
     rotation = max(abs(piece.leg.rotation - context.rotation) for piece in way)
-    rate = max(piece.turn / piece.leg.duration for piece in way)
+    rate = max((piece.turn - limits.rotation_tolerance) / piece.leg.duration for piece in way)
     turns = max(abs(piece.leg.rotation) for piece in way) / (2 * math.pi)
     bounded = (
         (Rule.MAX_DEPTH, "depth", end * 1e3, limits.max_depth * 1e3, "mm"),

@@ -22,7 +22,7 @@ class Wire:
         self.answers = list(answers)
         self.sent: list[bytes] = []
         self.beats = 0
-        self.client = PatientSdoClient(1, self.beat, 0.001)
+        self.client = PatientSdoClient(1, self.beat, 0.001, lambda there, _: there())
         network: Any = self
         self.client.network = network
         self.on_beat: list[bytes] = []

@@ -35,7 +35,17 @@ class SdoAbortError(Exception):
 
 
 class Kind(enum.Enum):
-    """A numeric type: size in bytes, and whether it has a sign."""
+    """A numeric type.
+
+    Attributes
+    ----------
+    size : int
+        In bytes.
+    signed : bool
+        Whether it has a sign.
+    bounds : tuple of int
+        Smallest and largest value.
+    """
 
     U8 = (1, False)
     U16 = (2, False)
@@ -44,21 +54,10 @@ class Kind(enum.Enum):
     I16 = (2, True)
     I32 = (4, True)
 
-    @property
-    def size(self) -> int:
-        """Size in bytes."""
-        return self.value[0]
-
-    @property
-    def signed(self) -> bool:
-        """Tell whether it has a sign."""
-        return self.value[1]
-
-    @property
-    def bounds(self) -> tuple[int, int]:
-        """Smallest and largest value."""
-        bits = 8 * self.size
-        return (-(1 << bits - 1), (1 << bits - 1) - 1) if self.signed else (0, (1 << bits) - 1)
+    def __init__(self, size: int, signed: bool) -> None:
+        self.size, self.signed = size, signed
+        bits = 8 * size
+        self.bounds = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
 
 
 @dataclasses.dataclass

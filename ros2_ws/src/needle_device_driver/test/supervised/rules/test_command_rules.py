@@ -244,6 +244,13 @@ def test_max_speed_of_5_mm_a_second_is_a_hard_cap(bench: Bench) -> None:
         SafetyLimits(max_speed=0.0051)
 
 
+def test_max_speed_takes_a_step_at_the_bound_whatever_its_time_is_rounded_to(bench: Bench) -> None:
+    bench.ready()
+    # A nanosecond less than the way takes at 5 mm/s, as a message has it.
+    bench.command(0.0003, duration=0.059_999_999)
+    assert bench.state is State.MOVING
+
+
 def test_max_rotation_step(bench: Bench) -> None:
     bench.ready()
     bench.command(0.001, -1.21)
