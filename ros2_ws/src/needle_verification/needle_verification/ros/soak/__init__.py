@@ -1,0 +1,1 @@
+"""The rig's own nodes on a virtual middleware, clock and bus."""

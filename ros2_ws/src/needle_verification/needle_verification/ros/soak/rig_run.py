@@ -1,0 +1,164 @@
+"""One run of the virtual rig under a schedule of faults, watched from beginning to end."""
+
+from __future__ import annotations
+
+import dataclasses
+import random
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import Joy
+
+from needle_common.ros.conversions import values_of
+from needle_device_driver.supervisor.limits import SafetyLimits
+from needle_verification.ros.soak.fault_orders import FaultOrders
+from needle_verification.ros.soak.virtual_bench import Motors
+from needle_verification.ros.soak.virtual_person import OUT, Wish
+from needle_verification.ros.soak.virtual_rig import VirtualRig, virtual_rig
+from needle_verification.soak.faults import STRANGER, Fault, draw_schedule
+from needle_verification.soak.invariants import Bounds, Violation, Watch
+from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
+
+# Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
+# out. A killed node counts for 8 s more, and a driver looks for its drives again.
+_GO_ON, _DRAW_OUT = 60.0, 60.0
+# The device's faults that take the joints from the controller, or give it others.
+_JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_controller")
+
+
+@dataclasses.dataclass(frozen=True)
+class RunResult:
+    """What came of a run.
+
+    Attributes
+    ----------
+    seed : int
+        Its seed.
+    faults : tuple of Fault
+        What happened to it.
+    violations : tuple of Violation
+        What must never be, and was.
+    digest : str
+        Of all that was published and called, of every command and of the motors' ways.
+    simulated : float
+        How long it took in its own time [s].
+    inserted : bool
+        Whether the controller was done once.
+    log : tuple of str
+        What the nodes logged, one line each.
+    """
+
+    seed: int
+    faults: tuple[Fault, ...]
+    violations: tuple[Violation, ...]
+    digest: str
+    simulated: float
+    inserted: bool
+    log: tuple[str, ...]
+
+
+def schedule_of(seed: int) -> list[Fault]:
+    """Return the faults of a seed; every twentieth run has none."""
+    return draw_schedule(random.Random(f"faults of {seed}")) if seed % 20 else []
+
+
+def run(seed: int, faults: Sequence[Fault]) -> RunResult:
+    """Run the rig once.
+
+    Parameters
+    ----------
+    seed : int
+        Of the run: order, delays, needle, noise.
+    faults : sequence of Fault
+        What goes wrong meanwhile.
+    """
+    with virtual_rig(seed) as rig:
+        watch = _watched(rig, faults)
+        orders = FaultOrders(rig)
+        for fault in faults:
+            rig.world.call_at(_ns(fault.at), partial(_begin, rig, orders, fault))
+        calm = max((fault.at + fault.lasts for fault in faults), default=0.0)
+        rig.world.run_until(_ns(calm))
+        rig.world.run_until(_ns(calm + _GO_ON), lambda: _has_left(rig))
+        if not _has_left(rig):
+            rig.person.wish = Wish.DRAW_OUT
+            rig.world.run_until(_ns(calm + _GO_ON + _DRAW_OUT), lambda: _has_left(rig))
+        now = _seconds(rig.world.steady_ns)
+        if not _has_left(rig):
+            watch.violate("the_way_goes_on", now, _state_of(rig))
+        if not faults and not rig.person.done:
+            watch.violate("undisturbed_converges", now, _state_of(rig))
+        return RunResult(
+            seed,
+            tuple(faults),
+            tuple(watch.violations),
+            rig.graph.digest.hexdigest(),
+            now,
+            rig.person.done,
+            tuple(
+                f"{_seconds(at):9.3f} {name}: {level}: {text}" for at, name, level, text in rig.log
+            ),
+        )
+
+
+def _begin(rig: VirtualRig, orders: FaultOrders, fault: Fault) -> None:
+    end = orders.begin(fault)
+    rig.world.call_at(_ns(fault.at + fault.lasts), end)
+
+
+def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
+    """Return what watches over a rig from now on."""
+    limits = SafetyLimits()
+    watch = Watch(
+        Bounds(limits.max_depth, limits.max_speed, limits.max_rotation, limits.max_rotation_rate)
+    )
+    joints_spoilt = any(fault.part in _JOINTS for fault in faults)
+
+    def see_motors(at: Motors) -> None:
+        now = _seconds(at.steady_ns)
+        process = rig.processes.get("device_driver")
+        speaks = process is not None and process.alive and not process.stands_still
+        rig.graph.digest.update(f"{at.insertion!r} {at.rotation!r}\n".encode())
+        watch.see_hand(now, holds=rig.hand.holds)
+        watch.see_driver(now, speaks=speaks)
+        watch.see_motors(now, at.insertion, at.rotation)
+
+    def see(topic: str, node: str, message: Any) -> None:
+        now = _seconds(rig.world.steady_ns)
+        if topic == "/device/status" and isinstance(message, DiagnosticStatus):
+            watch.see_device(now, values_of(message))
+        elif topic == "/needle/controller_status" and isinstance(message, DiagnosticStatus):
+            watch.see_belief(now, values_of(message), joints_heard=not joints_spoilt)
+        elif topic == "/device/joint_trajectory":
+            rig.graph.digest.update(repr(message).encode())
+        elif topic == "/device/hold" and node == "/stranger" and isinstance(message, Joy):
+            watch.see_other_hold(now)
+
+    rig.bench.watchers.append(see_motors)
+    rig.graph.watchers.append(see)
+    return watch
+
+
+def _has_left(rig: VirtualRig) -> bool:
+    person = rig.nodes.get("person")
+    left = person is not None and rig.person.wish is Wish.LEAVE
+    return left and rig.bench.motors.insertion < OUT
+
+
+def _state_of(rig: VirtualRig) -> str:
+    device, controller = rig.person.device, rig.person.controller
+    return (
+        f"the needle is {rig.bench.motors.insertion * 1e3:.2f} mm in; device "
+        f"{device.get('state')}: {device.get('fault') or device.get('reason')}; controller "
+        f"{controller.get('state')}: {controller.get('reason')}"
+    )
+
+
+def _ns(seconds: float) -> int:
+    return STEADY_START_NS + round(seconds * NANOSECONDS)
+
+
+def _seconds(steady_ns: int) -> float:
+    return (steady_ns - STEADY_START_NS) / NANOSECONDS

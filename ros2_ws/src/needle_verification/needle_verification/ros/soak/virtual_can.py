@@ -1,0 +1,179 @@
+"""The driver's CAN link to emulated drives: frames take their time, and may be lost."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import can
+import canopen
+
+from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
+from needle_sim.bus.can_frame import CanFrame
+from needle_sim.drives.emulated_bus import EmulatedBus
+from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
+
+# A frame's way, adapter included [ns], at least and at most.
+_FRAME_NS = (150_000, 600_000)
+# How often the drives look at their clocks [ns].
+_POLL_NS = 2_000_000
+TO_DRIVES, FROM_DRIVES = "can to the drives", "can from the drives"
+LINKS = (TO_DRIVES, FROM_DRIVES)
+
+
+class VirtualCan:
+    """Both drives on their bus, and the adapters that are plugged into it.
+
+    Parameters
+    ----------
+    world : VirtualWorld
+        Its time and chance.
+    bus : EmulatedBus
+        The drives.
+    faults : LinkFaults
+        What happens to frames, on `LINKS`.
+
+    Attributes
+    ----------
+    unplugged : bool
+        Whether the adapter is gone.
+    """
+
+    def __init__(self, world: VirtualWorld, bus: EmulatedBus, faults: LinkFaults) -> None:
+        self._world = world
+        self._faults = faults
+        self.bus = bus
+        self.unplugged = False
+        self._links: list[VirtualLink] = []
+        self._arrivals = dict.fromkeys(LINKS, 0)
+        self._poll()
+
+    def plug_in(self, link: VirtualLink) -> None:
+        """Let a link hear the bus."""
+        self._links.append(link)
+
+    def unplug(self) -> None:
+        """Take the adapter away from whoever has it open."""
+        self.unplugged = True
+        for link in self._links:
+            link.lose()
+        self._links.clear()
+
+    def pull(self, link: VirtualLink) -> None:
+        """Close a link."""
+        if link in self._links:
+            self._links.remove(link)
+
+    def send(self, identifier: int, data: bytes) -> None:
+        """Put a frame of the computer's on the bus."""
+        for fate in self._faults.fates(TO_DRIVES, data, self._world):
+            frame = CanFrame(identifier, fate.data)
+            self._world.call_at(
+                self._arrival(TO_DRIVES, fate.late_ns, overtakes=fate.overtakes),
+                lambda frame=frame: self._take(frame),  # type: ignore[misc]
+            )
+
+    def _take(self, frame: CanFrame) -> None:
+        self.bus.receive(frame, self._world.steady)
+        self._hand_on()
+
+    def _poll(self) -> None:
+        self._hand_on()
+        self._world.call_after(_POLL_NS, self._poll)
+
+    def _hand_on(self) -> None:
+        for frame in self.bus.poll(self._world.steady):
+            for fate in self._faults.fates(FROM_DRIVES, frame.data, self._world):
+                message = can.Message(
+                    arbitration_id=frame.identifier, data=fate.data, is_extended_id=False
+                )
+                self._world.call_at(
+                    self._arrival(FROM_DRIVES, fate.late_ns, overtakes=fate.overtakes),
+                    lambda message=message: self._arrive(message),  # type: ignore[misc]
+                )
+
+    def _arrive(self, message: can.Message) -> None:
+        for link in tuple(self._links):
+            link.hear(message)
+
+    def _arrival(self, name: str, late_ns: int, *, overtakes: bool) -> int:
+        due_ns = self._world.steady_ns + self._world.random.randint(*_FRAME_NS) + late_ns
+        if overtakes:
+            return due_ns
+        # A bus keeps the order; one nanosecond, since ties are drawn.
+        self._arrivals[name] = max(due_ns, self._arrivals[name] + 1)
+        return self._arrivals[name]
+
+
+class VirtualLink(CanLink):
+    """The driver's own link, without a thread: frames come as events.
+
+    Parameters
+    ----------
+    settings : LinkSettings
+        The driver's; only their text counts.
+    clock : callable
+        Steady time [s].
+    adapter : VirtualCan
+        What is opened.
+    process : VirtualProcess
+        Whose link it is.
+    """
+
+    def __init__(
+        self,
+        settings: LinkSettings,
+        clock: Callable[[], float],
+        adapter: VirtualCan,
+        process: VirtualProcess,
+    ) -> None:
+        super().__init__(settings, clock, self._open_adapter)
+        self.arrival = _Arrival(process)
+        self._adapter = adapter
+        self._process = process
+
+    def hear(self, message: can.Message) -> None:
+        """Take a frame off the bus, in what is the receiving thread elsewhere."""
+        network = self._network
+        if network is not None:
+            self._process.do_beside(lambda: self._dispatch(message, network))
+
+    def lose(self) -> None:
+        """Notice that the adapter is gone."""
+        self._lose(OSError(5, "Input/output error"))
+
+    def _open_adapter(self, settings: LinkSettings) -> Any:
+        if self._adapter.unplugged:
+            raise LinkError(f"cannot open {settings}: No such file or directory")
+        return _Opening(self._adapter, self, self._process)
+
+    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+        del bus, network
+        self._adapter.plug_in(self)
+
+
+class _Opening:
+    """What python-can's buses are to the link."""
+
+    def __init__(self, adapter: VirtualCan, link: VirtualLink, process: VirtualProcess) -> None:
+        self._adapter, self._link, self._process = adapter, link, process
+
+    def send(self, message: can.Message) -> None:
+        if self._process.alive:
+            self._adapter.send(message.arbitration_id, bytes(message.data))
+
+    def shutdown(self) -> None:
+        self._adapter.pull(self._link)
+
+
+class _Arrival(threading.Condition):
+    """Waits in the world's time, while the others go on."""
+
+    def __init__(self, process: VirtualProcess) -> None:
+        super().__init__()
+        self._process = process
+
+    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
+        return self._process.wait_for(predicate, timeout)

@@ -1,0 +1,194 @@
+"""The whole graph in one thread: the rig's own nodes, the bench, the person in front of it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import os
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+from rclpy.node import Node
+
+from needle_bringup.ros.operator import OperatorNode
+from needle_common.errors import UserError
+from needle_controller.ros.plane_controller import PlaneControllerNode
+from needle_device_driver.ros.device_driver import DeviceDriverNode
+from needle_verification.ros.soak.virtual_bench import TIP_NOISE, Bench, TipTeller
+from needle_verification.ros.soak.virtual_can import VirtualCan, VirtualLink
+from needle_verification.ros.soak.virtual_node import Place, placed, virtual_nodes
+from needle_verification.ros.soak.virtual_person import (
+    INSERT,
+    RETRACT,
+    STOP,
+    Hand,
+    Joystick,
+    Person,
+)
+from needle_verification.ros.soak.virtual_topics import VirtualGraph
+from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
+
+NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node", "person")
+_DEPTHS = (0.005, 0.02)
+_PRESETS = ("best", "paper")
+_INSERTIONS = ("stepwise", "continuous")
+# A node that ended is started again by whoever sees it [ns].
+_RESTART_NS = NANOSECONDS
+
+
+class VirtualRig:
+    """All that is there, from the needle to the person.
+
+    Parameters
+    ----------
+    seed : int
+        Of all that is drawn.
+
+    Attributes
+    ----------
+    world : VirtualWorld
+        Its clock and chance.
+    faults : LinkFaults
+        What is wrong with topics, services and bus.
+    graph : VirtualGraph
+        Topics and services.
+    bench : Bench
+        Drives and needle.
+    can : VirtualCan
+        The bus.
+    hand : Hand
+        The person's.
+    processes : dict of str to VirtualProcess
+        By the name of the node in it.
+    nodes : dict of str to Node
+        Those that run.
+    log : list of tuple
+        Steady time [ns], node, level and text of all that was logged.
+    ends : list of tuple
+        Steady time [ns], node and why, of processes that ended by themselves.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.world = VirtualWorld(seed)
+        self.faults = LinkFaults()
+        self.graph = VirtualGraph(self.world, self.faults)
+        self.bench = Bench(self.world)
+        self.can = VirtualCan(self.world, self.bench.bus, self.faults)
+        self.hand = Hand()
+        self.processes: dict[str, VirtualProcess] = {}
+        self.nodes: dict[str, Node] = {}
+        self.log: list[tuple[int, str, str, str]] = []
+        self.ends: list[tuple[int, str, str]] = []
+        draw = self.world.random
+        self.depth = draw.uniform(*_DEPTHS)
+        self.preset = draw.choice(_PRESETS)
+        self.insertion = draw.choice(_INSERTIONS)
+        for name in NODES:
+            self.world.call_after(draw.randint(0, NANOSECONDS // 5), partial(self.start, name))
+
+    @property
+    def person(self) -> Person:
+        """The person."""
+        person = self.nodes["person"]
+        assert isinstance(person, Person)
+        return person
+
+    @property
+    def tracker(self) -> TipTeller | None:
+        """What tells the tip, while it runs."""
+        tracker = self.nodes.get("stereo_tracker")
+        return tracker if isinstance(tracker, TipTeller) else None
+
+    def start(self, name: str) -> None:
+        """Start a node that does not run."""
+        if name in self.processes and self.processes[name].alive:
+            return
+        process = VirtualProcess(self.world, name, partial(self._on_end, name))
+        self.processes[name] = process
+        parameters, create = self._plan(name, process)
+        place = Place(self.graph, process, _own_domain(), parameters, self._tell)
+        with placed(place):
+            try:
+                self.nodes[name] = create()
+            except UserError as error:
+                process.kill()
+                self._on_end(name, str(error))
+
+    def kill(self, name: str) -> None:
+        """Kill a node as SIGKILL does."""
+        process = self.processes.get(name)
+        if process is None or not process.alive:
+            return
+        process.kill()
+        self.graph.remove(process, killed=True)
+        # The kernel takes back what it had.
+        node = self.nodes.pop(name, None)
+        if node is not None:
+            node.context.shutdown()
+
+    def close(self) -> None:
+        """Let go of everything that the operating system knows of."""
+        for node in self.nodes.values():
+            node.context.shutdown()
+
+    def _plan(
+        self, name: str, process: VirtualProcess
+    ) -> tuple[dict[str, Any], Callable[[], Node]]:
+        """Return the parameters of a node, and what makes it."""
+        if name == "device_driver":
+
+            def make_link(settings: Any, clock: Callable[[], float]) -> VirtualLink:
+                return VirtualLink(settings, clock, self.can, process)
+
+            return {"link": "virtual", "channel": "soak"}, partial(DeviceDriverNode, make_link)
+        if name == "plane_controller":
+            steering = {
+                "preset": self.preset,
+                "insertion": self.insertion,
+                "depth": self.depth,
+                "nominal_speed": 0.005,
+                "tip_noise_bound": TIP_NOISE,
+            }
+            return steering, PlaneControllerNode
+        if name == "operator":
+            buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
+            return {"source": "joy", **buttons}, OperatorNode
+        if name == "stereo_tracker":
+            return {}, partial(TipTeller, self.bench)
+        if name == "joy_node":
+            return {}, partial(Joystick, self.hand)
+        return {}, partial(Person, self.hand, lambda: self.bench.motors.insertion)
+
+    def _on_end(self, name: str, why: str) -> None:
+        self.ends.append((self.world.steady_ns, name, why))
+        self.graph.remove(self.processes[name], killed=False)
+        node = self.nodes.pop(name, None)
+        if node is not None:
+            node.context.shutdown()
+        self.world.call_after(_RESTART_NS, partial(self.start, name))
+
+    def _tell(self, name: str, level: str, text: str) -> None:
+        self.log.append((self.world.steady_ns, name, level, text))
+
+
+@contextlib.contextmanager
+def virtual_rig(seed: int) -> Iterator[VirtualRig]:
+    """Have a rig, with its own clocks, until the end of the block."""
+    # Nodes made of rings of references: collected here, not somewhere in the middle of a run.
+    rig = None
+    with virtual_nodes():
+        try:
+            rig = VirtualRig(seed)
+            with rig.world.own_clocks():
+                yield rig
+        finally:
+            if rig is not None:
+                rig.close()
+    gc.collect()
+
+
+def _own_domain() -> int:
+    """Return what no other process takes for its domain, a virtual one's included."""
+    return 1_000_000 + os.getpid()

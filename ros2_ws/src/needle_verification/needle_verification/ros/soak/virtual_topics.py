@@ -1,0 +1,342 @@
+"""Topics and services of a virtual graph: found after a while, delivered late, queued, lost."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections import deque
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message, serialize_message
+from rclpy.task import Future
+
+from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
+
+# From an endpoint's creation until another process knows it [ns], at least and at most.
+_DISCOVERY_NS = (5_000_000, 200_000_000)
+# On a topic's way [ns].
+_TRANSPORT_NS = (50_000, 1_500_000)
+# Until others take a killed process for gone [ns].
+_LEASE_NS = 8_000_000_000
+
+
+Careful = Callable[[Callable[[], None]], None]
+"""Calls back; a node sets its own, which knows what to do with a failure."""
+
+
+def _plainly(act: Callable[[], None]) -> None:
+    act()
+
+
+class Endpoint:
+    """What a node has made and others find.
+
+    Parameters
+    ----------
+    graph : VirtualGraph
+        Where it is.
+    process : VirtualProcess
+        Whose it is.
+    node_name : str
+        Its node's full name.
+    name : str
+        Topic or service.
+    qos : QoSProfile, optional
+        As created; a service has none.
+    """
+
+    def __init__(
+        self,
+        graph: VirtualGraph,
+        process: VirtualProcess,
+        node_name: str,
+        name: str,
+        qos: Any = None,
+    ) -> None:
+        self.graph = graph
+        self.process = process
+        self.node_name = node_name
+        self.topic_name = self.topic = self.srv_name = name
+        self.qos_profile = qos
+        self.created_ns = graph.world.steady_ns
+        self.gone_ns: int | None = None
+        self._known_ns: dict[VirtualProcess, int] = {process: self.created_ns}
+
+    def known_ns(self, process: VirtualProcess) -> int:
+        """Return when a process comes to know it, steady clock [ns]."""
+        if process not in self._known_ns:
+            late_ns = self.graph.world.random.randint(*_DISCOVERY_NS)
+            self._known_ns[process] = max(self.created_ns, process.started_ns) + late_ns
+        return self._known_ns[process]
+
+    def is_seen(self, process: VirtualProcess) -> bool:
+        """Return whether a process takes it for there."""
+        now = self.graph.world.steady_ns
+        return (self.gone_ns is None or now < self.gone_ns) and self.known_ns(process) <= now
+
+    @property
+    def info(self) -> SimpleNamespace:
+        """What rclpy's `get_*_info_by_topic` tells of it."""
+        namespace, _, name = self.node_name.rpartition("/")
+        return SimpleNamespace(
+            node_name=name, node_namespace=namespace or "/", qos_profile=self.qos_profile
+        )
+
+
+class VirtualGraph:
+    """All endpoints of one ROS domain.
+
+    Parameters
+    ----------
+    world : VirtualWorld
+        Its time and chance.
+    faults : LinkFaults
+        What happens to messages on their way.
+
+    Attributes
+    ----------
+    digest : hashlib hash
+        Of all that was published and called: by whom, when, how long.
+    watchers : list of callable
+        Called with topic, full name of the node and message whenever something is published.
+    """
+
+    def __init__(self, world: VirtualWorld, faults: LinkFaults) -> None:
+        self.world = world
+        self.faults = faults
+        self.digest = hashlib.sha256()
+        self.watchers: list[Callable[[str, str, Any], None]] = []
+        self.publishers: dict[str, list[VirtualPublisher]] = {}
+        self.subscriptions: dict[str, list[VirtualSubscription]] = {}
+        self.services: dict[str, list[VirtualService]] = {}
+
+    def transport_ns(self) -> int:
+        """Return how long the next message takes [ns]."""
+        return self.world.random.randint(*_TRANSPORT_NS)
+
+    def remove(self, process: VirtualProcess, *, killed: bool) -> None:
+        """Take a process' endpoints out; others go on to count those of one that was killed."""
+        gone_ns = self.world.steady_ns + (_LEASE_NS if killed else 0)
+        for table in (self.publishers, self.subscriptions, self.services):
+            for endpoints in table.values():
+                for endpoint in endpoints:
+                    if endpoint.process is process and endpoint.gone_ns is None:
+                        endpoint.gone_ns = gone_ns
+
+
+class VirtualPublisher(Endpoint):
+    """rclpy's Publisher, as far as the nodes use it."""
+
+    def __init__(self, *place: Any, kind: type[Any]) -> None:
+        super().__init__(*place)
+        self.msg_type = kind
+        self._kept: deque[bytes] = deque(maxlen=self.qos_profile.depth)
+        self._arrivals: dict[VirtualSubscription, int] = {}
+        self.graph.publishers.setdefault(self.topic_name, []).append(self)
+        for subscription in self.graph.subscriptions.get(self.topic_name, ()):
+            self.greet(subscription)
+
+    def publish(self, message: Any) -> None:
+        """Send a message, or its bytes."""
+        if not self.process.alive:
+            return
+        graph = self.graph
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        # Not the bytes: what fills them up between two fields is whatever lay in memory.
+        mark = f"{graph.world.steady_ns} {self.node_name} {self.topic_name} {len(data)}\n"
+        graph.digest.update(mark.encode())
+        for watch in graph.watchers:
+            watch(self.topic_name, self.node_name, message)
+        if _is_latched(self.qos_profile):
+            self._kept.append(data)
+        now = graph.world.steady_ns
+        for subscription in graph.subscriptions.get(self.topic_name, ()):
+            if self._matched_ns(subscription) <= now and self._suits(subscription):
+                self._send(subscription, data)
+
+    def get_subscription_count(self) -> int:
+        """Return how many subscriptions it knows."""
+        there = self.graph.subscriptions.get(self.topic_name, ())
+        return sum(1 for one in there if one.is_seen(self.process) and self._suits(one))
+
+    def greet(self, subscription: VirtualSubscription) -> None:
+        """Send what is kept for late comers, once both know each other."""
+        if not (_is_latched(self.qos_profile) and _is_latched(subscription.qos_profile)):
+            return
+
+        def send() -> None:
+            if self.process.alive:
+                for data in self._kept:
+                    self._send(subscription, data)
+
+        self.graph.world.call_at(self._matched_ns(subscription) - 1, send)
+
+    def _matched_ns(self, subscription: VirtualSubscription) -> int:
+        return max(subscription.known_ns(self.process), self.known_ns(subscription.process))
+
+    def _suits(self, subscription: VirtualSubscription) -> bool:
+        """Return whether QoS lets a message pass: a subscription gets no more than is offered."""
+        offered, asked = self.qos_profile, subscription.qos_profile
+        if asked.reliability == ReliabilityPolicy.RELIABLE != offered.reliability:
+            return False
+        return not _is_latched(asked) or _is_latched(offered)
+
+    def _send(self, subscription: VirtualSubscription, data: bytes) -> None:
+        world = self.graph.world
+        for fate in self.graph.faults.fates(self.topic_name, data, world):
+            arrival = world.steady_ns + self.graph.transport_ns() + fate.late_ns
+            if not fate.overtakes:
+                # One nanosecond later at least, since ties are drawn.
+                arrival = max(arrival, self._arrivals.get(subscription, 0) + 1)
+                self._arrivals[subscription] = arrival
+            sent_ns = world.system_ns
+
+            def arrive(data: bytes = fate.data, sent_ns: int = sent_ns) -> None:
+                subscription.arrive(data, sent_ns)
+
+            world.call_at(arrival, arrive)
+
+
+class VirtualSubscription(Endpoint):
+    """rclpy's Subscription, as far as the nodes use it; its own handle, too."""
+
+    def __init__(self, *place: Any, kind: type[Any], callback: Any, raw: bool) -> None:
+        super().__init__(*place)
+        self.msg_type = kind
+        self.callback = callback
+        self._raw = raw
+        self._with_info = _takes_two(callback)
+        self._queue: deque[tuple[bytes, int]] = deque()
+        self.careful: Careful = _plainly
+        self.handle = self
+        self.graph.subscriptions.setdefault(self.topic_name, []).append(self)
+        for publisher in self.graph.publishers.get(self.topic_name, ()):
+            publisher.greet(self)
+
+    def arrive(self, data: bytes, sent_ns: int) -> None:
+        """Queue a message; the oldest gives way where there is no room."""
+        if not self.process.alive or self.gone_ns is not None:
+            return
+        if len(self._queue) >= self.qos_profile.depth:
+            self._queue.popleft()
+        else:
+            self.process.do(self._take_next)
+        self._queue.append((data, sent_ns))
+
+    def get_publisher_count(self) -> int:
+        """Return how many publishers it knows."""
+        there = self.graph.publishers.get(self.topic_name, ())
+        return sum(1 for one in there if one.is_seen(self.process))
+
+    def __enter__(self) -> VirtualSubscription:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Do nothing: a handle is held while it is used."""
+
+    def take_message(self, _: type[Any], raw: bool) -> tuple[bytes, dict[str, int]] | None:
+        """Take the next message as bytes; None where there is none."""
+        assert raw
+        if not self._queue:
+            return None
+        data, sent_ns = self._queue.popleft()
+        return data, self._info(sent_ns)
+
+    def _take_next(self) -> None:
+        if not self._queue or self.gone_ns is not None:
+            return
+        data, sent_ns = self._queue.popleft()
+        message = data if self._raw else deserialize_message(data, self.msg_type)
+        arguments = (message, self._info(sent_ns)) if self._with_info else (message,)
+        self.careful(lambda: self.callback(*arguments))
+
+    def _info(self, sent_ns: int) -> dict[str, int]:
+        return {"source_timestamp": sent_ns, "received_timestamp": self.graph.world.system_ns}
+
+
+class VirtualService(Endpoint):
+    """rclpy's Service, as far as the nodes use it."""
+
+    def __init__(self, *place: Any, kind: type[Any], callback: Any) -> None:
+        super().__init__(*place)
+        self.srv_type = kind
+        self.callback = callback
+        self.careful: Careful = _plainly
+        self.graph.services.setdefault(self.srv_name, []).append(self)
+
+    def answer(self, data: bytes, reply: Callable[[bytes], None]) -> None:
+        """Answer a request that has come."""
+
+        def act() -> None:
+            if self.gone_ns is None:
+                request = deserialize_message(data, self.srv_type.Request)
+                self.careful(lambda: self._reply(request, reply))
+
+        self.process.do(act)
+
+    def _reply(self, request: Any, reply: Callable[[bytes], None]) -> None:
+        reply(serialize_message(self.callback(request, self.srv_type.Response())))
+
+
+class VirtualClient:
+    """rclpy's Client, as far as the nodes use it."""
+
+    def __init__(
+        self, graph: VirtualGraph, process: VirtualProcess, kind: type[Any], name: str
+    ) -> None:
+        self._graph = graph
+        self._process = process
+        self.srv_type = kind
+        self.srv_name = name
+
+    def service_is_ready(self) -> bool:
+        """Return whether a server is known."""
+        return bool(self._servers())
+
+    def call_async(self, request: Any) -> Future[Any]:
+        """Send a request; where the server is gone no answer ever comes."""
+        graph, future = self._graph, Future()
+        data = serialize_message(request)
+        mark = f"{graph.world.steady_ns} {self._process.name} calls {self.srv_name} {request}\n"
+        graph.digest.update(mark.encode())
+
+        def take(answer: bytes) -> None:
+            self._process.do(
+                lambda: future.set_result(deserialize_message(answer, self.srv_type.Response))
+            )
+
+        def reply(answer: bytes) -> None:
+            self._pass(answer, take)
+
+        for server in self._servers():
+            self._pass(data, lambda there, server=server: server.answer(there, reply))  # type: ignore[misc]
+        return future
+
+    def remove_pending_request(self, _: Future[Any]) -> None:
+        """Forget a request; its answer changes nothing any more."""
+
+    def _pass(self, data: bytes, arrive: Callable[[bytes], None]) -> None:
+        world = self._graph.world
+        for fate in self._graph.faults.fates(self.srv_name, data, world):
+            late_ns = self._graph.transport_ns() + fate.late_ns
+            world.call_after(late_ns, lambda data=fate.data: arrive(data))  # type: ignore[misc]
+
+    def _servers(self) -> list[VirtualService]:
+        servers = self._graph.services.get(self.srv_name, ())
+        return [server for server in servers if server.is_seen(self._process)]
+
+
+def _is_latched(qos: QoSProfile) -> bool:
+    return bool(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def _takes_two(callback: Any) -> bool:
+    try:
+        inspect.signature(callback).bind(object(), object())
+    except TypeError:
+        return False
+    return True

@@ -1,0 +1,223 @@
+"""What must hold in every run, judged from outside: motors, hand, and what is published."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Mapping
+
+# Speeds are judged over so many ticks: motors move in whole milliseconds.
+_SPEED_TICKS = 4
+# A motor that goes no farther in a tick rests [m], [rad].
+_REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
+# From a release, or a loss, to the last motion [s]: a joystick that falls silent (0.1), an operator
+# that stops (0.1), their looks and the driver's cycle (0.02 each), a driver that stops (0.02), the
+# ramp (0.03); and what each of them is late by itself.
+RELEASE_BOUND = 0.35
+# A stop by the watchdog of the drives, and the ramp [s].
+WATCHDOG_BOUND = 0.2
+# How long a status may be behind the motors [s].
+_STATUS_LAG = 0.15
+# Beyond the limits themselves: what drives of such a rig swing over.
+_SPEED_ROOM, _PLACE_ROOM = 1.25, 0.0011
+# The controller knows of a motion when its next tip has come: two steps.
+_BELIEF = 0.0045
+
+
+@dataclasses.dataclass(frozen=True)
+class Violation:
+    """Something that must never be.
+
+    Attributes
+    ----------
+    invariant : str
+        Its name.
+    at : float
+        When, from the start of the run [s].
+    text : str
+        What was seen, with values and units.
+    """
+
+    invariant: str
+    at: float
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """The rig's own limits.
+
+    Attributes
+    ----------
+    max_depth : float
+        [m].
+    max_speed : float
+        [m/s].
+    max_rotation : float
+        Either way [rad].
+    max_rotation_rate : float
+        [rad/s].
+    """
+
+    max_depth: float
+    max_speed: float
+    max_rotation: float
+    max_rotation_rate: float
+
+
+class Watch:
+    """Watches one run. Times are seconds from its start.
+
+    Parameters
+    ----------
+    bounds : Bounds
+        Of the rig.
+
+    Attributes
+    ----------
+    violations : list of Violation
+        The first of each kind.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self._bounds = bounds
+        self.violations: list[Violation] = []
+        self._before: tuple[float, float, float] | None = None
+        self._pressed_until = -1.0
+        self._pressed_since = -1.0
+        self._holds = False
+        self._must_press_after = 0.0
+        self._status: Mapping[str, str] = {}
+        self._status_at = 0.0
+        self._homing_until = -1.0
+        self._silent_since: float | None = None
+        self._moving_since: float | None = None
+        self._track: deque[tuple[float, float, float]] = deque(maxlen=_SPEED_TICKS + 1)
+
+    def violate(self, invariant: str, at: float, text: str) -> None:
+        """Note a violation; of each invariant the first counts."""
+        if all(one.invariant != invariant for one in self.violations):
+            self.violations.append(Violation(invariant, at, text))
+
+    # ---- what happens -------------------------------------------------------------------------
+
+    def see_hand(self, at: float, *, holds: bool) -> None:
+        """Take whether the hand presses what could move the needle."""
+        if holds and not self._holds:
+            self._pressed_since = at
+        if holds:
+            self._pressed_until = at
+        self._holds = holds
+
+    def see_other_hold(self, at: float) -> None:
+        """Take that somebody else pressed: from outside that is a hold like any other."""
+        self._pressed_until = at
+        self._pressed_since = max(self._pressed_since, at)
+
+    def see_device(self, at: float, values: Mapping[str, str]) -> None:
+        """Take a device/status as it is published."""
+        state, before = values.get("state", ""), self._status.get("state", "")
+        if state in ("FAULT", "ESTOPPED") and not values.get("fault"):
+            self.violate("faults_are_named", at, f"{state} without a word why")
+        if (
+            state != before
+            and state in ("HOLDING", "DISABLED")
+            and before not in ("MOVING", "HOLDING")
+        ):
+            # Enabled, or reset: a press from before may not count.
+            self._must_press_after = at
+        self._status, self._status_at = values, at
+        if values.get("activity") == "homing":
+            self._homing_until = at + WATCHDOG_BOUND
+
+    def see_driver(self, at: float, *, speaks: bool) -> None:
+        """Take whether the driver runs and hears its drives: else it cannot know better."""
+        self._silent_since = None if speaks else self._silent_since or at
+
+    def see_motors(self, at: float, insertion: float, rotation: float) -> None:
+        """Take where the motors really are."""
+        before, self._before = self._before, (at, insertion, rotation)
+        self._track.append((at, insertion, rotation))
+        if before is None:
+            return
+        along, around = insertion - before[1], rotation - before[2]
+        self._judge_limits(at, insertion, rotation)
+        moves = abs(along) > _REST_INSERTION or abs(around) > _REST_ROTATION
+        if not moves:
+            self._moving_since = None
+            return
+        begins, self._moving_since = self._moving_since is None, self._moving_since or at
+        if self._status.get("activity") == "homing" or at <= self._homing_until:
+            self._homing_until = (
+                max(self._homing_until, at) if self._is_homing else self._homing_until
+            )
+            return
+        self._judge_hold(at, begins=begins)
+        self._judge_status(at)
+
+    def see_belief(self, at: float, values: Mapping[str, str], *, joints_heard: bool) -> None:
+        """Take a needle/controller_status as it is published, while joints reach the controller."""
+        # Before its first step it has nothing but the needle's place of before.
+        steers = values.get("state") == "STEERING" and values.get("step", "0") != "0"
+        if not (steers and joints_heard) or self._before is None:
+            return
+        try:
+            told = float(values["insertion_m"])
+        except (KeyError, ValueError):
+            return
+        off = self._before[1] - told
+        if not -0.0005 <= off <= _BELIEF:
+            self.violate(
+                "belief_equals_joints",
+                at,
+                f"the controller says {told * 1e3:.2f} mm, the needle is "
+                f"{self._before[1] * 1e3:.2f} mm in",
+            )
+
+    # ---- judgement ----------------------------------------------------------------------------
+
+    @property
+    def _is_homing(self) -> bool:
+        return self._status.get("activity") == "homing"
+
+    def _judge_limits(self, at: float, insertion: float, rotation: float) -> None:
+        bounds = self._bounds
+        then, inserted, turned = self._track[0]
+        period = max(at - then, 1e-3)
+        speed, rate = (insertion - inserted) / period, (rotation - turned) / period
+        for name, value, bound in (
+            ("insertion [mm]", insertion * 1e3, (bounds.max_depth + _PLACE_ROOM) * 1e3),
+            ("rotation [rad]", abs(rotation), bounds.max_rotation + 0.3),
+            ("speed [mm/s]", abs(speed) * 1e3, bounds.max_speed * _SPEED_ROOM * 1e3),
+            ("rotation rate [rad/s]", abs(rate), bounds.max_rotation_rate * 1.6),
+        ):
+            if value > bound:
+                self.violate(
+                    "none_beyond_limits", at, f"{name} is {value:.4g}, at most {bound:.4g}"
+                )
+
+    def _judge_hold(self, at: float, *, begins: bool) -> None:
+        idle = at - self._pressed_until
+        if idle > RELEASE_BOUND:
+            self.violate(
+                "no_motion_without_hold",
+                at,
+                f"motion {idle:.3f} s after the last moment in which anybody held",
+            )
+        if begins and self._pressed_since < self._must_press_after:
+            self.violate(
+                "no_motion_by_itself",
+                at,
+                f"motion by a press of {self._pressed_since:.3f} s, from before "
+                f"{self._must_press_after:.3f} s, when the device became ready",
+            )
+
+    def _judge_status(self, at: float) -> None:
+        state = self._status.get("state", "")
+        if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
+            return
+        lag = at - max(self._status_at, self._moving_since or at)
+        if lag > _STATUS_LAG:
+            self.violate(
+                "status_is_true", at, f"it moves {lag:.3f} s after device/status said {state}"
+            )

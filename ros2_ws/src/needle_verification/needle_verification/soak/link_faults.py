@@ -1,0 +1,77 @@
+"""What happens to a message on its way."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_verification.soak.virtual_world import VirtualWorld
+
+
+@dataclasses.dataclass(frozen=True)
+class Fate:
+    """One arrival of a message.
+
+    Attributes
+    ----------
+    data : bytes
+        What arrives.
+    late_ns : int
+        How much later than usual [ns].
+    overtakes : bool
+        Whether it may arrive before what was sent earlier.
+    """
+
+    data: bytes
+    late_ns: int = 0
+    overtakes: bool = False
+
+
+@dataclasses.dataclass
+class LinkFault:
+    """What goes wrong on one topic, service or bus while it lasts.
+
+    Attributes
+    ----------
+    loss : float
+        Share of messages that do not arrive.
+    late_ns : int
+        How much later they arrive at most [ns].
+    duplicates : float
+        Share that arrives twice.
+    reorders : bool
+        Whether later ones may overtake earlier ones.
+    """
+
+    loss: float = 0.0
+    late_ns: int = 0
+    duplicates: float = 0.0
+    reorders: bool = False
+
+
+class LinkFaults:
+    """The faults that are on, by the name of what they are on."""
+
+    def __init__(self) -> None:
+        self._on: dict[str, LinkFault] = {}
+
+    def begin(self, name: str, fault: LinkFault) -> None:
+        """Let a fault begin; it takes the place of another on the same link."""
+        self._on[name] = fault
+
+    def end(self, name: str) -> None:
+        """Let the fault on a link end."""
+        self._on.pop(name, None)
+
+    def fates(self, name: str, data: bytes, world: VirtualWorld) -> list[Fate]:
+        """Return all arrivals of a message that is sent now."""
+        fault = self._on.get(name)
+        if fault is None:
+            return [Fate(data)]
+        draw = world.random.random
+        fates = []
+        for _ in range(2 if draw() < fault.duplicates else 1):
+            if draw() < fault.loss:
+                continue
+            late_ns = world.random.randint(0, fault.late_ns)
+            fates.append(Fate(data, late_ns, fault.reorders))
+        return fates

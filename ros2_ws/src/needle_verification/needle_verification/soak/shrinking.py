@@ -1,0 +1,40 @@
+"""The shortest schedule that still does what a longer one does."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+from needle_verification.soak.faults import Fault
+
+
+def shrink(faults: Sequence[Fault], still: Callable[[list[Fault]], bool]) -> list[Fault]:
+    """Leave faults out, then make those that stay shorter, while it still happens.
+
+    Parameters
+    ----------
+    faults : sequence of Fault
+        With which it happens.
+    still : callable
+        Returns whether it happens with others, too.
+
+    Returns
+    -------
+    list of Fault
+        None of which can be left out alone.
+    """
+    kept = list(faults)
+    smaller = True
+    while smaller:
+        smaller = False
+        for index in range(len(kept)):
+            without = kept[:index] + kept[index + 1 :]
+            if still(without):
+                kept, smaller = without, True
+                break
+    for index, fault in enumerate(kept):
+        shorter = dataclasses.replace(fault, lasts=fault.lasts / 2.0)
+        trial = [*kept[:index], shorter, *kept[index + 1 :]]
+        if still(trial):
+            kept = trial
+    return kept

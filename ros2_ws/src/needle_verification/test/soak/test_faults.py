@@ -1,0 +1,50 @@
+"""Schedules: drawn from the vocabulary alone, read as they were written, shrunk to what matters."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import pytest
+
+from needle_common.errors import UserError
+from needle_verification.soak.faults import (
+    VOCABULARY,
+    Fault,
+    Kind,
+    draw_schedule,
+    read_schedule,
+    write_schedule,
+)
+from needle_verification.soak.shrinking import shrink
+
+
+def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
+    drawn = {
+        (fault.part, fault.kind)
+        for seed in range(2000)
+        for fault in draw_schedule(random.Random(seed))
+    }
+    assert drawn == {(part, kind) for part, kinds in VOCABULARY.items() for kind in kinds}
+
+
+def test_a_schedule_is_read_as_it_was_written(tmp_path: Path) -> None:
+    faults = draw_schedule(random.Random(3))
+    write_schedule(tmp_path / "one.json", 3, faults, "because")
+    assert read_schedule(tmp_path / "one.json") == (3, faults)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "{}", '{"seed": 1, "faults": [{"part": "operator", "kind": "reordered"}]}']
+)
+def test_what_is_no_schedule_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "one.json").write_text(text)
+    with pytest.raises(UserError, match=r"one\.json"):
+        read_schedule(tmp_path / "one.json")
+
+
+def test_faults_that_do_not_matter_are_left_out() -> None:
+    faults = [Fault(part, Kind.OFF, 1.0, 2.0, 0.5) for part in ("operator", "/joy", "bus")]
+    kept = shrink(faults, lambda some: {"operator", "bus"} <= {fault.part for fault in some})
+    assert [fault.part for fault in kept] == ["operator", "bus"]
+    assert [fault.lasts for fault in kept] == [1.0, 1.0]
