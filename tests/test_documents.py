@@ -60,6 +60,14 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
             # In real time, whatever the other lane does: a rig gives its driver a machine that is
             # not busy. Without the right to go first it goes with the rest.
             return f"nice -n -10 {command}"
+        if "pip install" in command:
+            # A link into the environment would stay behind.
+            return f"cp -rL docs/examples {scratch}; {command}".replace(
+                "--editable docs/examples", f"{scratch}/examples"
+            )
+        if "monte_carlo" in command and "--depth-mm" not in command:
+            words, _, _ = command.partition("#")
+            return f"{words} --depth-mm {SHORT_MM}"
         if "render_images" in command:
             return f"{command} --frames 8"
         if not command.startswith("scripts/simulate"):
@@ -122,7 +130,14 @@ def test_every_block_works_as_written(
     if page == "docs/calibration.md":
         draw_session(checkout)
     with own_domain() as domain:
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        # What a page has installed is there for the page alone.
+        own = f"{scratch}/own"
+        environment = {
+            **os.environ,
+            "ROS_DOMAIN_ID": str(domain),
+            "PIP_TARGET": own,
+            "PYTHONPATH": f"{own}:{os.environ['PYTHONPATH']}",
+        }
         session = Session(checkout, environment, print, shortened(scratch, runs))
         session.type(checkout / page)
     if page == "docs/hardware.md":

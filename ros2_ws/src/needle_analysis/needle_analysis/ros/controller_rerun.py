@@ -49,6 +49,8 @@ class ControllerStage:
         Tips used so far.
     notes : list of str
         What could not be done as recorded.
+    name : str
+        What steers, in words.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class ControllerStage:
         unheard: frozenset[HeardMessage],
     ) -> None:
         self._node = node
+        self.name = settings.controller
         self._messages = SteeringMessages(settings)
         self._steering = self._messages.steering
         self._ends = ends

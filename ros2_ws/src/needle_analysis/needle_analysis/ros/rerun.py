@@ -31,6 +31,7 @@ from needle_common.commands.options import CommandParser, output_file
 from needle_common.errors import UserError
 from needle_common.ros.parameters import OF_EVERY_NODE
 from needle_common.settings.parameter_files import read_parameters
+from needle_controller.presets.own_parts import GROUPS
 from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
@@ -112,10 +113,12 @@ def _run(words: Sequence[str]) -> int:
     if given.output is not None:
         refuse_existing_bag(given.output)
     changes = read_parameters(given.params) if given.params is not None else {}
-    if given.preset is not None:
-        if given.preset not in PRESETS:
-            raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
-        changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), "preset": given.preset}}
+    if given.preset is not None and given.preset not in PRESETS:
+        raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
+    named = {key: getattr(given, key) for key in ("preset", *GROUPS)}
+    asked = {key: name for key, name in named.items() if name is not None}
+    if asked:
+        changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), **asked}}
     run = read_run(given.bag, given.namespace)
     tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
     controller_node = _node(run, CONTROLLER, changes)
@@ -135,7 +138,7 @@ def _run(words: Sequence[str]) -> int:
         nodes = [node for node in (tracker_node, controller_node) if node is not None]
         used = {node.name: node.values for node in nodes}
         write_rerun(run, given.output, outputs, used, calibration)
-    print(f"{run.path}: {_summary(tracker, controller, controller_node)}")
+    print(f"{run.path}: {_summary(tracker, controller)}")
     for note in controller.notes:
         print(f"note: {note}")
     if rerun.tips_without_images:
@@ -154,6 +157,12 @@ def _parser() -> CommandParser:
     add = parser.add_argument
     add("bag", type=Path, metavar="BAG", help="the bag's directory")
     add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")
+    for kind in GROUPS:
+        add(
+            f"--{kind}",
+            metavar="NAME",
+            help=f"another {kind}, of another package (docs/own_controllers.md); '': the preset's",
+        )
     add("--params", type=Path, metavar="FILE", help="ROS parameter file on top of the recorded")
     add(
         "--output",
@@ -226,9 +235,9 @@ def _controller(run: Run, node: Node) -> ControllerStage:
     return ControllerStage(parameters, node.name, ends, unheard)
 
 
-def _summary(tracker: TrackerStage | None, controller: ControllerStage, node: Node) -> str:
+def _summary(tracker: TrackerStage | None, controller: ControllerStage) -> str:
     pairs = "" if tracker is None else f"{tracker.pairs} image pairs through {TRACKER}, "
-    return f"{pairs}{controller.tips} tips through {CONTROLLER} ({node.values.get('preset')})"
+    return f"{pairs}{controller.tips} tips through {CONTROLLER} ({controller.name})"
 
 
 if __name__ == "__main__":

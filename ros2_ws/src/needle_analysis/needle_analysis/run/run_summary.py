@@ -8,6 +8,7 @@ import numpy.typing as npt
 from needle_analysis.run.run_events import is_aborted
 from needle_bags.reading.bag_reader import Run, Series, Stamps
 from needle_common.commands.cli import JsonValue, finite_or_none
+from needle_controller.presets.own_parts import GROUPS
 
 GOAL = 1e-3
 LAST_STRETCH = 20e-3
@@ -255,7 +256,10 @@ def _mm(metres: float | None) -> float | None:
 
 
 def _controller(run: Run) -> str | None:
-    return _text(run.run_info.get("controller"), run.parameter("plane_controller", "preset"))
+    preset = _text(run.run_info.get("controller"), run.parameter("plane_controller", "preset"))
+    parts = {kind: run.parameter("plane_controller", kind) for kind in GROUPS}
+    own = [f"{kind} {name}" for kind, name in parts.items() if name]
+    return f"{preset} with {', '.join(own)}" if own else preset
 
 
 def _text(*candidates: object) -> str | None:

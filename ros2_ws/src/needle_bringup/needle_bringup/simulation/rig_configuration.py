@@ -56,6 +56,9 @@ OPTIONS = {
     "measurement_std": "--noise-mm",
     "bag": "--bag",
     "preset": "--controller",
+    "estimator": "--estimator",
+    "law": "--law",
+    "planner": "--planner",
     "insertion": "--insertion",
     "depth": "--depth-mm",
     "target_point": "--target",
@@ -133,6 +136,10 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         },
         "simulated_operator": {"wait_for_recorder": True},
     }
+    own = {"estimator": options.estimator, "law": options.law, "planner": options.planner}
+    parameters["plane_controller"].update({kind: name for kind, name in own.items() if name})
+    if options.estimator:
+        parameters["plane_controller"]["seed"] = options.seed
     if options.insertion == "continuous":
         sim_rig["camera_rate"] = CONTINUOUS_CAMERA_RATE
         parameters["plane_controller"]["insertion"] = options.insertion

@@ -44,6 +44,8 @@ examples:
         frame: rig
         spheres: [{center: [0.002, -0.003, 0.055], radius: 0.003}]
         capsules: [{start: [-0.02, 0.006, 0.07], end: [0.02, 0.006, 0.07], radius: 0.003}]
+  scripts/simulate --level tip --estimator particle_filter
+      with an estimator of another package (docs/own_controllers.md)
   scripts/simulate --params my_rig.yaml
       with a ROS parameter file on top of the rig's configuration, such as
         plane_controller: {ros__parameters: {max_rotation_per_length: 300.0}}
@@ -55,6 +57,11 @@ something missing, 130 interrupted.
 LEVELS = ("tip", "camera", "drive")
 CONTROLLERS = ("best", "paper", "open_loop")
 """plane_controller's presets; named here again, for to import them takes half a second."""
+OWN_PARTS = {
+    "--estimator": "an estimator",
+    "--law": "a control law",
+    "--planner": "with --target: a planner",
+}
 INSERTIONS = ("stepwise", "continuous")
 """How plane_controller lets the needle go in, likewise."""
 
@@ -68,6 +75,9 @@ class SimulateOptions:
 
     level: str = "camera"
     controller: str = "best"
+    estimator: str = ""
+    law: str = ""
+    planner: str = ""
     insertion: str = "stepwise"
     seed: int = 1
     initial_x_mm: float = -3.0
@@ -104,11 +114,16 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         raise UserError(f"--noise-mm goes with --level tip only, not with {given.level}")
     x_mm, pitch_deg, roll_deg = start(given.initial, largest_x=50.0, largest_pitch=45.0)
     target = None if given.target is None else _target(given.target)
+    if given.planner and target is None:
+        raise UserError("--planner goes with --target only")
     depth = given.depth_mm or (DEPTH_MM if target is None else f"{LARGEST_DEPTH_MM:g}")
     factor = number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
     return SimulateOptions(
         level=given.level,
         controller=given.controller,
+        estimator=given.estimator,
+        law=given.law,
+        planner=given.planner,
         insertion=given.insertion,
         initial_x_mm=x_mm,
         initial_pitch_deg=pitch_deg,
@@ -145,6 +160,14 @@ def _parser() -> CommandParser:
         help="how the needle is turned: as in the paper, by the best controller known here, or not "
         f"at all (default: best); for comparison also {', '.join(CONTROLLERS[3:])}",
     )
+    for option, what in OWN_PARTS.items():
+        add(
+            option,
+            default="",
+            metavar="NAME",
+            help=f"{what} of another package in place of the controller's own, by the name of its "
+            "entry point (docs/own_controllers.md)",
+        )
     add(
         "--insertion",
         default="stepwise",

@@ -14,7 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_controller.model.arrays import Array
-from needle_controller.model.kinematics import REDUCED, rotation_from_angles
+from needle_controller.model.feedback_linearization import linearized_from_reduced
+from needle_controller.model.kinematics import (
+    REDUCED,
+    angles_from_rotation,
+    rotation_from_angles,
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +71,42 @@ class Estimate:
     def covariance(self) -> Array:
         """Covariance of `coordinates`, in their order, shape (..., 6, 6)."""
         return self.covariance_of()
+
+
+def pose_estimate(
+    position: npt.ArrayLike,
+    rotation: npt.ArrayLike,
+    curvature: npt.ArrayLike,
+    covariance: npt.ArrayLike,
+    warnings: tuple[str, ...] = (),
+) -> Estimate:
+    """Return the estimate that a pose in the target plane is.
+
+    Parameters
+    ----------
+    position : array_like, shape (..., 3)
+        The tip [m].
+    rotation : array_like, shape (..., 3, 3)
+        Its orientation: the heading is the last column, the needle bends to -y.
+    curvature : array_like, shape (...)
+        Of the needle's path [1/m].
+    covariance : array_like, shape (..., 6, 6)
+        Of x, y, z [m], yaw, pitch, roll [rad].
+    warnings : tuple of str
+        What a user should know of it.
+    """
+    places = np.asarray(position, dtype=float)
+    coordinates = np.concatenate([places, angles_from_rotation(rotation)], axis=-1)
+    shape = coordinates.shape[:-1]
+    kappa = np.array(np.broadcast_to(np.asarray(curvature, dtype=float), shape))
+    known = np.array(np.broadcast_to(np.asarray(covariance, dtype=float), (*shape, 6, 6)))
+    return Estimate(
+        coordinates=coordinates,
+        linearized=linearized_from_reduced(coordinates[..., REDUCED], kappa),
+        curvature=kappa,
+        warnings=warnings,
+        covariance_of=lambda: known,
+    )
 
 
 class Estimator(Protocol):

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from needle_controller.laws.law import SteeringCommand
@@ -15,6 +13,7 @@ from needle_controller.planning.entry import entry_state, first_path
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
 from needle_controller.planning.path_settings import PathSettings
+from needle_controller.presets.own_planner import OwnPlanner, Route, tried_planner
 from needle_controller.presets.point_steering import prompt_point_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
@@ -44,7 +43,7 @@ def configured_obstacles(settings: SteeringSettings) -> Obstacles:
 
 
 class PathSteering:
-    """Leads one needle past obstacles.
+    """Leads one needle past obstacles, by our planner or that of another package.
 
     Parameters
     ----------
@@ -54,12 +53,15 @@ class PathSteering:
     Attributes
     ----------
     path : NeedlePath or None
-        What is followed.
+        What is followed; None by another package's planner, which plans every step anew.
     """
 
     def __init__(self, settings: SteeringSettings) -> None:
         self._settings = settings
         self._planner = path_planner(settings)
+        self._own = None
+        if settings.planner:
+            self._own = OwnPlanner(tried_planner(settings.planner), settings)
         self._law = prompt_point_law(settings)
         self.path: NeedlePath | None = None
 
@@ -81,6 +83,9 @@ class PathSteering:
         entry = entry_state(
             settings.curvature, rotation=rotation, heading_std=settings.entry_angle_std
         )
+        if self._own is not None:
+            route = self._own.route(entry, target, obstacles)
+            return "" if route is not None else self._own.why_not(obstacles)
         self.path, why = first_path(self._planner, entry, target, obstacles)
         return why
 
@@ -107,27 +112,41 @@ class PathSteering:
         insertion : float
             That the estimate is of [m].
         """
-        tip = tip_state(estimate, plane)
-        self.path = self._planner.path(
-            tip, target, obstacles, insertion=insertion, followed=self.path
-        )
-        if self.path is None:
+        route = self.route(tip_states(estimate, plane)[0], target, obstacles, insertion)
+        if route is None:
             return None
-        command = self._law(estimate, plane.from_rig(self.path.aim))
-        if len(self.path.legs) == 1:
+        command = self._law(estimate, plane.from_rig(route.aim))
+        if route.length is None:
             return command
-        left = np.asarray(self.path.length)
+        left = np.asarray(route.length)
         return SteeringCommand(command.virtual_input, command.rotation_rate, left)
 
+    def route(
+        self, tip: TipState, target: Array, obstacles: Obstacles, insertion: float
+    ) -> Route | None:
+        """Return the way to go on from a tip, None where none is clear; see `command`."""
+        if self._own is not None:
+            return self._own.route(tip, target, obstacles)
+        path = self.path = self._planner.path(
+            tip, target, obstacles, insertion=insertion, followed=self.path
+        )
+        if path is None:
+            return None
+        return Route(path.aim, None if len(path.legs) == 1 else path.length)
 
-def tip_state(estimate: Estimate, plane: TargetPlane) -> TipState:
-    """Return the tip that an estimate in a plane's frame is of, in `rig`."""
-    turn, covariance = plane.T_rig_plane[:3, :3], estimate.covariance
-    across = max(covariance[X, X], covariance[X + 1, X + 1])
-    return TipState(
-        position=turn @ estimate.position + plane.T_rig_plane[:3, 3],
-        rotation=turn @ estimate.rotation,
-        curvature=float(estimate.curvature),
-        position_std=math.sqrt(max(across, 0.0)),
-        heading_std=math.sqrt(max(covariance[PITCH, PITCH], covariance[YAW, YAW], 0.0)),
+
+def tip_states(estimate: Estimate, plane: TargetPlane) -> list[TipState]:
+    """Return the tips that an estimate in a plane's frame is of, in `rig`."""
+    turn, shift = plane.T_rig_plane[:3, :3], plane.T_rig_plane[:3, 3]
+    places, turns = estimate.position @ turn.T + shift, turn @ estimate.rotation
+    variance = np.diagonal(estimate.covariance, axis1=-2, axis2=-1)
+    across = np.maximum(variance[..., X], variance[..., X + 1])
+    heading = np.maximum(variance[..., PITCH], variance[..., YAW])
+    stds = np.sqrt(np.maximum(np.stack([across, heading], axis=-1), 0.0)).reshape(-1, 2)
+    rows = zip(
+        places.reshape(-1, 3), turns.reshape(-1, 3, 3), estimate.curvature.flat, stds, strict=True
     )
+    return [
+        TipState(place, rotation, float(kappa), float(std[0]), float(std[1]))
+        for place, rotation, kappa, std in rows
+    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,6 +15,7 @@ from needle_controller.laws.point_turns import PointLawSettings
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import WINDOWS, TargetMotion
 from needle_controller.observers.estimator import Estimate
+from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 _LOOKS = 4
@@ -24,6 +26,15 @@ _AVERAGED = 0.010
 """The needle will be as fast as over so much insertion [m]."""
 _CLOCKS_APART = 1.0
 """A target seen so long after the tip is stamped by another clock [s]."""
+
+
+class LawToPoint(Protocol):
+    """A law for points: `PointLaw`, or that of another package."""
+
+    def __call__(
+        self, estimate: Estimate, target: npt.ArrayLike, rotation_left: npt.ArrayLike = np.inf
+    ) -> SteeringCommand:
+        """Return the command for the next step; see `PointLaw`."""
 
 
 class PointSteering:
@@ -107,13 +118,17 @@ class PointSteering:
         return (insertion - inserted) / (time - began) if insertion > inserted else None
 
 
-def point_law(settings: SteeringSettings) -> PointLaw:
+def point_law(settings: SteeringSettings) -> LawToPoint:
     """Return the law for points; `SteeringSettings.check_steers_to_points` says who can."""
+    if settings.law:
+        return OwnLaw(tried_law(settings.law), settings).to_point
     return PointLaw(PointLawSettings(**settings.turning))
 
 
-def prompt_point_law(settings: SteeringSettings) -> PointLaw:
+def prompt_point_law(settings: SteeringSettings) -> LawToPoint:
     """Return the law for points that turns the bevel at once: as paths are planned."""
+    if settings.law:
+        return point_law(settings)
     return PointLaw(
         PointLawSettings(
             **settings.turning,

@@ -15,6 +15,8 @@ from needle_controller.laws.roll_turns import RollLawSettings
 from needle_controller.model.gains import Gains
 from needle_controller.observers.estimator import Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver, LuenbergerSettings
+from needle_controller.presets.own_estimator import OwnEstimator, tried_estimator
+from needle_controller.presets.own_law import OwnLaw, tried_law
 from needle_controller.presets.steering_settings import SteeringSettings
 
 
@@ -56,8 +58,12 @@ def make_controller(
     settings: SteeringSettings,
     initial_rotation: npt.ArrayLike,
     entry: npt.ArrayLike | None = None,
+    *,
+    first: int = 0,
 ) -> tuple[Estimator, StepLaw]:
-    """Return a preset's estimator and law, for one needle or for as many as there will be tips.
+    """Return estimator and law, for one needle or for as many as there will be tips.
+
+    They are a preset's, or those of another package where the settings name one.
 
     Parameters
     ----------
@@ -67,7 +73,27 @@ def make_controller(
         Orientation of a needle at its entry with the base's rotation at 0, in `target_plane`.
     entry : array_like, shape (3,), optional
         Where it enters, in `target_plane` [m]; not known if none is given.
+    first : int
+        Number of the first needle, which keys the chance of an own estimator beside the seed.
+
+    Raises
+    ------
+    OwnPartError
+        An estimator or law of another package that is not what it must be.
     """
+    estimator, law = _of_preset(settings, initial_rotation, entry)
+    if settings.estimator:
+        part = tried_estimator(settings.estimator)
+        rng = np.random.default_rng([settings.seed, first])
+        estimator = OwnEstimator(part, settings, initial_rotation, entry, rng)
+    if settings.law:
+        law = OwnLaw(tried_law(settings.law), settings)
+    return estimator, law
+
+
+def _of_preset(
+    settings: SteeringSettings, initial_rotation: npt.ArrayLike, entry: npt.ArrayLike | None
+) -> tuple[Estimator, StepLaw]:
     if settings.preset == "best":
         known = FilterSettings(
             curvature=settings.curvature,

@@ -16,6 +16,7 @@ from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, design_gains
 from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
+from needle_controller.presets.own_parts import GROUPS, check_is_offered, own_part
 
 ONE_SIDED_PRESETS = ("paper", "open_loop")
 """Their coordinates end at roll +-90 deg."""
@@ -52,6 +53,22 @@ class SteeringSettings:
         description="best = hypothesis filter and roll law, paper = observer and law of [KC09], "
         "open_loop = no rotation.",
         choices=PRESETS,
+    )
+    estimator: str = fixed_parameter(
+        "",
+        "-",
+        "Name of an estimator of another package, in place of the preset's (entry points "
+        "needle_controller.estimators; docs/own_controllers.md); empty = the preset's.",
+    )
+    law: str = fixed_parameter("", "-", "Likewise of a control law (needle_controller.laws).")
+    planner: str = fixed_parameter(
+        "",
+        "-",
+        "Likewise of a planner of ways to a point (needle_controller.planners); empty = ours, past "
+        "obstacles.",
+    )
+    seed: int = fixed_parameter(
+        0, "-", "Of what chance another package's estimator uses; ours use none.", 0, 2**31 - 1
     )
     curvature: float = parameter(
         1.0 / 0.122,
@@ -292,6 +309,9 @@ class SteeringSettings:
             numbers = getattr(self, name)
             if len(numbers) != 3:
                 raise UserError(f"{name} = {list(numbers)}, wants three numbers, for s1, s2, s3")
+        for kind in GROUPS:
+            if name := getattr(self, kind):
+                check_is_offered(kind, name)
         self.check_plane(self.plane())
         if self.target_point:
             if len(self.target_point) != 3:
@@ -300,6 +320,8 @@ class SteeringSettings:
         if len(self.obstacles) % 7:
             raise UserError(f"obstacles has {len(self.obstacles)} numbers, wants 7 for each")
         FlipPlan(self.flip_depths).check_within(self.depth)
+        if self.flip_depths and self.law:
+            raise UserError(f"flip_depths are of the law of best; law {self.law} says itself")
         if self.flip_depths and self.preset in ONE_SIDED_PRESETS:
             raise UserError(
                 f"flip_depths: preset {self.preset} cannot steer with the bevel flipped (its "
@@ -316,6 +338,12 @@ class SteeringSettings:
             measurement_std=self.measurement_std,
             step_length=self.step_length,
         )
+
+    @property
+    def controller(self) -> str:
+        """What steers, in words: the preset, and what of other packages is in it."""
+        own = [f"{kind} {getattr(self, kind)}" for kind in GROUPS if getattr(self, kind)]
+        return f"{self.preset} with {', '.join(own)}" if own else self.preset
 
     @property
     def turning(self) -> dict[str, float]:
@@ -344,14 +372,25 @@ class SteeringSettings:
         check_point(point, self.curvature, self.depth)
 
     def check_steers_to_points(self) -> None:
-        """Refuse points altogether, with a preset or a plan that is for planes; UserError."""
-        if self.preset not in POINT_PRESETS:
+        """Refuse points altogether, with a law or a plan that is for planes; UserError."""
+        if self.law and not self.steers_to_points:
+            raise own_part("law", self.law).error(
+                "cannot steer to a point: it lacks to_point(estimate, target)"
+            )
+        if not self.steers_to_points:
             raise UserError(
                 f"preset {self.preset} cannot steer to a point (it does not estimate the whole "
                 f"pose); {', '.join(POINT_PRESETS)} can"
             )
         if self.flip_depths:
             raise UserError("a target point and flip_depths do not go together")
+
+    @property
+    def steers_to_points(self) -> bool:
+        """Whether the law is one for points, too."""
+        if self.law:
+            return callable(getattr(own_part("law", self.law).made_by, "to_point", None))
+        return self.preset in POINT_PRESETS
 
     def check_plane(self, plane: TargetPlane) -> None:
         """Refuse a wanted plane that is out of reach; raises UserError."""

@@ -157,7 +157,7 @@ class ContinuousSteering(Steering):
                 way = self.intake.joints.between(ahead.start, joints, spacing)
                 self.step += 1
             update, actions = self._use(accepted, way)
-            if not self._steering:
+            if update is None:
                 return actions
             slowly = self.trust.is_doubtful
             ahead = self._ahead = PathAhead(joints, update.command, self.settings, slowly=slowly)

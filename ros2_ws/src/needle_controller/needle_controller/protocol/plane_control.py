@@ -20,11 +20,7 @@ from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.presets.path_steering import PathSteering, configured_obstacles
 from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
-from needle_controller.presets.steering_settings import (
-    ONE_SIDED_PRESETS,
-    POINT_PRESETS,
-    SteeringSettings,
-)
+from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.trust import TARGET_TOLERANCE
@@ -149,7 +145,7 @@ class PlaneControl:
             self.plane = settings.plane()
         if settings.target_point != self._settings.target_point:
             self.target_point = _point(settings)
-        if settings.preset not in POINT_PRESETS:
+        if not settings.steers_to_points:
             self.target_point = None
         if settings.obstacles != self._settings.obstacles:
             self.obstacles = configured_obstacles(settings)
@@ -244,14 +240,14 @@ class PlaneControl:
         rotation : float
             Of the base [rad].
         """
-        if self.target_point is None or not len(self.obstacles):
+        if self.target_point is None or not self._is_planned:
             return ""
         return self._path.why_not(self.target_point, self.obstacles, rotation)
 
     def _command(self, estimate: Estimate, joints: JointSample) -> SteeringCommand | None:
         if self._points is None:
             return self._law(estimate, joints.insertion)
-        if len(self.obstacles):
+        if self._is_planned:
             point = self._points.motion.last
             return self._path.command(
                 estimate, self._plane, point, self.obstacles, joints.insertion
@@ -263,6 +259,11 @@ class PlaneControl:
             self._settings.rotation_budget - self._rotation,
             self._plane.from_rig,
         )
+
+    @property
+    def _is_planned(self) -> bool:
+        """Whether a planner leads to the point: ours past obstacles, an own one always."""
+        return len(self.obstacles) > 0 or self._settings.planner != ""
 
     def _reach(self, estimate: Estimate, joints: JointSample) -> Reachability:
         limits = {
@@ -299,7 +300,7 @@ class PlaneControl:
         estimator.correct([0.0, 0.0, length], settings.configured_covariance())
         estimate = estimator.estimate()
         law(estimate, length)
-        if settings.preset in POINT_PRESETS:
+        if settings.steers_to_points:
             point_law(settings)(estimate, [0.0, 0.0, 1.0])
             ahead = np.array([0.0, 0.0, 0.5 * settings.depth])
             PathSteering(settings).command(estimate, self._plane, ahead, _FAR_AWAY, length)

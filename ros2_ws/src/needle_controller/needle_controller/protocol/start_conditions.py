@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import DEPTH_TOLERANCE
@@ -105,4 +106,7 @@ def _needle_obstacle(joints: JointSample, control: PlaneControl, settings: Steer
             f"the needle's roll in target_plane is {roll:.3g} rad (rotation_joint "
             f"{joints.rotation:.4g} rad), wants within {control.largest_start_roll:.3g} rad"
         )
-    return control.path_obstacle(joints.rotation)
+    try:
+        return control.path_obstacle(joints.rotation)
+    except OwnPartError as error:
+        return str(error)

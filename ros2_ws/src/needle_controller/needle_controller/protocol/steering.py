@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 from needle_controller.model.reachability import Reachability
+from needle_controller.presets.own_parts import OwnPartError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import Heard, JointSample
 from needle_controller.protocol.next_step import next_step
@@ -121,8 +122,6 @@ class Steering:
         if not self._steering:
             return StartReply(True, f"was not steering ({self.state.value})"), []
         return StartReply(True, "stopped"), self._leave(SteeringState.IDLE, "stopped", "info")
-
-    # What comes in
 
     def on_joints(self, sample: JointSample) -> list[Action]:
         """Take a sample of the joints."""
@@ -313,24 +312,25 @@ class Steering:
     def _go_on_from(self, accepted: AcceptedTip) -> list[Action]:
         """Do what a good tip lets be done."""
         update, actions = self._use(accepted)
-        if not self._steering:
+        if update is None:
             return actions
-        tip, joints = accepted.tip, accepted.joints
-        self._ready_step = next_step(
-            tip.stamp_ns, joints, update.command, self.settings, slowly=self.trust.is_doubtful
-        )
+        stamp, joints, slowly = accepted.tip.stamp_ns, accepted.joints, self.trust.is_doubtful
+        self._ready_step = next_step(stamp, joints, update.command, self.settings, slowly=slowly)
         if self._ready_step is None:
             return actions + self._end(update, joints)
         return actions + self._send()
 
     def _use(
         self, accepted: AcceptedTip, way: Sequence[JointSample] = ()
-    ) -> tuple[ControlUpdate, list[Action]]:
-        """Hand a tip to the estimator; steering has ended where no way on is clear."""
+    ) -> tuple[ControlUpdate | None, list[Action]]:
+        """Hand a tip to the estimator; None where no way on is clear, or another's part failed."""
         tip, joints = accepted.tip, accepted.joints
         self.rejection = ""
         self.insertion = joints.insertion
-        update = self.control.update(tip.position, joints, accepted.covariance, way)
+        try:
+            update = self.control.update(tip.position, joints, accepted.covariance, way)
+        except OwnPartError as error:
+            return None, self._leave(SteeringState.FAULT, str(error), "error")
         self.reach = update.reach
         self.trust = trust_of(update.estimate)
         self.reason = "; ".join(update.estimate.warnings)
@@ -340,7 +340,7 @@ class Steering:
             actions.append(Log("info", "STEERING: a good tip came"))
         if update.blocked:
             why = f"no way on from insertion {joints.insertion:.4g} m is clear of the obstacles"
-            actions += self._leave(SteeringState.IDLE, why, "warning")
+            return None, [*actions, *self._leave(SteeringState.IDLE, why, "warning")]
         return update, actions
 
     def _end(self, update: ControlUpdate, joints: JointSample) -> list[Action]:

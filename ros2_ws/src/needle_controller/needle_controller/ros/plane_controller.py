@@ -112,7 +112,7 @@ class PlaneControllerNode(WholeNode):
         self._life = LifeSigns(
             self,
             self._diagnostics,
-            f"preset {values.preset}",
+            f"preset {values.controller}",
             self._waits_for,
             alone_on=("device/joint_trajectory", "needle/controller_status"),
         )

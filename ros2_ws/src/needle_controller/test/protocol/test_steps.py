@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
+from needle_controller.observers.luenberger import LuenbergerObserver
+from needle_controller.presets.own_estimator import OwnEstimator
+from needle_controller.presets.own_parts import OwnPart
+from needle_controller.presets.presets import observer_settings
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import Awaiting, PublishUpdate, SteeringState
 from needle_controller.protocol.tip_gate import TipMeasurement
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, none_sent, sent, where
+from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 
 
 def test_start_without_hold_asks_for_no_tip_until_somebody_holds() -> None:
@@ -166,3 +172,32 @@ def test_the_last_step_ends_at_the_depth_and_then_it_is_done() -> None:
     assert where(rig) == (SteeringState.DONE, Awaiting.NOTHING)
     assert rig.steering.insertion == 0.0025
     assert not rig.steering.on_start()[0].success
+
+
+def test_an_own_estimator_that_fails_on_the_way_stops_the_needle() -> None:
+    class Broken(LuenbergerObserver):
+        is_mended = False
+
+        def __init__(self, settings: SteeringSettings, *_: object) -> None:
+            super().__init__(observer_settings(settings, settings.gains()))
+
+        def advance(self, d_insertion: npt.ArrayLike, d_rotation: npt.ArrayLike) -> None:
+            if not self.is_mended:
+                raise RuntimeError("no")
+
+    rig = Rig()
+    settings, rng = rig.steering.settings, np.random.default_rng(0)
+    part = OwnPart("estimator", "broken", "package 1.0, module:Broken", Broken)
+    own = OwnEstimator(part, settings, np.eye(3), np.zeros(3), rng)
+    rig.steering.control._estimator = own
+    rig.run(sent(rig.expose()))
+    actions = rig.expose()
+    assert none_sent(actions)
+    assert where(rig) == (SteeringState.FAULT, Awaiting.NOTHING)
+    assert "estimator 'broken' (package 1.0, module:Broken): advance(" in logged(actions)
+    assert "raised RuntimeError: no at test_steps.py:" in rig.steering.reason
+    # A tip that comes later moves nothing either.
+    Broken.is_mended = True
+    assert none_sent(rig.expose())
+    assert rig.steering.on_start()[0].success
+    assert not none_sent(rig.expose())

@@ -72,6 +72,7 @@ def run_point_study(
     *,
     on_progress: Callable[[int], None] = lambda _: None,
     chunk: int = CHUNK,
+    first: int = 0,
 ) -> PointOutcomes:
     """Steer each needle from its start to its point.
 
@@ -89,6 +90,8 @@ def run_point_study(
         Told after each step how many needles were on their way.
     chunk : int
         Needles steered at a time; changes the time it takes, not the outcomes.
+    first : int
+        Number of the first needle: of a part of a study the place where it begins.
 
     Returns
     -------
@@ -96,8 +99,9 @@ def run_point_study(
         In the order of the starts.
     """
     parts = []
-    for first, needles in needle_chunks(starts, settings, bump_at=0.5 * NEAREST, chunk=chunk):
-        some = targets.part(first, len(needles.true.x))
+    chunks = needle_chunks(starts, settings, bump_at=0.5 * NEAREST, chunk=chunk, begin=first)
+    for place, needles in chunks:
+        some = targets.part(place, len(needles.true.x))
         parts.append(_steer(needles, some, new_controller(), settings, on_progress))
     return joined(parts)
 

@@ -98,6 +98,7 @@ def run_study(
     *,
     on_progress: Callable[[int], None] = lambda _: None,
     chunk: int = CHUNK,
+    first: int = 0,
 ) -> Outcomes:
     """Steer each needle from its start.
 
@@ -113,24 +114,27 @@ def run_study(
         Told after each step how many needles have made one.
     chunk : int
         Needles steered at a time; changes the time it takes, not the outcomes.
+    first : int
+        Number of the first needle: of a part of a study the place where it begins.
 
     Returns
     -------
     Outcomes
         In the order of the starts.
     """
-    chunks = needle_chunks(starts, settings, bump_at=0.5 * settings.depth, chunk=chunk)
+    chunks = needle_chunks(starts, settings, bump_at=0.5 * settings.depth, chunk=chunk, begin=first)
     return joined(
         [_steer(needles, new_controller(), settings, on_progress) for _, needles in chunks]
     )
 
 
 def needle_chunks(
-    starts: FloatArray, settings: StudySettings, *, bump_at: float, chunk: int
+    starts: FloatArray, settings: StudySettings, *, bump_at: float, chunk: int, begin: int = 0
 ) -> Iterator[tuple[int, DisturbedNeedles]]:
-    """Yield the needles of a study, `chunk` at a time, each time after the number of the first.
+    """Yield the needles of a study, `chunk` at a time, each time after the place of the first.
 
-    Parameters, but for `bump_at` (see `DisturbedNeedles`), as of `run_study`.
+    Parameters, but for `bump_at` (see `DisturbedNeedles`), as of `run_study`; `begin` is its
+    `first`.
     """
     for first in range(0, len(starts), chunk):
         yield (
@@ -141,7 +145,7 @@ def needle_chunks(
                 curvature=settings.curvature,
                 bump_at=bump_at,
                 seed=settings.seed,
-                first=first,
+                first=begin + first,
             ),
         )
 

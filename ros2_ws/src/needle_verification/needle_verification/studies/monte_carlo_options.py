@@ -16,6 +16,7 @@ from needle_common.commands.options import (
     whole_number,
 )
 from needle_common.errors import UserError
+from needle_controller.presets.steering_settings import PRESETS
 from needle_sim.studies.disturbances import NOISE_SHAPES, Disturbances
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 
@@ -61,6 +62,7 @@ examples:
   ros2 run needle_sim monte_carlo --targets 2000 --target-drift-mm 2 --target-breath-mm 3
   ros2 run needle_sim monte_carlo --targets 2000 --controller sliding_mode
   ros2 run needle_sim monte_carlo --targets 2000 --controller rrt
+  ros2 run needle_sim monte_carlo --estimator particle_filter --draws 1
   ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
@@ -74,6 +76,9 @@ class MonteCarloOptions:
     """Options of one study; SI."""
 
     controller: str
+    estimator: str
+    law: str
+    planner: str
     grid: str
     draws: int
     bounds: StartBounds
@@ -108,9 +113,16 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(NOISE_SHAPES)}")
     if given.targets != "0" and given.turn_delay_mm != "0":
         raise UserError("--turn-delay-mm is of needles that are steered to the plane")
+    if given.planner and given.targets == "0":
+        raise UserError("--planner goes with --targets only")
+    if (given.planner or given.law) and given.controller not in PRESETS:
+        raise UserError(f"--controller {given.controller} is a law; it goes without another one")
     depth = given.depth_mm or (_DEPTH_MM if given.targets == "0" else _DEPTH_OF_POINTS_MM)
     return MonteCarloOptions(
         controller=given.controller,
+        estimator=given.estimator,
+        law=given.law,
+        planner=given.planner,
         grid=given.grid,
         draws=whole_number("--draws", given.draws, 1, 1000),
         bounds=StartBounds(
@@ -159,6 +171,18 @@ def _parser() -> CommandParser:
         help="best, paper or open_loop; with --targets best, or the published sliding_mode or rrt "
         "with best's estimator (default: best)",
     )
+    for option, what in (
+        ("--estimator", "an estimator"),
+        ("--law", "a control law"),
+        ("--planner", "with --targets: a planner"),
+    ):
+        add(
+            option,
+            default="",
+            metavar="NAME",
+            help=f"{what} of another package in place of the controller's own, by the name of its "
+            "entry point (docs/own_controllers.md)",
+        )
     add(
         "--grid",
         default="endpoint",

@@ -5,6 +5,7 @@ needle_sim, whose studies these are for, does not know the controller under test
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
 
@@ -15,9 +16,12 @@ from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_motion import TargetMotion
+from needle_controller.model.target_plane import offset_plane
 from needle_controller.observers.estimator import Estimate, Estimator
 from needle_controller.observers.luenberger import LuenbergerObserver
-from needle_controller.presets.point_steering import PointSteering
+from needle_controller.planning.obstacles import Obstacles
+from needle_controller.presets.path_steering import PathSteering, tip_states
+from needle_controller.presets.point_steering import PointSteering, prompt_point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import (
     ONE_SIDED_PRESETS,
@@ -235,6 +239,40 @@ def rrt_law(
     return command
 
 
+def planned_law(motion: TargetMotion, settings: SteeringSettings) -> TimedLaw:
+    """Return the law that leads each needle along a planner's way; no obstacle is in it.
+
+    Parameters
+    ----------
+    motion : TargetMotion
+        Of the targets.
+    settings : SteeringSettings
+        Of the needles, and which planner.
+    """
+    law, free, plane = prompt_point_law(settings), Obstacles(), offset_plane(0.0)
+    needles: list[PathSteering] = []
+
+    def command(
+        estimate: Estimate, _: FloatArray, insertion: FloatArray, __: FloatArray
+    ) -> SteeringCommand:
+        count = len(estimate.position)
+        needles.extend(PathSteering(settings) for _ in range(count - len(needles)))
+        targets = np.broadcast_to(motion.last, (count, 3))
+        inserted = np.broadcast_to(insertion, (count,))
+        # Who sees no way stays where it is.
+        aims, longer = np.array(targets), np.zeros(count)
+        for n, tip in enumerate(tip_states(estimate, plane)):
+            route = needles[n].route(tip, targets[n], free, float(inserted[n]))
+            longer[n] = -math.inf if route is None else route.length or math.nan
+            aims[n] = aims[n] if route is None else route.aim
+        said = law(estimate, aims)
+        assert said.insertion_left is not None
+        left = np.where(np.isnan(longer), said.insertion_left, longer)
+        return SteeringCommand(said.virtual_input, said.rotation_rate, left)
+
+    return command
+
+
 def _in_frames_of_tips(points: Array, estimate: Estimate) -> Array:
     off = (points - estimate.position)[..., None]
     return np.asarray((estimate.rotation.swapaxes(-1, -2) @ off)[..., 0])
@@ -245,6 +283,28 @@ def needles_at_a_time(name: str) -> int:
     return _LINEAR_CHUNK if name in ONE_SIDED_PRESETS else CHUNK
 
 
+@dataclasses.dataclass(frozen=True)
+class OwnParts:
+    """Parts of a controller that come from other packages: names, empty where a preset's are used.
+
+    Attributes
+    ----------
+    estimator, law, planner : str
+        See `SteeringSettings`.
+    seed, first : int
+        Key what chance the estimator uses: of the study, and the first needle.
+    """
+
+    estimator: str = ""
+    law: str = ""
+    planner: str = ""
+    seed: int = 0
+    first: int = 0
+
+
+PRESETS_OWN = OwnParts()
+
+
 def controller_factory(
     name: str,
     claimed: float,
@@ -252,6 +312,7 @@ def controller_factory(
     *,
     sigma_scale: float = 1.0,
     turn_delay: float = 0.0,
+    own: OwnParts = PRESETS_OWN,
 ) -> Callable[[], SteeredNeedles]:
     """Return what makes the controller of some needles.
 
@@ -268,20 +329,27 @@ def controller_factory(
         standard deviations are those of uniform noise within `claimed`, divided by this.
     turn_delay : float
         As of `study.StudySettings` [m].
+    own : OwnParts
+        What other packages have in place of the preset's.
 
     Raises
     ------
     UserError
         If there is no such controller, or it cannot flip.
     """
-    settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths)
+    settings, covariance = _what_is_told(name, claimed, sigma_scale, flip_depths, own)
     return lambda: SteeredNeedles(
-        *make_controller(settings, np.eye(3), np.zeros(3)), covariance, turn_delay
+        *make_controller(settings, np.eye(3), np.zeros(3), first=own.first), covariance, turn_delay
     )
 
 
 def point_controller_factory(
-    name: str, claimed: float, *, sigma_scale: float = 1.0, rotation_budget: float = math.inf
+    name: str,
+    claimed: float,
+    *,
+    sigma_scale: float = 1.0,
+    rotation_budget: float = math.inf,
+    own: OwnParts = PRESETS_OWN,
 ) -> Callable[[], NeedlesToPoints]:
     """Return what makes the controller of some needles that are steered to points.
 
@@ -290,7 +358,7 @@ def point_controller_factory(
     the most that each base may turn [rad]; those laws do not heed it.
     """
     preset = "best" if name in {SLIDING_MODE, RRT} else name
-    settings, covariance = _what_is_told(preset, claimed, sigma_scale, ())
+    settings, covariance = _what_is_told(preset, claimed, sigma_scale, (), own)
     settings.check_steers_to_points()
 
     def new_law(motion: TargetMotion) -> TimedLaw:
@@ -298,22 +366,28 @@ def point_controller_factory(
             return rrt_law(motion, settings)
         if name == SLIDING_MODE:
             return sliding_law(motion, settings.max_rotation_per_length)
+        if settings.planner:
+            return planned_law(motion, settings)
         return PointSteering(settings, motion).command
 
     def needles() -> NeedlesToPoints:
-        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3))
+        estimator, _ = make_controller(settings, np.eye(3), np.zeros(3), first=own.first)
         return NeedlesToPoints(estimator, new_law, covariance, rotation_budget)
 
     return needles
 
 
 def _what_is_told(
-    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float]
+    name: str, claimed: float, sigma_scale: float, flip_depths: Sequence[float], own: OwnParts
 ) -> tuple[SteeringSettings, Array | None]:
     if name not in PRESETS:
         raise UserError(f"--controller {name!r} is not available; there is {', '.join(PRESETS)}")
     settings = SteeringSettings(
         preset=name,
+        estimator=own.estimator,
+        law=own.law,
+        planner=own.planner,
+        seed=own.seed,
         tip_covariance="configured" if sigma_scale == 1.0 else "from_tip_pose",
         tip_noise="bounded",
         tip_noise_bound=claimed,

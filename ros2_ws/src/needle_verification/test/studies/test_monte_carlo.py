@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pytest
 
 from needle_verification.studies.monte_carlo import main
 from needle_verification.studies.monte_carlo_options import parse
+from needle_verification.studies.study_parts import parts_of, results_of
 
 KEYS = {
     "runs",
@@ -155,3 +157,31 @@ def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
 
 def test_the_default_controller_is_the_best() -> None:
     assert parse([]).controller == "best"
+
+
+@pytest.mark.parametrize("asked", [["--targets", "11"], ["--controller", "paper", "--draws", "1"]])
+def test_a_part_of_a_study_comes_out_as_in_the_whole(asked: list[str]) -> None:
+    """Wherever it is cut: so that parts can be steered on many machines."""
+    options = parse([*asked, "--depth-mm", "12", "--target-drift-mm", "2", "--play-deg", "10"])
+    (whole,) = parts_of(options)
+    cut = 4
+    rest = dataclasses.replace(
+        whole, first=cut, starts=whole.starts[cut:], places=whole.places[cut:]
+    )
+    parts = [whole.of_first(cut), rest]
+    apart = results_of(parts, [part.run() for part in parts])
+    together = results_of([whole], [whole.run()])
+    assert apart.columns.keys() == together.columns.keys()
+    for name, column in together.columns.items():
+        np.testing.assert_array_equal(apart.columns[name], column, err_msg=name)
+    assert apart.figures == together.figures
+
+
+def test_an_own_part_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for words in (["--estimator", "a"], ["--law", "a"], ["--targets", "3", "--planner", "a"]):
+        assert main([*words, "--depth-mm", "5"]) == 2
+        assert "= 'a': no installed package offers it" in capsys.readouterr().err
+    assert main(["--planner", "a"]) == 2
+    assert "--planner goes with --targets only" in capsys.readouterr().err
+    assert main(["--targets", "3", "--controller", "rrt", "--law", "a"]) == 2
+    assert "rrt is a law" in capsys.readouterr().err

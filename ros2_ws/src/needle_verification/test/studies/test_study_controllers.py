@@ -46,7 +46,7 @@ def test_the_controller_is_told_what_is_claimed(
     made: list[SteeringSettings] = []
     recorder = Recorder(FilterSettings())
 
-    def make(settings: SteeringSettings, *_: Array) -> tuple[Recorder, Any]:
+    def make(settings: SteeringSettings, *_: Array, **__: int) -> tuple[Recorder, Any]:
         made.append(settings)
         return recorder, still
 

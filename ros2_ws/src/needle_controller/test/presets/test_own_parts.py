@@ -1,0 +1,289 @@
+"""Estimators, laws and planners of other packages: found, tried when loaded, held to what is."""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from needle_common.errors import UserError
+from needle_controller.observers.estimator import pose_estimate
+from needle_controller.planning.entry import entry_state
+from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.presets.own_estimator import tried_estimator
+from needle_controller.presets.own_law import OwnLaw, tried_law
+from needle_controller.presets.own_parts import GROUPS, OwnPartError
+from needle_controller.presets.own_planner import tried_planner
+from needle_controller.presets.path_steering import PathSteering
+from needle_controller.presets.presets import make_controller
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+
+ESTIMATOR = '''
+import numpy as np
+from needle_controller.model.arc_motion import arc
+from needle_controller.observers.estimator import pose_estimate
+
+
+class Own:
+    """Believes the last tip, and the model for the rest."""
+
+    broken = False
+
+    def __init__(self, settings, initial_rotation, entry, rng):
+        self.settings, self.start, self.rng = settings, initial_rotation, rng
+
+    def reset(self, tip, joints):
+        self.place = tip
+        self.turn = np.broadcast_to(self.start, (*tip.shape, 3))
+        self.chance = self.rng.random()
+
+    def advance(self, d_insertion, d_rotation):
+        step = arc(d_insertion, d_rotation, self.settings.curvature)
+        self.place = self.place + (self.turn @ step.shift[..., None])[..., 0]
+        self.turn = self.turn @ step.rotation
+
+    def correct(self, tip, covariance, age):
+        self.place = np.where(np.isfinite(tip), tip, self.place)
+
+    def estimate(self):
+        return pose_estimate(self.place, self.turn, self.settings.curvature, np.eye(6) * 1e-6)
+
+    def change_frame(self, T_new_old):
+        self.place = self.place @ T_new_old[:3, :3].T + T_new_old[:3, 3]
+        self.turn = T_new_old[:3, :3] @ self.turn
+'''
+LAW = """
+import numpy as np
+
+
+class Own:
+    def __init__(self, settings):
+        self.settings = settings
+
+    def to_plane(self, estimate, insertion):
+        return np.full(estimate.curvature.shape, 40.0 * insertion)
+
+    def to_point(self, estimate, target):
+        return np.zeros(estimate.curvature.shape)
+"""
+PLANNER = """
+import numpy as np
+
+
+class Own:
+    def __init__(self, settings):
+        self.settings = settings
+
+    def via_points(self, tip, target, obstacles):
+        if len(obstacles) > 1:
+            return None
+        if len(obstacles) == 1:
+            return np.array([[0.0, -0.01, 0.04], target])
+        return [target]
+"""
+Offer = Callable[..., str]
+NUMBERS = itertools.count()
+
+
+@pytest.fixture
+def offer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Offer]:
+    """Return what makes a package that offers a class `Own` of a module; it returns its name."""
+    modules = []
+
+    def make(kind: str, source: str, value: str = "", package: str = "", name: str = "") -> str:
+        module = f"own_module_{next(NUMBERS)}"
+        folder = tmp_path / module
+        about = folder / f"{package or module}-1.0.dist-info"
+        about.mkdir(parents=True)
+        (folder / f"{module}.py").write_text(source)
+        (about / "METADATA").write_text(
+            f"Metadata-Version: 2.1\nName: {package or module}\nVersion: 1.0\n"
+        )
+        (about / "entry_points.txt").write_text(
+            f"[{GROUPS[kind]}]\n{name or module} = {value or f'{module}:Own'}\n"
+        )
+        monkeypatch.syspath_prepend(folder)
+        modules.append(module)
+        return name or module
+
+    yield make
+    for module in modules:
+        sys.modules.pop(module, None)
+
+
+def test_an_own_estimator_stands_in_the_preset_s_place(offer: Offer) -> None:
+    name = offer("estimator", ESTIMATOR)
+    settings = SteeringSettings(estimator=name, **PAPER_NOISE)
+    assert settings.controller == f"best with estimator {name}"
+    estimator, law = make_controller(settings, np.eye(3))
+    estimator.reset([0.003, 0.0, 0.0], [0.0, 0.0])
+    estimator.advance(0.001, 0.0)
+    estimator.correct([0.0028, 0.0, 0.001])
+    found = estimator.estimate()
+    np.testing.assert_allclose(found.position, [0.0028, 0.0, 0.001])
+    # Above the plane the needle is to bend down, to -y of the tip: roll to +90 deg.
+    assert float(law(found, 0.001).rotation_rate) != 0.0
+
+
+def test_chance_is_keyed_by_the_seed_and_the_first_needle(offer: Offer) -> None:
+    name = offer("estimator", ESTIMATOR)
+
+    def chance(seed: int, first: int) -> float:
+        settings = SteeringSettings(estimator=name, seed=seed)
+        estimator, _ = make_controller(settings, np.eye(3), first=first)
+        estimator.reset(np.zeros(3), np.zeros(2))
+        return float(estimator._own.chance)  # type: ignore[attr-defined]
+
+    drawn = [chance(1, 0), chance(1, 500), chance(2, 0)]
+    assert len(set(drawn)) == 3
+    assert chance(1, 500) == drawn[1]
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        ("    def correct(self", "lacks correct(tip, covariance, age)"),
+        ("    def change_frame(self", "lacks change_frame(T_new_old)"),
+        ("class Own", "has no attribute 'Own'"),
+        ("import numpy as np", "loading it raised NameError"),
+        ("self.settings, self.start, self.rng = settings", "raised NameError"),
+    ],
+)
+def test_what_an_estimator_lacks_is_named(offer: Offer, broken: str, said: str) -> None:
+    source = {
+        "import numpy as np": ESTIMATOR.replace("import numpy as np", "numpy"),
+        "class Own": ESTIMATOR.replace("class Own", "class Other"),
+        "self.settings, self.start, self.rng = settings": ESTIMATOR.replace(
+            "= settings, initial", "= setting, initial"
+        ),
+    }.get(broken, ESTIMATOR.replace(broken, broken.replace("def ", "def not_")))
+    assert source != ESTIMATOR
+    name = offer("estimator", source)
+    with pytest.raises(OwnPartError) as error:
+        tried_estimator(name)
+    text = str(error.value)
+    assert said in text
+    assert name in text
+    assert "docs/own_controllers.md" in text
+    assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    ("sound", "wrong", "said"),
+    [
+        ("return pose_estimate(", "return (", "returned tuple, wants an Estimate"),
+        ("(self.place, self.turn", "(self.place * np.nan, self.turn", "holds nan"),
+        ("(self.place, self.turn", "(1e3 * self.place, self.turn", "is wanted in m"),
+        ("(self.place, self.turn", "(0 * self.place, self.turn", "0.02 m off"),
+        ("np.eye(6) * 1e-6)", "[[1, 2], [3]])", "estimate() raised ValueError"),
+        ("reset(self, tip, joints)", "reset(self, tip)", "reset(tip, joints) raised TypeError"),
+        ("np.eye(6) * 1e-6)", "np.eye(5))", "estimate() raised ValueError"),
+        ("np.eye(6) * 1e-6)", "np.full((6, 6), np.inf))", "covariance holds inf"),
+        ("np.where(np.isfinite(tip), tip, self.place)", "tip", "holds nan"),
+        ("+ T_new_old[:3, 3]", "- T_new_old[:3, 3]", "change_frame by 0.002 m along x moves x by"),
+        (
+            "step.shift[..., None])[..., 0]",
+            "step.shift[:, None])[:, 0]",
+            "advance(d_insertion, d_rotation) raised",
+        ),
+    ],
+)
+def test_what_no_estimate_can_be_is_named(offer: Offer, sound: str, wrong: str, said: str) -> None:
+    assert sound in ESTIMATOR
+    with pytest.raises(OwnPartError, match=r"^estimator 'own_module") as error:
+        tried_estimator(offer("estimator", ESTIMATOR.replace(sound, wrong)))
+    assert said in str(error.value)
+
+
+def test_a_name_that_nobody_offers_tells_those_that_are(offer: Offer) -> None:
+    name = offer("estimator", ESTIMATOR)
+    with pytest.raises(UserError, match=rf"offered: .*{name} \({name} 1.0\)"):
+        SteeringSettings(estimator="nobody")
+    with pytest.raises(UserError, match=r"law = 'own_module_\d+': no installed package"):
+        SteeringSettings(law=name)
+
+
+def test_a_name_that_two_packages_offer_is_refused(offer: Offer) -> None:
+    for package in ("one", "two"):
+        offer("law", LAW, package=package, name="both")
+    with pytest.raises(UserError, match=r"several packages: (one|two) 1.0, (one|two) 1.0"):
+        SteeringSettings(law="both")
+
+
+def test_a_function_is_no_class(offer: Offer) -> None:
+    name = offer("law", "def Own(estimate):\n    return 0.0\n")
+    with pytest.raises(OwnPartError, match=r"is a function, wants a class .* \(settings\)"):
+        tried_law(name)
+
+
+def test_an_own_law_turns_no_faster_than_the_rig_may(offer: Offer) -> None:
+    settings = SteeringSettings(law=offer("law", LAW), max_rotation_per_length=10.0)
+    _, law = make_controller(settings, np.eye(3))
+    estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6))
+    assert float(law(estimate, 0.1).rotation_rate) == pytest.approx(4.0)
+    assert float(law(estimate, 1.0).rotation_rate) == 10.0
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ("return np.nan", "holds nan"),
+        ("return np.zeros(3)", "has shape (3,), wants ()"),
+        ("return 'fast'", "is of type str"),
+        ("return estimate.speed", "to_plane(estimate, insertion) raised AttributeError"),
+    ],
+)
+def test_what_no_rotation_rate_can_be_is_named(offer: Offer, wrong: str, said: str) -> None:
+    source = LAW.replace("return np.full(estimate.curvature.shape, 40.0 * insertion)", wrong)
+    with pytest.raises(OwnPartError) as error:
+        tried_law(offer("law", source))
+    assert said in str(error.value)
+
+
+def test_a_law_to_points_knows_how_far_they_are(offer: Offer) -> None:
+    settings = SteeringSettings(law=offer("law", LAW))
+    law = OwnLaw(tried_law(settings.law), settings)
+    estimate = pose_estimate(np.zeros(3), np.eye(3), 8.0, np.eye(6))
+    # A quarter of a circle of 50 mm radius, and straight on, either way.
+    targets = {(0.05, 0.0, 0.05): 0.05 * np.pi / 2.0, (0, 0, 0.1): 0.1, (0, 0, -0.02): -0.02}
+    for target, left in targets.items():
+        said = law.to_point(estimate, np.array(target)).insertion_left
+        assert said is not None
+        assert float(said) == pytest.approx(left)
+
+
+def test_a_law_for_planes_alone_is_not_asked_for_a_point(offer: Offer) -> None:
+    name = offer("law", LAW.replace("def to_point", "def not_to_point"))
+    with pytest.raises(UserError, match=r"cannot steer to a point: it lacks to_point"):
+        SteeringSettings(law=name, target_point=(0.0, 0.0, 0.1))
+    SteeringSettings(law=name)
+    with pytest.raises(UserError, match="flip_depths"):
+        SteeringSettings(law=name, flip_depths=(0.05,))
+
+
+def test_an_own_planner_leads_by_its_via_points(offer: Offer) -> None:
+    settings = SteeringSettings(planner=offer("planner", PLANNER))
+    way, target = PathSteering(settings), np.array([0.0, 0.0, 0.08])
+    tip = entry_state(settings.curvature)
+    direct = way.route(tip, target, Obstacles(), 0.0)
+    assert direct is not None
+    assert direct.length is None
+    np.testing.assert_array_equal(direct.aim, target)
+    sphere = Obstacle((0.0, 0.0, 0.04), (0.0, 0.0, 0.04), 0.003)
+    around = way.route(tip, target, Obstacles([sphere]), 0.0)
+    assert around is not None
+    np.testing.assert_allclose(around.aim, [0.0, -0.01, 0.04])
+    assert around.length == pytest.approx(2.0 * np.hypot(0.01, 0.04))
+    assert way.why_not(target, Obstacles([sphere]), 0.0) == ""
+    none = way.why_not(target, Obstacles([sphere, sphere]), 0.0)
+    assert none == f"planner {settings.planner} finds no path to the target point past 2 obstacles"
+
+
+def test_a_way_that_does_not_end_at_the_target_is_refused(offer: Offer) -> None:
+    name = offer("planner", PLANNER.replace("return [target]", "return [target + 0.01]"))
+    with pytest.raises(OwnPartError, match=r"does not end at the target \[0.0, 0.0, 0.08\] m"):
+        tried_planner(name)

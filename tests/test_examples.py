@@ -1,0 +1,90 @@
+"""The examples in docs/examples do what they say: of those that documents do not type."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from needle_controller.observers.estimator import Estimate, pose_estimate
+from needle_controller.planning.entry import entry_state
+from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_sim.needle.plant import NeedlePlant, initial_pose
+
+EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
+SETTINGS = SteeringSettings(**PAPER_NOISE)
+NOISE, STEP = SETTINGS.tip_noise_bound, SETTINGS.step_length
+
+
+@pytest.fixture
+def own(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Return what gives the class of a module of the example package."""
+    monkeypatch.syspath_prepend(EXAMPLES / "own_controllers")
+
+    def of(module: str, name: str) -> Any:
+        return getattr(importlib.import_module(f"own_controllers.{module}"), name)
+
+    return of
+
+
+def followed(filter_: Any, rng: np.random.Generator) -> tuple[Estimate, npt.NDArray[np.float64]]:
+    """Insert four needles by 60 mm with turns; return the estimate and their true poses."""
+    plants = [
+        NeedlePlant(initial_pose(0.1 * k - 0.15, 0.2 * k - 0.3), curvature=SETTINGS.curvature)
+        for k in range(4)
+    ]
+    filter_.reset(np.array([p.T_rig_tip[:3, 3] for p in plants]), np.zeros((4, 2)))
+    for k in range(60):
+        turned = np.array([0.2, -0.3, 0.5, 0.0]) if k % 20 < 10 else np.zeros(4)
+        for plant, turn in zip(plants, turned, strict=True):
+            plant.advance(STEP, float(turn))
+        tips = np.array([p.T_rig_tip[:3, 3] for p in plants]) + rng.uniform(-NOISE, NOISE, (4, 3))
+        if k == 30:
+            tips[1] = np.nan
+        filter_.advance(np.full(4, STEP), turned)
+        filter_.correct(tips, None, np.zeros(4))
+    return filter_.estimate(), np.array([p.T_rig_tip for p in plants])
+
+
+def test_the_particle_filter_knows_where_needles_are_and_how_well(own: Any) -> None:
+    filter_ = own("particle_filter", "ParticleFilter")(
+        SETTINGS, np.eye(3), np.zeros(3), np.random.default_rng(1)
+    )
+    known, true = followed(filter_, np.random.default_rng(2))
+    off = np.linalg.norm(known.position - true[:, :3, 3], axis=1)
+    assert np.max(off) < NOISE
+    heading = np.einsum("ni,ni->n", known.rotation[..., 2], true[:, :3, 2])
+    assert np.max(np.arccos(heading)) < math.radians(4.0)
+    std = np.sqrt(known.covariance[:, 0, 0])
+    assert np.all((std > 0.05 * NOISE) & (std < 0.6 * NOISE))
+
+
+def test_pursuit_bends_to_the_plane_from_either_side(own: Any) -> None:
+    law = own("pursuit", "Pursuit")(SETTINGS)
+    # Above the plane, and below it, with the bevel towards -x and then +x: there already.
+    for x, side in ((0.003, -1.0), (-0.003, 1.0)):
+        roll = side * math.pi / 2.0
+        c, s = math.cos(roll), math.sin(roll)
+        turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+        place = np.array([x, 0.0, 0.0])
+        right = law.to_plane(pose_estimate(place, turn, 8.0, np.eye(6)), 0.0)
+        assert float(right) == pytest.approx(0.0, abs=1e-6)
+        wrong = law.to_plane(pose_estimate(-place, turn, 8.0, np.eye(6)), 0.0)
+        assert abs(float(wrong)) == pytest.approx(math.pi / STEP)
+
+
+def test_sidestep_leads_beside_what_is_in_the_way(own: Any) -> None:
+    planner = own("sidestep", "Sidestep")(SETTINGS)
+    tip, target = entry_state(SETTINGS.curvature), np.array([0.0, 0.0, 0.1])
+    free = np.array([[0.05, 0.0, 0.05, 0.05, 0.0, 0.05, 0.003]])
+    np.testing.assert_array_equal(planner.via_points(tip, target, free), [target])
+    for y in (0.002, 0.0):
+        sphere = np.array([[0.0, y, 0.05, 0.0, y, 0.05, 0.003]])
+        via, last = planner.via_points(tip, target, sphere)
+        assert np.linalg.norm(via - sphere[0, :3]) == pytest.approx(0.009)
+        np.testing.assert_array_equal(last, target)
