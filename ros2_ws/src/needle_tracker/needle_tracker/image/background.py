@@ -20,7 +20,8 @@ _LEVEL = 128.0
 # Of rows and columns: so much is looked at to tell which image is rougher, and over so many pixels.
 _EVERY, _LAG = 8, 2
 _LEAST_LEVEL = 1.0
-_SURE = 128  # of 255: so much of a map is needle
+SURE = 128
+"""Of 255: so much of a map is needle."""
 
 
 class Background:
@@ -52,7 +53,7 @@ class Background:
         self._seam: float | None = None
 
     def difference(self, image: Image) -> Image | None:
-        """Return what an image has beside the background; None where it is smoother as it is.
+        """Return what an image has beside the background; None where the image itself says more.
 
         Before a plain floor the difference has nothing less but more noise; and after the camera
         was touched it has everything twice.
@@ -70,7 +71,9 @@ class Background:
                 cv2.addWeighted(image, 1.0, self.before, -gain, _LEVEL), dtype=np.uint8
             )
             smoother = _roughness(difference) < _roughness(image)
-            self._image, self._difference = image, difference if smoother else None
+            # The first pair is its own background: nothing is new, and the image says all.
+            itself = not self.is_empty and np.array_equal(image, self.before)
+            self._image, self._difference = image, difference if smoother and not itself else None
         return self._difference
 
     def joined(self, whole: Image, new: Image, before: Image) -> Image:
@@ -81,7 +84,8 @@ class Background:
         Parameters
         ----------
         whole, new, before : ndarray of uint8, shape (height, width)
-            Maps of the image, of the difference, and of the image before.
+            Maps of the image, of the difference, and of the image before: that matters only where
+            the difference is needle.
         """
         self._seam = self._begin(whole, new, before)
         if self._seam is None:
@@ -94,7 +98,7 @@ class Background:
         What the difference shows and the image before showed better is a needle that has gone.
         """
         least = self._least_new or 0.0
-        there = new > _SURE
+        there = new > SURE
         away = self._away[there].astype(np.int64)
         come = whole[there].astype(np.int64) - before[there]
         occupied = np.flatnonzero(np.bincount(away))

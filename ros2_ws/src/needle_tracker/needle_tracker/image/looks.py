@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.image import detection, tip_fit
-from needle_tracker.image.background import Background
+from needle_tracker.image.background import SURE, Background
 from needle_tracker.image.detection import DetectionSettings, Image, Path
 from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end, hidden_sigma
-from needle_tracker.image.needle_map import Box, NeedleMap
+from needle_tracker.image.needle_map import TILE, Box, Mask, NeedleMap, tile_counts
 from needle_tracker.image.search_grid import SearchGrid
 from needle_tracker.image.tip_fit import HIDDEN_END_PX, HIDDEN_FACTOR, Expected, ImageTip
 
@@ -37,6 +37,7 @@ _LINE_SYSTEMATIC, _END_SYSTEMATIC = 0.06, 0.15
 # Likewise: beyond such a gap may be another thing, and beyond such a one there is.
 _GAP_WIDTHS, _HIDDEN_WIDTHS = 1.5, 8.0
 _ROOM_WIDTHS = 6.0  # drawn around an end that is fitted
+_SEARCH_WIDTHS = 4.0  # and beside where it is searched for
 
 
 class Look(Protocol):
@@ -105,17 +106,20 @@ class MapLook:
         self._bevel_length_px = bevel_length_px
         self.background: Background | None = None
 
-    def _draw(self, image: Image, box: Box) -> Image:
+    def _draw(self, image: Image, box: Box, tiles: Mask | None = None) -> Image:
         """Return the map; before lines that were there before the needle, of what is new."""
         background = self.background
         difference = None if background is None else background.difference(image)
         if background is None or difference is None:
-            return self._map.draw(image, box)
-        new = self._map_of_difference.draw(difference, box)
+            return self._map.draw(image, box, tiles)
+        new = self._map_of_difference.draw(difference, box, tiles)
         if background.is_empty:
             return new
-        before = self._map_before.draw(background.before, box)
-        return background.joined(self._map.draw(image, box), new, before)
+        rows, columns = np.nonzero(new > SURE)
+        there = np.zeros(tile_counts(image), np.bool_)
+        there[rows // TILE, columns // TILE] = True
+        before = self._map_before.draw(background.before, box, there)
+        return background.joined(self._map.draw(image, box, tiles), new, before)
 
     def _beyond_seam(self, image: Image, point: NDArray[np.float64]) -> float:
         """Return how far a point is beyond where the map is put together [px]."""
@@ -133,7 +137,8 @@ class MapLook:
     ) -> list[Path]:
         """Return paths that may be the needle."""
         rows = len(grid.distances) if ends is None else min(ends[1] + 1, len(grid.distances))
-        box = grid.bounds(max(rows, 1), 4.0 * settings.needle_width_px, image.shape)
+        margin = _SEARCH_WIDTHS * settings.needle_width_px
+        box = grid.bounds(max(rows, 1), margin, image.shape)
         sure = dataclasses.replace(
             settings,
             bright=True,
@@ -141,7 +146,7 @@ class MapLook:
             noise_factor=0.0,
             min_coverage=0.0,
         )
-        drawn = self._draw(image, box)
+        drawn = self._draw(image, box, grid.tiles(rows, margin, tile_counts(image), TILE))
         least = max(int(sure.min_length / grid.row_pitch), 2, 0 if ends is None else ends[0])
         paths = [
             part

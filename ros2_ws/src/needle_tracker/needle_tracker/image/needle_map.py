@@ -15,13 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
 _WIDTH_PX = 4.5
 """Width of a needle in what the net sees: of 3.5 to 5.5 it sees long bevels whole, of 6 not."""
 _LIKE = (0.85, 1.2)  # widths so near to that, as a ratio, are not scaled
 _MARGIN_PX = 24  # what is seen around a box, in what the net sees: farther off matters little
-_TILE = 64
+TILE = 16
+"""Side of the squares that are drawn or not [px of the image]."""
 _PART_PX = 384  # what the net sees at once
 _SURROUNDINGS_PX, _DARK_NOISE, _CLIP = 10.0, 2.0, 4.0
 
@@ -57,7 +59,7 @@ class NeedleMap:
         self._map = np.empty((0, 0), np.uint8)
         self._drawn = np.empty((0, 0), np.bool_)
 
-    def draw(self, image: Image, box: Box) -> Image:
+    def draw(self, image: Image, box: Box, tiles: Mask | None = None) -> Image:
         """Return the map, as large as the image, that holds at least in the box.
 
         Parameters
@@ -66,42 +68,36 @@ class NeedleMap:
             The camera's image; what was drawn of the same array before is kept.
         box : tuple of int
             First column and row, and those after the last.
+        tiles : ndarray of bool, shape (height / 16, width / 16), rounded up, optional
+            Which squares of 16 x 16 px of the image matter; all by default.
         """
         height, width = image.shape
         if image is not self._image:
             self._image = image
             self._map = np.zeros_like(image)
-            self._drawn = np.zeros((-(-height // _TILE), -(-width // _TILE)), np.bool_)
+            self._drawn = np.zeros(tile_counts(image), np.bool_)
         x0, y0, x1, y1 = box
-        rows = slice(max(y0, 0) // _TILE, -(-min(y1, height) // _TILE))
-        columns = slice(max(x0, 0) // _TILE, -(-min(x1, width) // _TILE))
-        missing_rows, missing_columns = np.nonzero(~self._drawn[rows, columns])
-        if len(missing_rows):
-            tiles = (
-                int(missing_columns.min() + columns.start) * _TILE,
-                int(missing_rows.min() + rows.start) * _TILE,
-                min(int(missing_columns.max() + columns.start + 1) * _TILE, width),
-                min(int(missing_rows.max() + rows.start + 1) * _TILE, height),
+        rows = slice(max(y0, 0) // TILE, -(-min(y1, height) // TILE))
+        columns = slice(max(x0, 0) // TILE, -(-min(x1, width) // TILE))
+        missing = ~self._drawn[rows, columns]
+        if tiles is not None:
+            missing &= tiles[rows, columns]
+        margin = _MARGIN_PX / self._scale / TILE
+        longest = max(int(_PART_PX / self._scale / TILE), 1)
+        _, parts = _cover(missing, (columns.start, rows.start), margin, longest)
+        for left, top, right, bottom in parts:
+            part = (
+                left * TILE,
+                top * TILE,
+                min(right * TILE, width),
+                min(bottom * TILE, height),
             )
-            drawn = self._look(image, tiles)
-            self._map[tiles[1] : tiles[3], tiles[0] : tiles[2]] = drawn
-            self._drawn[rows, columns] = True
+            self._map[part[1] : part[3], part[0] : part[2]] = self._look(image, part)
+            self._drawn[top:bottom, left:right] = True
         return self._map
 
     def _look(self, image: Image, box: Box) -> Image:
-        """Return the map of a box, part by part: the net's memory grows with what it sees."""
-        x0, y0, x1, y1 = box
-        size = max(int(_PART_PX / self._scale), 2) // 2 * 2
-        drawn = np.zeros((y1 - y0, x1 - x0), np.uint8)
-        for top in range(y0, y1, size):
-            for left in range(x0, x1, size):
-                part = (left, top, min(left + size, x1), min(top + size, y1))
-                drawn[top - y0 : part[3] - y0, left - x0 : part[2] - x0] = self._look_at_part(
-                    image, part
-                )
-        return drawn
-
-    def _look_at_part(self, image: Image, box: Box) -> Image:
+        """Return the map of a box."""
         scale = self._scale
         height, width = image.shape
         margin = int(_MARGIN_PX / scale) + 1
@@ -128,6 +124,49 @@ class NeedleMap:
         # Of an odd image the last line is left out.
         drawn[: inner.shape[0], : inner.shape[1]] = np.rint(255.0 * inner)
         return drawn
+
+
+def tile_counts(image: Image) -> tuple[int, int]:
+    """Return how many rows and columns of tiles an image has."""
+    return -(-image.shape[0] // TILE), -(-image.shape[1] // TILE)
+
+
+def _cover(
+    missing: Mask, corner: tuple[int, int], margin: float, longest: int
+) -> tuple[float, list[Box]]:
+    """Return boxes that hold all missing tiles, and what they cost: their area with margins.
+
+    Parameters
+    ----------
+    missing : ndarray of bool, shape (rows, columns)
+        Tiles.
+    corner : tuple of int
+        Column and row of the first.
+    margin : float
+        What is looked at around each box [tiles].
+    longest : int
+        Largest side of a box [tiles]: the net's memory grows with what it sees.
+    """
+    rows, columns = np.flatnonzero(missing.any(axis=1)), np.flatnonzero(missing.any(axis=0))
+    if not len(rows):
+        return 0.0, []
+    top, bottom, left, right = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
+    missing = missing[top:bottom, left:right]
+    x0, y0 = corner[0] + int(left), corner[1] + int(top)
+    height, width = missing.shape
+    cost = (height + 2.0 * margin) * (width + 2.0 * margin)
+    whole: tuple[float, list[Box]] = (cost, [(x0, y0, x0 + width, y0 + height)])
+    fits = max(height, width) <= longest
+    if max(height, width) == 1 or (fits and missing.all()):
+        return whole
+    if height > width:
+        half = height // 2
+        parts = (missing[:half], (x0, y0)), (missing[half:], (x0, y0 + half))
+    else:
+        half = width // 2
+        parts = (missing[:, :half], (x0, y0)), (missing[:, half:], (x0 + half, y0))
+    (one, some), (other, more) = (_cover(*part, margin, longest) for part in parts)
+    return whole if fits and cost <= one + other else (one + other, some + more)
 
 
 @cache

@@ -13,6 +13,7 @@ import dataclasses
 import functools
 import math
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -124,6 +125,31 @@ class SearchGrid:
             int(min(width, float(high[0]) + margin_px + 1)),
             int(min(height, float(high[1]) + margin_px + 1)),
         )
+
+
+    def tiles(self, rows: int, margin_px: float, counts: tuple[int, int], side: int) -> Mask:
+        """Return which squares of the image the first rows come near.
+
+        Parameters
+        ----------
+        rows : int
+            How many rows.
+        margin_px : float
+            How near [px].
+        counts : tuple of int
+            How many rows and columns of squares the image has.
+        side : int
+            Their side [px].
+
+        Returns
+        -------
+        ndarray of bool, shape `counts`
+        """
+        columns_rows = (self.pixels[:rows][self.reachable[:rows]] // side).astype(np.int64)
+        there = np.zeros(counts, np.uint8)
+        there[columns_rows[:, 1], columns_rows[:, 0]] = 1
+        size = 2 * math.ceil(margin_px / side) + 1
+        return np.asarray(cv2.dilate(there, np.ones((size, size), np.uint8)), np.bool_)
 
 
 # Trackers of the same rig, one beside the other or one after the other, share theirs.

@@ -54,6 +54,13 @@ def test_an_empty_phantom_has_no_seam() -> None:
     assert background.beyond_seam(ENTRY) == np.inf
 
 
+def test_the_first_pair_is_its_own_background_and_has_nothing_new() -> None:
+    image = floor(1, lines=True, needle=True)
+    assert Background(image, ENTRY, NEW).difference(image.copy()) is None
+    # Without any needle in it there is none, whatever its lines look like.
+    assert Background(image, ENTRY, None).difference(image.copy()) is not None
+
+
 def line_map(begin: int, end: int) -> Image:
     """Return a map with needle between two columns."""
     drawn = np.zeros(SHAPE, np.uint8)

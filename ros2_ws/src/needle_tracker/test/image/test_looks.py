@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 import pytest
 
+from needle_tracker.image.background import Background
 from needle_tracker.image.detection import DetectionSettings
 from needle_tracker.image.looks import MapLook
 from needle_tracker.image.search_grid import make_search_grid
+from needle_tracker.image.tip_fit import Expected
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
@@ -44,3 +47,23 @@ def test_a_box_may_hide_where_a_needle_enters_as_long_as_most_of_it_is_seen(
     )
     ends = [np.linalg.norm(each.pixels[-1] - pixels[-1]) < 2.0 * WIDTH_PX for each in found]
     assert any(ends) is seen
+
+
+def paper(end: int, seed: int) -> np.ndarray:
+    """Draw a needle from the left over graph paper, up to a column."""
+    image = np.full((240, 320), 150.0, np.float32)
+    for at in range(10, 320, 20):
+        cv2.line(image, (at, 0), (at, 239), 60.0, 2)
+        cv2.line(image, (0, at), (319, at), 60.0, 2)
+    cv2.line(image, (0, 121), (end, 121), 20.0, 5, cv2.LINE_AA)
+    image += np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
+    return np.asarray(np.clip(image, 0.0, 255.0), np.uint8)
+
+
+@pytest.mark.parametrize(("before", "now", "come"), [(100, 200, True), (200, 100, False)])
+def test_a_needle_that_was_drawn_out_has_not_come(before: int, now: int, come: bool) -> None:
+    look = MapLook(WIDTH_PX, 0.0)
+    look.background = Background(paper(before, 1), np.array([0.0, 121.0]), 3.0 * WIDTH_PX)
+    expected = Expected(np.array([200.0, 121.0]), np.array([1.0, 0.0]), 150.0, 6, 0.0, 0.0)
+    found = look.fit(paper(now, 2), expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
+    assert (found is not None and found.come) is come

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from needle_tracker.image.needle_map import NeedleMap
+from needle_tracker.image.needle_map import TILE, NeedleMap, tile_counts
 
 Image = NDArray[np.uint8]
 SHAPE = (240, 320)
@@ -57,9 +57,25 @@ def test_is_drawn_where_it_is_asked_for_and_as_if_all_were() -> None:
     whole = NeedleMap(5.0).draw(image, (0, 0, SHAPE[1], SHAPE[0])).astype(int)
     one = NeedleMap(5.0)
     part = one.draw(image, (150, 100, 230, 150)).astype(int)
-    assert not part[:, :64].any()
+    assert not part[:, :144].any()
     assert np.abs(part - whole)[100:150, 150:230].max() < 25
     more = one.draw(image, (20, 100, 230, 150)).astype(int)
     assert np.abs(more - whole)[100:150, 20:230].max() < 25
     # Of another image nothing is kept.
     assert not one.draw(np.full(SHAPE, 140, np.uint8), (0, 0, 30, 30))[64:].any()
+
+
+def test_leaves_out_what_does_not_matter_and_shows_the_rest_as_if_all_were_drawn() -> None:
+    image = drawn(60.0, 230.0)
+    box = (0, 0, SHAPE[1], SHAPE[0])
+    whole = NeedleMap(5.0).draw(image, box).astype(int)
+    tiles = np.zeros(tile_counts(image), np.bool_)
+    for u, v in np.linspace(BEGIN, END, 40):
+        tiles[int(v) // TILE - 1 : int(v) // TILE + 2, int(u) // TILE] = True
+    one = NeedleMap(5.0)
+    part = one.draw(image, box, tiles).astype(int)
+    wanted = np.kron(tiles, np.ones((TILE, TILE), np.bool_))[: SHAPE[0], : SHAPE[1]]
+    assert np.abs(part - whole)[wanted].max() < 40
+    assert not part[180:].any()
+    # What was left out is drawn when it is asked for.
+    assert np.abs(one.draw(image, box).astype(int) - whole).max() < 40
