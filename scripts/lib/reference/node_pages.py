@@ -1,0 +1,145 @@
+"""Pages of the nodes: what each says, hears, answers, takes and reports."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from needle_common.settings.parameter_fields import ParameterSpec, specs
+from reference.endpoints import CALLS, HEARS, OPEN_ENDED, PUBLISHES, SERVES, Endpoint
+from reference.markdown import block, code, node_link, table
+from reference.rig_nodes import RigNode
+
+NODES = "nodes/"
+_EVERY_NODE = """\
+Every node also publishes `/diagnostics` and `/rosout`, and has ROS's own services and
+`/parameter_events` for parameters.
+"""
+
+
+def node_page(node: RigNode) -> str:
+    """Return the page of a node."""
+    ends = node.endpoints(PUBLISHES, HEARS)
+    calls = node.endpoints(SERVES, CALLS)
+    topics = [
+        (end.role, code(end.name), code(end.type_name), end.qos, when)
+        for end, when in sorted(ends, key=lambda each: (each[0].role != PUBLISHES, each[0].name))
+        if not _is_of_every_node(end)
+    ]
+    services = [
+        ("answers" if end.role == SERVES else "calls", code(end.name), code(end.type_name), when)
+        for end, when in sorted(calls, key=lambda each: (each[0].role != SERVES, each[0].name))
+    ]
+    note = "".join(
+        f"{text}\n\n" for text in OPEN_ENDED.values() if text.startswith(f"`{node.name}")
+    )
+    parts = [(code(part), ", ".join(map(code, keys))) for part, keys in node.parts.items()]
+    return "".join(
+        (
+            f"# {node.name}\n\n",
+            f"    ros2 run {node.package} {node.name}\n\n",
+            block(node.help) if node.help else "",
+            "## Topics\n\n" if topics or note else "",
+            table(("", "topic", "type", "quality of service", "when"), topics),
+            note,
+            "## Services\n\n" if services else "",
+            table(("", "service", "type", "when"), services),
+            "## Parameters\n\n",
+            parameter_table(node.parameters),
+            "## Diagnostics\n\n" if parts else "",
+            table(("part", "keys of its values"), parts),
+        )
+    )
+
+
+def parameter_table(parameters: type) -> str:
+    """Return the parameters of a dataclass, as they are declared."""
+    rows = []
+    for name, spec, default in specs(parameters):
+        shown = list(default) if isinstance(default, tuple) else default
+        text = repr(shown).replace("'", '"') if isinstance(shown, (str, list)) else repr(shown)
+        rows.append(
+            (
+                code(name),
+                code(text.lower() if isinstance(shown, bool) else text),
+                "" if spec.unit == "-" else spec.unit,
+                _allowed(spec),
+                spec.description + ("" if spec.read_only else " *May be set while it runs.*"),
+            )
+        )
+    return table(("parameter", "default", "unit", "range", "what it is"), rows)
+
+
+def _allowed(spec: ParameterSpec) -> str:
+    if spec.choices:
+        return ", ".join(code(choice) if choice else "empty" for choice in spec.choices)
+    lower, upper = f"{spec.lower:g}", f"{spec.upper:g}"
+    if math.isfinite(spec.lower) and math.isfinite(spec.upper):
+        return f"{lower} to {upper}"
+    if math.isfinite(spec.lower):
+        return f"from {lower}"
+    return f"to {upper}" if math.isfinite(spec.upper) else ""
+
+
+def _is_of_every_node(end: Endpoint) -> bool:
+    return end.role == PUBLISHES and end.name == "/diagnostics"
+
+
+def nodes_index(nodes: Sequence[RigNode]) -> str:
+    """Return the page that leads to the nodes' own."""
+    rows = [
+        (node_link(node.name, NODES), code(node.package), _first_sentence(node)) for node in nodes
+    ]
+    return f"# Nodes\n\n{_EVERY_NODE}\n{table(('node', 'package', 'what it does'), rows)}"
+
+
+def _first_sentence(node: RigNode) -> str:
+    text = node.help or (node.module.__doc__ or "")
+    first = text.strip().partition("\n\n")[0]
+    return " ".join(first.removeprefix(f"{node.name}: ").split()).partition(". ")[0].rstrip(".")
+
+
+def topics_page(nodes: Sequence[RigNode]) -> str:
+    """Return all topics, with who is at either end."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for node in nodes:
+        for end, when in node.endpoints(PUBLISHES, HEARS):
+            if not _is_of_every_node(end):
+                sides = found.setdefault((end.name, end.type_name), {PUBLISHES: [], HEARS: []})
+                sides[end.role].append(_at_end(node, end.qos, when))
+    rows = [
+        (code(name), code(kind), "<br>".join(ends[PUBLISHES]), "<br>".join(ends[HEARS]))
+        for (name, kind), ends in sorted(found.items(), key=lambda each: each[0][0].lstrip("/"))
+    ]
+    return (
+        "# Topics\n\nNames are relative but where they begin with `/`: a namespace moves the whole "
+        "rig. Types are ROS's own. The number is the depth of the queue; what is latched reaches "
+        "those, too, who come later.\n\n"
+        + table(("topic", "type", "published by", "heard by"), rows)
+        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" not in text)
+        + _EVERY_NODE
+    )
+
+
+def services_page(nodes: Sequence[RigNode]) -> str:
+    """Return all services, with who answers and who calls."""
+    found: dict[tuple[str, str], dict[str, list[str]]] = {}
+    for node in nodes:
+        for end, when in node.endpoints(SERVES, CALLS):
+            sides = found.setdefault((end.name, end.type_name), {SERVES: [], CALLS: []})
+            sides[end.role].append(_at_end(node, "", when))
+    rows = [
+        (code(name), code(kind), "<br>".join(ends[SERVES]), "<br>".join(ends[CALLS]))
+        for (name, kind), ends in sorted(found.items())
+    ]
+    return (
+        "# Services\n\n"
+        + table(("service", "type", "answered by", "called by"), rows)
+        + "".join(f"{text}\n\n" for text in OPEN_ENDED.values() if "ask" in text)
+        + _EVERY_NODE
+    )
+
+
+def _at_end(node: RigNode, qos: str, when: str) -> str:
+    more = "; ".join(text for text in (qos, when) if text)
+    return f"{node_link(node.name, NODES)}{f' ({more})' if more else ''}"

@@ -1,0 +1,285 @@
+"""Every node of the rig, made once in each way that changes what it says or hears."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+from unittest import mock
+
+import rclpy
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.signals import SignalHandlerOptions
+
+from code_lines import ROOT
+from needle_bags.player.player_options import parse_options
+from needle_bags.reading.bag_files import read_contents
+from needle_common.process.ros_domain import own_domain
+from needle_common.ros.executor import NodeExecutor
+from reference.endpoints import PUBLISHES, SOURCES, Endpoint, Noted, noting
+
+BAG = ROOT / "bags" / "regression"
+
+
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """A way to set a node.
+
+    Attributes
+    ----------
+    when : str
+        In words, for a reader; empty where there is only one.
+    parameters : tuple of str
+        As `-p` takes them; `{scratch}` is a folder.
+    make : callable
+        Takes the node's module, returns the node.
+    then : callable
+        Has the node do what it does later.
+    """
+
+    when: str = ""
+    parameters: tuple[str, ...] = ()
+    make: Callable[[ModuleType], Node] = lambda module: _class_of(module)()
+    then: Callable[[Any, Noted], None] = lambda node, noted: None
+
+
+@dataclasses.dataclass(frozen=True)
+class RigNode:
+    """A node, as it is.
+
+    Attributes
+    ----------
+    name, package : str
+        The executable's, and whose it is.
+    module : ModuleType
+        Where it is.
+    ways : list of (str, Noted)
+        In which way, and what was noted.
+    """
+
+    name: str
+    package: str
+    module: ModuleType
+    ways: list[tuple[str, Noted]]
+
+    def endpoints(self, *roles: str) -> list[tuple[Endpoint, str]]:
+        """Return its endpoints, each once, with the ways that have it; all: an empty text."""
+        found: dict[Endpoint, list[str]] = {}
+        for when, noted in self.ways:
+            for endpoint in noted.endpoints:
+                if endpoint.role in roles:
+                    found.setdefault(endpoint, []).append(when)
+        every = len(self.ways)
+        return [(end, "" if len(ways) == every else ", ".join(ways)) for end, ways in found.items()]
+
+    @property
+    def parameters(self) -> type:
+        """Its dataclass of parameters."""
+        return self.ways[0][1].parameters[0]
+
+    @property
+    def parts(self) -> dict[str, list[str]]:
+        """Parts of its diagnostics, each with all keys that were seen."""
+        found: dict[str, list[str]] = {}
+        for _, noted in self.ways:
+            for part, keys in noted.parts.items():
+                known = found.setdefault(part, [])
+                known += [key for key in keys if key not in known]
+        return found
+
+    @property
+    def help(self) -> str:
+        """Its text of `--help`, without the parameters."""
+        return str(getattr(self.module, "HELP", "")).strip("\n")
+
+
+def executables(kind: str) -> Iterator[tuple[str, str, str]]:
+    """Yield (package, executable, module) of all executables of a kind, `node` or `command`."""
+    for folder in sorted(SOURCES.iterdir()):
+        if not (folder / folder.name / "executables.py").is_file():
+            continue
+        module = importlib.import_module(f"{folder.name}.executables")
+        for name, enter in sorted(vars(module).items()):
+            if getattr(enter, "__qualname__", "") == f"{kind}.<locals>.enter":
+                yield folder.name, name, inspect.getclosurevars(enter).nonlocals["module"]
+
+
+def rig_nodes() -> list[RigNode]:
+    """Make every node of the rig in all its ways, and return what was noted."""
+    found = []
+    with own_domain() as domain, tempfile.TemporaryDirectory() as scratch:
+        for package, name, module_name in executables("node"):
+            module = importlib.import_module(module_name)
+            ways = [
+                (way.when, _noted(module, way, domain, Path(scratch, f"{name}_{number}")))
+                for number, way in enumerate(WAYS.get(name, (Way(),)))
+            ]
+            found.append(RigNode(name, package, module, ways))
+    return found
+
+
+def _noted(module: ModuleType, way: Way, domain: int, scratch: Path) -> Noted:
+    arguments = ["--ros-args", "--log-level", "fatal"]
+    for parameter in way.parameters:
+        arguments += ["-p", parameter.format(scratch=scratch)]
+    options = SignalHandlerOptions.NO
+    rclpy.init(args=arguments, domain_id=domain, signal_handler_options=options)
+    try:
+        with noting() as noted:
+            node = way.make(module)
+            try:
+                way.then(node, noted)
+            finally:
+                getattr(node, "close", lambda: None)()
+                node.destroy_node()
+    finally:
+        rclpy.try_shutdown()
+    return noted
+
+
+def _class_of(module: ModuleType) -> Callable[[], Node]:
+    """Return the one class of nodes that a module defines."""
+    (found,) = (
+        each
+        for each in vars(module).values()
+        if inspect.isclass(each) and issubclass(each, Node) and each.__module__ == module.__name__
+    )
+    return found
+
+
+def _turn(node: Any, _: Noted) -> None:
+    """Let everything happen that happens by itself."""
+    with NodeExecutor(node, lambda *_: None, lambda _: None) as executor:
+        for _turns in range(5):
+            executor.spin_once(timeout_sec=0.0)
+
+
+class _Unmade:
+    """In place of a node: notes a publisher without making it."""
+
+    def __init__(self, node: Node, noted: Noted) -> None:
+        self._node = node
+        self._noted = noted
+
+    def create_publisher(self, kind: type, topic: str, qos: Any) -> None:
+        self._noted.add(PUBLISHES, self._node, kind, topic, qos)
+
+
+def _look(node: Any, noted: Noted) -> None:
+    """Show the needle to somebody who looks, and transforms as where there is tf2_msgs."""
+    with mock.patch.object(Publisher, "get_subscription_count", return_value=1):
+        node._show()
+    module = importlib.import_module("needle_analysis.ros.transform_publishers")
+    kind = type("TFMessage", (), {"__module__": "tf2_msgs.msg"})
+    module.TransformPublishers(_Unmade(node, noted), kind)
+
+
+def _console(_: ModuleType) -> Node:
+    """Make the console without its page: that wants NiceGUI and ports."""
+    pages = ("hold.hold_server", "page.console_page", "page.web_server")
+    stand_ins = {f"needle_console.{page}": mock.MagicMock() for page in pages}
+    name = "needle_console.ros.console_node"
+    with mock.patch.dict(sys.modules, stand_ins):
+        sys.modules.pop(name, None)
+        node: Node = importlib.import_module(name).ConsoleNode()
+    # It knows the stand-ins only.
+    sys.modules.pop(name, None)
+    return node
+
+
+def _look_at_page(node: Any, _: Noted) -> None:
+    node._feed.picture("left", time.monotonic())
+    node._look()
+    node._tell_health()
+
+
+def _player(module: ModuleType, *more: str) -> Node:
+    options = parse_options([str(BAG), *more])
+    node: Node = module.Player(options, read_contents(BAG))
+    return node
+
+
+def _make_and_look(node: Any, _: Noted) -> None:
+    node._make_publishers()
+    node.look_around()
+
+
+def _with_pedal(module: ModuleType) -> Node:
+    node: Node = module.OperatorNode(mock.MagicMock())
+    return node
+
+
+def _report_and_close(node: Any, _: Noted) -> None:
+    node.report()
+    node.recording.close()
+
+
+def _tick(node: Any, noted: Noted) -> None:
+    """Do what a hand's timer, and a simulation's loop, do."""
+    for name in ("turn", "_on_timer"):
+        getattr(node, name, lambda: None)()
+    _turn(node, noted)
+
+
+def _drive_on(node: Any, noted: Noted) -> None:
+    _tick(node, noted)
+    node._device.count_watchdog_trip()
+
+
+def _camera(module: ModuleType) -> Node:
+    """Make what publishes images, without any."""
+    with mock.patch.object(module, "open_source"):
+        return _class_of(module)()
+
+
+WAYS: dict[str, tuple[Way, ...]] = {
+    "console": (Way(make=_console, then=_look_at_page),),
+    "device_driver": (
+        Way(then=lambda node, _: node._tell_health()),
+        Way("in simulated time", ("use_sim_time:=true",)),
+    ),
+    "live_view": (Way(then=_look),),
+    "operator": (
+        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), _with_pedal, _tick),
+        Way("source joy", ("source:=joy", "key:=0"), then=_tick),
+    ),
+    "player": (
+        Way(make=_player, then=_make_and_look),
+        Way(
+            "with `--clock`",
+            make=lambda module: _player(module, "--clock", "100"),
+            then=_make_and_look,
+        ),
+    ),
+    "recorder": (
+        Way("", ("bag:={scratch}",), then=_report_and_close),
+        Way(
+            "with `snapshot_seconds`",
+            ("bag:={scratch}", "snapshot_seconds:=1.0"),
+            then=_report_and_close,
+        ),
+    ),
+    "sim_rig": (
+        Way("level tip", ("level:=tip",), then=_tick),
+        Way("level camera", ("level:=camera",), then=_tick),
+        Way("level drive", ("level:=drive",), then=_drive_on),
+    ),
+    "simulated_operator": (
+        Way(then=_tick),
+        Way("with `wait_for_recorder`", ("wait_for_recorder:=true",)),
+    ),
+    "stereo_camera": (Way(make=_camera),),
+    "stereo_tracker": (
+        Way(then=_turn),
+        Way("with `heading_from_estimate`", ("heading_from_estimate:=true",), then=_turn),
+    ),
+}
+"""How to make a node that wants more than its name, or has several ways."""

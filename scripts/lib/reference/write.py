@@ -1,0 +1,37 @@
+"""Writes the reference into a folder: `python -m reference.write FOLDER`, from scripts/lib."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from reference.command_pages import commands_page
+from reference.diagnostic_pages import diagnostics_page
+from reference.node_pages import NODES, node_page, nodes_index, services_page, topics_page
+from reference.rig_nodes import rig_nodes
+
+
+def pages() -> dict[str, str]:
+    """Return every page by its file's name."""
+    nodes = rig_nodes()
+    return {
+        "nodes.md": nodes_index(nodes),
+        "topics.md": topics_page(nodes),
+        "services.md": services_page(nodes),
+        "diagnostics.md": diagnostics_page(nodes),
+        "commands.md": commands_page(nodes),
+        **{f"{NODES}{node.name}.md": node_page(node) for node in nodes},
+    }
+
+
+def main() -> None:
+    """Write the pages."""
+    folder = Path(sys.argv[1])
+    for name, text in pages().items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
