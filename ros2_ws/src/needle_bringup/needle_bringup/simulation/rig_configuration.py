@@ -12,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from needle_bringup.simulation.needle_options import needle_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import Parameters
@@ -60,6 +61,14 @@ OPTIONS = {
     "law": "--law",
     "planner": "--planner",
     "insertion": "--insertion",
+    "curvature": "--curvature",
+    "max_curvature": "--curvature",
+    "needle_diameter": "--diameter-mm",
+    "needle_width": "--diameter-mm",
+    "pre_bend": "--pre-bend-deg",
+    "pre_bend_lean": "--pre-bend-deg",
+    "lean": "--pre-bend-deg",
+    "tip_lean": "--pre-bend-deg",
     "depth": "--depth-mm",
     "target_point": "--target",
     "obstacles": "--obstacles",
@@ -155,6 +164,12 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         parameters["plane_controller"]["tip_noise"] = "bounded"
         parameters["plane_controller"]["tip_noise_bound"] = bound
         parameters["plane_controller"]["measurement_std"] = bound / math.sqrt(3.0)
+    needle = needle_parameters(
+        options.curvature,
+        None if options.diameter_mm is None else options.diameter_mm * 1e-3,
+        None if options.pre_bend_deg is None else math.radians(options.pre_bend_deg),
+    )
+    parameters = merge(parameters, needle)
     for node, values in parameters.items():
         values["use_sim_time"] = node != "recorder"
     return {node: parameters[node] for node in nodes_of(options)}

@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
+from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
     NODES,
@@ -110,6 +111,8 @@ def simulate(options: SimulateOptions) -> int:
     bag = _make_folder(options)
     try:
         parameters = merge(command_line_parameters(options, bag), given)
+        for line in contradictions(parameters, list(executables)):
+            print(f"warning: {line}", file=sys.stderr)
         with end, own_domain() as domain:
             write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
             _run_nodes(executables, bag, domain, end)

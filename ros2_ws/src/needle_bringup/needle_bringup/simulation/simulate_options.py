@@ -44,6 +44,9 @@ examples:
         frame: rig
         spheres: [{center: [0.002, -0.003, 0.055], radius: 0.003}]
         capsules: [{start: [-0.02, 0.006, 0.07], end: [0.02, 0.006, 0.07], radius: 0.003}]
+  scripts/simulate --curvature 4 --diameter-mm 1 --pre-bend-deg 6
+      another needle, which simulation, tracker and controller are told of alike; a contradiction
+      between --params and other nodes is warned of
   scripts/simulate --level tip --estimator particle_filter
       with an estimator of another package (docs/own_controllers.md)
   scripts/simulate --params my_rig.yaml
@@ -87,6 +90,9 @@ class SimulateOptions:
     depth_mm: float = 120.0
     target_mm: tuple[float, float, float] | None = None
     obstacles: Path | None = None
+    curvature: float | None = None
+    diameter_mm: float | None = None
+    pre_bend_deg: float | None = None
     play_deg: float = 0.0
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
@@ -132,6 +138,9 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         depth_mm=number("--depth-mm", depth, 1.0, LARGEST_DEPTH_MM, "mm"),
         target_mm=target,
         obstacles=_obstacles(given.obstacles, target),
+        curvature=_optional("--curvature", given.curvature, 0.1, 45.0, "1/m"),
+        diameter_mm=_optional("--diameter-mm", given.diameter_mm, 0.2, 3.0, "mm"),
+        pre_bend_deg=_optional("--pre-bend-deg", given.pre_bend_deg, 0.0, 25.0, "deg"),
         play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
@@ -204,6 +213,23 @@ def _parser() -> CommandParser:
         help="with --target: YAML file of spheres and capsules that the needle must not touch",
     )
     add(
+        "--curvature",
+        metavar="K",
+        help="needle: curvature of its path in the tissue [1/m], in all nodes (default: 8.197, a "
+        "radius of 122 mm)",
+    )
+    add(
+        "--diameter-mm",
+        metavar="D",
+        help="needle: diameter, in all nodes (default: 0.7)",
+    )
+    add(
+        "--pre-bend-deg",
+        metavar="A",
+        help="needle: angle between its shaft and its last 9 mm, in all nodes; 0: straight "
+        "(default: 10)",
+    )
+    add(
         "--play-deg",
         default="0",
         metavar="D",
@@ -243,6 +269,10 @@ def _target(text: str) -> tuple[float, float, float]:
         number("--target Y_MM", parts[1], -150.0, 150.0, "mm"),
         number("--target Z_MM", parts[2], 1.0, 150.0, "mm"),
     )
+
+
+def _optional(name: str, text: str | None, lower: float, upper: float, unit: str) -> float | None:
+    return None if text is None else number(name, text, lower, upper, unit)
 
 
 def _one_of(name: str, value: str, known: Sequence[str]) -> None:

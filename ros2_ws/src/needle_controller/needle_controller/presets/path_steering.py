@@ -22,7 +22,9 @@ def path_planner(settings: SteeringSettings) -> PathPlanner:
     """Return the planner of a rig's needle."""
     return PathPlanner(
         PathSettings(
-            max_rotation_per_length=settings.max_rotation_per_length, longest=settings.depth
+            max_rotation_per_length=settings.max_rotation_per_length,
+            needle_radius=0.5 * settings.needle_diameter,
+            longest=settings.depth,
         )
     )
 

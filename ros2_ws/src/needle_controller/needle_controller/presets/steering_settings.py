@@ -77,6 +77,9 @@ class SteeringSettings:
         lower=0.1,
         upper=100.0,
     )
+    needle_diameter: float = fixed_parameter(
+        0.0007, "m", "Diameter of the needle, which is led past obstacles.", 0.2e-3, 3e-3
+    )
     target_offset: float = parameter(
         0.0,
         unit="m",

@@ -13,6 +13,8 @@ from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_controller.planning.path_settings import PathSettings
+from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
@@ -133,3 +135,11 @@ def test_obstacles_change_with_the_settings_and_stay_with_others() -> None:
     assert len(control.obstacles) == 1
     with pytest.raises(UserError, match="obstacles has 6 numbers"):
         dataclasses.replace(SETTINGS, obstacles=SPHERE[:6])
+
+
+def test_obstacles_are_cleared_by_the_needle_at_hand() -> None:
+    thick = SteeringSettings(needle_diameter=0.002)
+    assert path_planner(thick).settings.needle_radius == 0.001
+    assert path_planner(SteeringSettings()).settings == PathSettings(
+        max_rotation_per_length=thick.max_rotation_per_length, longest=thick.depth
+    )

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from needle_common.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 
 # A path that is shorter than this is a point in any image [m].
@@ -28,13 +29,27 @@ class NeedleShape:
     bend_distance : float
         From the bend to the tip [m].
     lean : float
-        Angle between distal segment and heading at the tip [rad].
+        Angle between distal segment and heading at the tip; less than `bend_angle`, or as that 0:
+        a straight needle [rad].
+
+    Raises
+    ------
+    UserError
+        A lean that is not.
     """
 
     diameter: float = 0.0007
     bend_angle: float = float(np.deg2rad(10.0))
     bend_distance: float = 0.009
     lean: float = float(np.deg2rad(5.6))
+
+    def __post_init__(self) -> None:
+        """Check the lean."""
+        if not (0.0 < self.lean < self.bend_angle or self.lean == self.bend_angle == 0.0):
+            raise UserError(
+                f"lean = {self.lean:g} rad, wants above 0 and less than the bend of "
+                f"{self.bend_angle:g} rad, or 0 as that"
+            )
 
     def sideways(self, distance: FloatArray) -> FloatArray:
         """Return how far the shaft lies beside the tip's path, towards +y of the tip's frame.
@@ -49,6 +64,8 @@ class NeedleShape:
         ndarray, shape (...)
             Offset [m]: 0.88 mm at the bend, 0 from 32 mm on, with the default figures.
         """
+        if self.lean == 0.0:
+            return np.zeros_like(distance)
         at_bend = self.bend_distance * np.tan(self.lean)
         return_length = 2.0 * at_bend / np.tan(self.bend_angle - self.lean)
         behind_bend = np.clip((distance - self.bend_distance) / return_length, 0.0, 1.0)

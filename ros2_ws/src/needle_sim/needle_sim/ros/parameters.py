@@ -13,6 +13,7 @@ from needle_device_driver.supervisor.limits import (
     path_delay_parameter,
 )
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS
+from needle_sim.needle.needle_shape import NeedleShape
 
 LEVELS = ("tip", "camera", "drive")
 
@@ -39,6 +40,26 @@ class SimRigParameters:
     )
     curvature: float = fixed_parameter(
         1.0 / 0.122, "1/m", "Curvature of the needle's path in this tissue.", 0.0, 100.0
+    )
+    needle_diameter: float = fixed_parameter(
+        NeedleShape.diameter, "m", "Diameter of the needle that the cameras see.", 0.2e-3, 3e-3
+    )
+    pre_bend: float = fixed_parameter(
+        NeedleShape.bend_angle,
+        "rad",
+        "Angle between its shaft and its pre-bent end; 0: straight.",
+        0.0,
+        0.5,
+    )
+    pre_bend_distance: float = fixed_parameter(
+        NeedleShape.bend_distance, "m", "From that bend to the tip.", 1e-3, 0.05
+    )
+    pre_bend_lean: float = fixed_parameter(
+        NeedleShape.lean,
+        "rad",
+        "Angle between its end and the heading, less than pre_bend: the rest is the shaft's.",
+        0.0,
+        0.5,
     )
     initial_pitch: float = fixed_parameter(
         0.0, "rad", "Pitch of the needle at its entry point.", -math.pi / 2, math.pi / 2
@@ -104,13 +125,22 @@ class SimRigParameters:
         Raises
         ------
         UserError
-            A parameter out of bounds, or images wanted of a level that has none.
+            A parameter out of bounds, a bend that cannot be, or images wanted of a level that has
+            none.
         """
         check_fields(self)
+        _ = self.needle
         if self.level == "tip" and self.scenario != CLEAN.name:
             raise UserError(f"scenario = {self.scenario!r}: level tip has no images")
         if self.level == "tip" and self.images:
             raise UserError(f"images = {self.images!r}: level tip has no images")
+
+    @property
+    def needle(self) -> NeedleShape:
+        """What the cameras see of the needle."""
+        return NeedleShape(
+            self.needle_diameter, self.pre_bend, self.pre_bend_distance, self.pre_bend_lean
+        )
 
     @property
     def limits(self) -> SafetyLimits:

@@ -65,7 +65,8 @@ class SimulatedCameras:
         self._cameras = (rig.left, rig.right)
         scenario = SCENARIOS[values.scenario]
         self._has_needle = scenario.needle
-        self._renderer = StereoRenderer(rig, values.seed, scenario=scenario)
+        self._needle = values.needle
+        self._renderer = StereoRenderer(rig, values.seed, self._needle, scenario)
         self._folder: ImageFolder | None = None
         if values.images:
             self._folder = ImageFolder(Path(values.images).expanduser(), Path(file))
@@ -93,7 +94,7 @@ class SimulatedCameras:
                 number,
                 images,
                 self._bench.insertion,
-                truth_of(pose) if self._has_needle and len(line) > 1 else None,
+                truth_of(pose, self._needle) if self._has_needle and len(line) > 1 else None,
                 self._renderer.share_seen(pose, line, number),
             )
         for image, frame, camera, (image_raw, camera_info) in zip(

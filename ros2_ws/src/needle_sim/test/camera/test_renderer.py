@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from needle_common.errors import UserError
 from needle_sim.camera.projection import project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS
@@ -170,6 +171,27 @@ def test_the_bend_turns_by_its_angle_and_ends_at_the_tip() -> None:
     assert np.rad2deg(np.arccos(before @ direction)) == pytest.approx(10.0, abs=0.1)
     np.testing.assert_allclose(local[local[:, 2] < -0.032, 1], 0.0, atol=1e-12)
     np.testing.assert_allclose(local[:, 0], 0.0, atol=1e-12)
+
+
+def test_a_needle_may_be_straight_but_not_lean_farther_than_it_bends() -> None:
+    straight = NeedleShape(bend_angle=0.0, lean=0.0)
+    np.testing.assert_array_equal(straight.sideways(np.linspace(0.0, 0.1, 50)), 0.0)
+    for bend, lean in ((0.1, 0.1), (0.1, 0.0), (0.1, -0.05), (0.0, 0.05)):
+        with pytest.raises(UserError, match=r"lean = \S+ rad, wants above 0 and less than"):
+            NeedleShape(bend_angle=bend, lean=lean)
+
+
+def test_a_thicker_needle_covers_more(rig: StereoRig) -> None:
+    plant = NeedlePlant(np.eye(4), curvature=CURVATURE)
+    plant.advance(0.06, 0.0)
+    dark = []
+    for diameter in (0.0005, 0.001, 0.002):
+        renderer = StereoRenderer(rig, 1, NeedleShape(diameter))
+        image, _ = renderer.render(plant.T_rig_tip, plant.centreline(0.001), 1)
+        out, _ = renderer.render(np.eye(4), np.zeros((1, 3)), 1)
+        dark.append(float(np.sum(np.asarray(out, dtype=float) - image)))
+    assert dark[1] == pytest.approx(2.0 * dark[0], rel=0.1)
+    assert dark[2] == pytest.approx(2.0 * dark[1], rel=0.1)
 
 
 def test_a_short_path_draws_only_what_is_inside() -> None:
