@@ -161,11 +161,14 @@ def _cover(
         return whole
     if height > width:
         half = height // 2
-        parts = (missing[:half], (x0, y0)), (missing[half:], (x0, y0 + half))
+        first, second = missing[:half], missing[half:]
+        second_corner = x0, y0 + half
     else:
         half = width // 2
-        parts = (missing[:, :half], (x0, y0)), (missing[:, half:], (x0 + half, y0))
-    (one, some), (other, more) = (_cover(*part, margin, longest) for part in parts)
+        first, second = missing[:, :half], missing[:, half:]
+        second_corner = x0 + half, y0
+    one, some = _cover(first, (x0, y0), margin, longest)
+    other, more = _cover(second, second_corner, margin, longest)
     return whole if fits and cost <= one + other else (one + other, some + more)
 
 

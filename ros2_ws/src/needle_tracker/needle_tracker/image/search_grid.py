@@ -126,7 +126,6 @@ class SearchGrid:
             int(min(height, float(high[1]) + margin_px + 1)),
         )
 
-
     def tiles(self, rows: int, margin_px: float, counts: tuple[int, int], side: int) -> Mask:
         """Return which squares of the image the first rows come near.
 
