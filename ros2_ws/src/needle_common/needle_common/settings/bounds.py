@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple, get_type_hints
 
@@ -50,9 +51,18 @@ def check_bounds(
 
 def check_bounded_fields(settings: Any) -> None:
     """Check every field that is annotated with `Bounds`, unless it is None."""
-    for name, hint in get_type_hints(type(settings), include_extras=True).items():
+    for name, bounds in _bounded_fields(type(settings)):
         value = getattr(settings, name)
-        for bounds in getattr(hint, "__metadata__", ()):
-            if isinstance(bounds, Bounds) and value is not None:
-                lower, upper, unit, unlimited = bounds
-                check_bounds(name, float(value), lower, upper, unit, unlimited=unlimited)
+        if value is not None:
+            lower, upper, unit, unlimited = bounds
+            check_bounds(name, float(value), lower, upper, unit, unlimited=unlimited)
+
+
+@functools.cache
+def _bounded_fields(settings_class: type) -> list[tuple[str, Bounds]]:
+    return [
+        (name, bounds)
+        for name, hint in get_type_hints(settings_class, include_extras=True).items()
+        for bounds in getattr(hint, "__metadata__", ())
+        if isinstance(bounds, Bounds)
+    ]

@@ -103,6 +103,24 @@ def design_gains(
     return Gains(feedback, observer, poles)
 
 
+@functools.lru_cache
+def gains_by_diagonals(
+    state_weights: tuple[float, ...],
+    input_weight: float,
+    process_noise: tuple[float, ...],
+    measurement_std: float,
+    step_length: float,
+) -> Gains:
+    """Return `design_gains` of diagonal weights, designed once however often it is asked for."""
+    return design_gains(
+        state_weights=np.diag(state_weights),
+        input_weight=input_weight,
+        process_noise=np.diag(process_noise),
+        measurement_std=measurement_std,
+        step_length=step_length,
+    )
+
+
 def held_input(length: float) -> Array:
     """Return G, what a unit input v held over an inserted length adds to s, shape (3,)."""
     return np.array([length**3 / 6.0, length**2 / 2.0, length])

@@ -13,7 +13,7 @@ from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.model.arrays import Array
-from needle_controller.model.gains import Gains, design_gains
+from needle_controller.model.gains import Gains, gains_by_diagonals
 from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
 from needle_controller.presets.own_parts import GROUPS, check_is_offered, own_part
@@ -334,12 +334,12 @@ class SteeringSettings:
 
     def gains(self) -> Gains:
         """Return the gains the weights give; raises UserError as `gains.design_gains` does."""
-        return design_gains(
-            state_weights=np.diag(self.state_weights),
-            input_weight=self.input_weight,
-            process_noise=np.diag(self.process_noise),
-            measurement_std=self.measurement_std,
-            step_length=self.step_length,
+        return gains_by_diagonals(
+            tuple(self.state_weights),
+            self.input_weight,
+            tuple(self.process_noise),
+            self.measurement_std,
+            self.step_length,
         )
 
     @property

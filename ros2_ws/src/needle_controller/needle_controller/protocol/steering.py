@@ -384,12 +384,11 @@ class Steering:
         return self._leave(SteeringState.IDLE, why, "warning")
 
     def _end_by_retraction(self, sample: JointSample) -> list[Action]:
-        self.control.restart()
+        if self.control.started:
+            self.control.restart()
         self.intake.last = None
-        if not self._steering:
-            return []
         why = f"needle retracted to {sample.insertion:.4g} m: draw it out before steering again"
-        return self._leave(SteeringState.IDLE, why, "warning")
+        return self._leave(SteeringState.IDLE, why, "warning") if self._steering else []
 
     def _leave(self, state: SteeringState, reason: str, severity: str) -> list[Action]:
         self.state, self.reason = state, reason

@@ -109,25 +109,30 @@ class CanopenDevice:
         self._forget()
         self._on_power_up()
 
-    def receive(self, frame: CanFrame, now: float) -> None:
-        """Take a frame from the bus, SYNC excepted."""
+    def receive(self, frame: CanFrame, now: float) -> bool:
+        """Take a frame from the bus, SYNC excepted; returns whether it was for this device."""
         if self.state is NetworkState.BOOTING:
-            return
+            return False
         identifier = frame.identifier
         if identifier == NMT:
             self._obey(frame.data, now)
-        elif identifier == SDO_REQUEST + self.node_id:
+            return True
+        if identifier == SDO_REQUEST + self.node_id:
             self._answer(frame)
-        elif identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
+            return True
+        if identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
             if identifier & ~0x7F == HEARTBEAT:
                 self._heard[identifier & 0x7F] = now
-        elif self.state is NetworkState.OPERATIONAL:
-            if frame.remote:
-                self._answer_remote(identifier)
-                return
-            for pdo in self._receive:
-                if pdo.cob_id == identifier:
-                    pdo.take(frame.data)
+            return False
+        if self.state is not NetworkState.OPERATIONAL:
+            return False
+        if frame.remote:
+            self._answer_remote(identifier)
+            return False
+        taken = [pdo for pdo in self._receive if pdo.cob_id == identifier]
+        for pdo in taken:
+            pdo.take(frame.data)
+        return bool(taken)
 
     def sync(self) -> None:
         """Take a SYNC: sample what goes out with it, then apply what waited for it."""

@@ -59,17 +59,20 @@ class _Pdo:
             dictionary.on_write(mapping, entry, check=self._check_entry)
         dictionary.on_write(parameters, 1, check=self._check_cob_id)
         dictionary.on_write(mapping, 0, check=self._check_count)
+        # Asked for at every frame and every tick: kept at hand.
+        self._cob_id = dictionary.entry(parameters, 1)
+        self._transmission_type = dictionary.entry(parameters, 2)
 
     @property
     def cob_id(self) -> int | None:
         """Identifier; None while the PDO is off."""
-        value = self._dictionary.value(self._parameters, 1)
+        value = self._cob_id.value
         return None if value & INVALID else value & 0x7FF
 
     @property
     def transmission_type(self) -> int:
         """Transmission type: 0..240 with SYNC, 254 and 255 at once."""
-        return self._dictionary.value(self._parameters, 2)
+        return self._transmission_type.value
 
     @property
     def mapped(self) -> list[tuple[int, int, int]]:
@@ -182,7 +185,7 @@ class TransmitPdo(_Pdo):
 
     def event(self, now: float) -> bytes | None:
         """Return what goes out now for a change or the event timer, if anything; `now` in s."""
-        if self.cob_id is None or self.transmission_type < _EVENT_DRIVEN:
+        if self._transmission_type.value < _EVENT_DRIVEN or self._cob_id.value & INVALID:
             return None
         data = self.data()
         age = now - self._sent_at

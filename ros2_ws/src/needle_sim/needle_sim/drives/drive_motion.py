@@ -160,10 +160,12 @@ class DriveMotion:
             and self._target is None
         )
 
-    def rest(self) -> None:
-        """Let time go by while nothing moves."""
+    def rest(self) -> bool:
+        """Let time go by while nothing moves; returns whether something did until now."""
+        moved = self._motor.velocity != 0.0 or self._late != 0.0
         self._motor.rest()
         self._late = 0.0
+        return moved
 
     def operate(self, period: float) -> None:
         """Move the demand on for `period` [s] in the present mode."""

@@ -105,6 +105,8 @@ class EmulatedDrive:
         self._leaving: PowerState | None = None
         self._word = 0
         self.hung = False
+        # Whether something has changed since a master could last read it.
+        self._stale = True
 
     # ---- the bus ------------------------------------------------------------------------------
 
@@ -115,21 +117,23 @@ class EmulatedDrive:
     def receive(self, frame: CanFrame, now: float) -> None:
         """Take a frame from the bus, SYNC excepted."""
         if not self.hung:
-            self.device.receive(frame, now)
             self._show()
+            self._stale |= self.device.receive(frame, now)
 
     def sync(self) -> None:
         """Take a SYNC: tell where the motor is, then take the set-point that came before it."""
         if self.hung:
             return
+        self._show()
         self.device.sync()
         if self.state is PowerState.OPERATION_ENABLED and self._leaving is None:
             self._try(self._motion.take_set_point)
-        self._show()
+        self._stale = True
 
     def tick(self, now: float) -> None:
         """Do what is due by the clock."""
         if not self.hung:
+            self._show()
             self.device.tick(now)
 
     def fail(self, code: int) -> None:
@@ -142,7 +146,7 @@ class EmulatedDrive:
         # A lost heartbeat was told when it was missed.
         if code != HEARTBEAT_LOST:
             self.device.emergency(code, _MOTION_ERROR)
-        self._show()
+        self._stale = True
 
     @property
     def error_code(self) -> int:
@@ -161,10 +165,10 @@ class EmulatedDrive:
         """Let `steps` of `MOTION_STEP` go by."""
         for _ in range(steps):
             if self.state not in _ON or self._settled:
-                self._motion.rest()
+                self._stale |= self._motion.rest()
                 break
             self._step(MOTION_STEP)
-        self._show()
+            self._stale = True
 
     @property
     def _settled(self) -> bool:
@@ -248,12 +252,14 @@ class EmulatedDrive:
         self._leaving = None
         self._word = 0
         self._motion.power_up()
+        self._stale = True
 
     def _on_boot(self) -> None:
         self.state = PowerState.SWITCH_ON_DISABLED
-        self._show()
+        self._stale = True
 
     def _on_connection_lost(self) -> None:
+        self._stale = True
         option = self._objects.value(0x6007)
         if option == _LOST_FAULT:
             self.fail(HEARTBEAT_LOST)
@@ -265,6 +271,9 @@ class EmulatedDrive:
 
     def _show(self) -> None:
         """Bring up to date what a master can read."""
+        if not self._stale:
+            return
+        self._stale = False
         bits = self._motion.show(enabled=self.state is PowerState.OPERATION_ENABLED)
         self._objects.set(STATUSWORD, 0, self.state.value | _VOLTAGE | _REMOTE | bits)
 
