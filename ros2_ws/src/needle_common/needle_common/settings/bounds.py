@@ -51,7 +51,7 @@ def check_bounds(
 
 def check_bounded_fields(settings: Any) -> None:
     """Check every field that is annotated with `Bounds`, unless it is None."""
-    for name, bounds in _bounded_fields(type(settings)):
+    for name, bounds in _bounded_fields(settings.__class__):
         value = getattr(settings, name)
         if value is not None:
             lower, upper, unit, unlimited = bounds

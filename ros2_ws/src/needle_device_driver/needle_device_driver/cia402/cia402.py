@@ -81,6 +81,15 @@ TRANSITIONS: dict[tuple[DriveState, DriveCommand], DriveState] = {
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): _S.OPERATION_ENABLED,  # 16
 }
 
+# The bits of a statusword that tell a state, and the states by them.
+_STATE_BITS = 0x6F
+_STATES = {
+    word: state
+    for word in range(_STATE_BITS + 1)
+    for state in DriveState
+    if word & state.value[0] == state.value[1]
+}
+
 # The next command on the way to a goal. A fault is never acknowledged on the way.
 _ON = {
     DriveState.NOT_READY_TO_SWITCH_ON: DriveCommand.DISABLE_VOLTAGE,
@@ -100,11 +109,7 @@ _OFF_AT_REST = {DriveState.OPERATION_ENABLED: DriveCommand.QUICK_STOP}
 
 def drive_state(statusword: int) -> DriveState | None:
     """Return the state that a statusword tells; None for a pattern that the standard lacks."""
-    for state in DriveState:
-        mask, value = state.value
-        if statusword & mask == value:
-            return state
-    return None
+    return _STATES.get(statusword & _STATE_BITS)
 
 
 def next_command(goal: Goal, state: DriveState | None, *, at_rest: bool) -> DriveCommand:

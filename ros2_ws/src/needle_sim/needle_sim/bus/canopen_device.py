@@ -116,23 +116,15 @@ class CanopenDevice:
         identifier = frame.identifier
         if identifier == NMT:
             self._obey(frame.data, now)
-            return True
-        if identifier == SDO_REQUEST + self.node_id:
+        elif identifier == SDO_REQUEST + self.node_id:
             self._answer(frame)
-            return True
-        if identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
+        elif identifier > HEARTBEAT and identifier & 0x7F != self.node_id:
             if identifier & ~0x7F == HEARTBEAT:
                 self._heard[identifier & 0x7F] = now
             return False
-        if self.state is not NetworkState.OPERATIONAL:
-            return False
-        if frame.remote:
-            self._answer_remote(identifier)
-            return False
-        taken = [pdo for pdo in self._receive if pdo.cob_id == identifier]
-        for pdo in taken:
-            pdo.take(frame.data)
-        return bool(taken)
+        else:
+            return self.state is NetworkState.OPERATIONAL and self._take_process_data(frame)
+        return True
 
     def sync(self) -> None:
         """Take a SYNC: sample what goes out with it, then apply what waited for it."""
@@ -193,6 +185,15 @@ class CanopenDevice:
         add(0x1029, 0, Kind.U8, 1)
         writable(0x1029, 1, Kind.U8, 0)
         self.dictionary.on_write(0x1003, 0, then=lambda _: self._errors.clear())
+
+    def _take_process_data(self, frame: CanFrame) -> bool:
+        if frame.remote:
+            self._answer_remote(frame.identifier)
+            return False
+        taken = [pdo for pdo in self._receive if pdo.cob_id == frame.identifier]
+        for pdo in taken:
+            pdo.take(frame.data)
+        return bool(taken)
 
     def _forget_heard(self, consumer: int) -> None:
         self._heard.pop(consumer >> 16 & 0x7F, None)

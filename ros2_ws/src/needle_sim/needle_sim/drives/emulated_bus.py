@@ -91,8 +91,9 @@ class EmulatedBus:
             drive.device.outbox.clear()
         return [] if self.is_cut else frames
 
-    def axes(self) -> dict[str, AxisState]:
-        """Return where both motors really are."""
+    def axes(self, now: float) -> dict[str, AxisState]:
+        """Return where both motors really are at steady time `now` [s]."""
+        self._move_until(now)
         states = {}
         for name, drive in self.drives.items():
             scale = drive.settings.motor.counts_per_unit
@@ -130,7 +131,8 @@ class EmulatedBus:
     def _move_until(self, now: float) -> None:
         if self._clock is not MotionClock.STEADY:
             return
-        steps = int((now - self._moved_until) / MOTION_STEP)
+        # Times are rounded; what is a whole number of steps but for that is one.
+        steps = int((now - self._moved_until) / MOTION_STEP + 1e-6)
         if steps > 0:
             self._moved_until += steps * MOTION_STEP
             for drive in self.drives.values():

@@ -110,7 +110,7 @@ class DriveEmulatorNode(WholeNode):
 
     def obey(self, line: str) -> None:
         """Carry out a fault on command, and say where it came; complain about what is none."""
-        axes = self._bus.axes()
+        axes = self._bus.axes(time.monotonic())
         try:
             self._server.obey(line)
         except UserError as error:
@@ -145,7 +145,7 @@ class DriveEmulatorNode(WholeNode):
             self._tell_positions(stamp_ns or self.get_clock().now().nanoseconds)
 
     def _tell_positions(self, stamp_ns: int) -> None:
-        axes = self._bus.axes()
+        axes = self._bus.axes(time.monotonic())
         message = JointState(
             name=[f"{name}_joint" for name in axes],
             position=[axis.position for axis in axes.values()],

@@ -84,7 +84,7 @@ VOCABULARY: dict[str, tuple[Kind, ...]] = {
 }
 """What can go wrong with each part."""
 
-_LATEST, _SHORTEST, _LONGEST = 15.0, 0.02, 5.0
+_LATEST, _SHORTEST, _LONGEST = 9.0, 0.02, 4.0
 _MOST = 6
 
 

@@ -123,6 +123,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         rig.graph.digest.update(f"{at.insertion!r} {at.rotation!r}\n".encode())
         watch.see_hand(now, holds=rig.hand.holds)
         watch.see_driver(now, speaks=speaks)
+        watch.see_drives(now, blocked=rig.bench.has_blocked_motor)
         watch.see_motors(now, at.insertion, at.rotation)
 
     def see(topic: str, node: str, message: Any) -> None:

@@ -25,6 +25,8 @@ _ANSWER_NS = (15_000_000, 45_000_000)
 # Half width of the noise of a coordinate [m].
 TIP_NOISE = 0.0002
 _CURVATURE = 1.0 / 0.122
+# The needle takes the motors' way in pieces of at most so much [m], [rad].
+_PIECE = 0.0002, 0.1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,25 +75,41 @@ class Bench:
             torsion=Torsion(play=draw(0.0, 0.3), lag_length=0.0),
         )
         self.motors = Motors(world.steady_ns, 0.0, 0.0)
+        self._taken = self.motors
         self.watchers: list[Callable[[Motors], None]] = []
         self._tick()
 
     @property
+    def has_blocked_motor(self) -> bool:
+        """Whether one of the motors cannot move."""
+        return any(drive.motor.stalled for drive in self.bus.drives.values())
+
+    @property
     def tip(self) -> np.ndarray:
         """The true tip in `rig`, shape (3,) [m]."""
+        self._follow_motors()
         return self._plant.T_rig_tip[:3, 3]
 
     def _tick(self) -> None:
-        axes = self.bus.axes()
-        before = self.motors
+        axes = self.bus.axes(self._world.steady)
         at = Motors(self._world.steady_ns, axes["insertion"].position, axes["rotation"].position)
-        moved = at.insertion - before.insertion, at.rotation - before.rotation
-        if moved != (0.0, 0.0):
-            self._plant.advance(*moved)
         self.motors = at
+        if any(abs(way) > piece for way, piece in zip(self._way, _PIECE, strict=True)):
+            self._follow_motors()
         for watch in self.watchers:
             watch(at)
         self._world.call_after(TICK_NS, self._tick)
+
+    @property
+    def _way(self) -> tuple[float, float]:
+        """What the motors have moved since the needle followed them [m], [rad]."""
+        at, taken = self.motors, self._taken
+        return at.insertion - taken.insertion, at.rotation - taken.rotation
+
+    def _follow_motors(self) -> None:
+        if any(self._way):
+            self._plant.advance(*self._way)
+        self._taken = self.motors
 
 
 class Sight(enum.Enum):

@@ -18,7 +18,7 @@ from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
 # A frame's way, adapter included [ns], at least and at most.
 _FRAME_NS = (150_000, 600_000)
 # How often the drives look at their clocks [ns].
-_POLL_NS = 2_000_000
+_POLL_NS = 5_000_000
 TO_DRIVES, FROM_DRIVES = "can to the drives", "can from the drives"
 LINKS = (TO_DRIVES, FROM_DRIVES)
 

@@ -31,7 +31,7 @@ from needle_verification.soak.link_faults import LinkFaults
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node", "person")
-_DEPTHS = (0.005, 0.02)
+_DEPTHS = (0.003, 0.012)
 _PRESETS = ("best", "paper")
 _INSERTIONS = ("stepwise", "continuous")
 # A node that ended is started again by whoever sees it [ns].

@@ -6,6 +6,7 @@ import hashlib
 import inspect
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,8 @@ from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
 _DISCOVERY_NS = (5_000_000, 200_000_000)
 # On a topic's way [ns].
 _TRANSPORT_NS = (50_000, 1_500_000)
+# From a reliable writer's sending to its sending again, where no acknowledgement came [ns].
+_RESEND_NS = (20_000_000, 100_000_000)
 # Until others take a killed process for gone [ns].
 _LEASE_NS = 8_000_000_000
 
@@ -136,6 +139,7 @@ class VirtualPublisher(Endpoint):
         self.msg_type = kind
         self._kept: deque[bytes] = deque(maxlen=self.qos_profile.depth)
         self._arrivals: dict[VirtualSubscription, int] = {}
+        self._unacknowledged: dict[VirtualSubscription, deque[tuple[bytes, int]]] = {}
         self.graph.publishers.setdefault(self.topic_name, []).append(self)
         for subscription in self.graph.subscriptions.get(self.topic_name, ()):
             self.greet(subscription)
@@ -186,19 +190,55 @@ class VirtualPublisher(Endpoint):
         return not _is_latched(asked) or _is_latched(offered)
 
     def _send(self, subscription: VirtualSubscription, data: bytes) -> None:
+        """Send a message, or queue it behind what a reliable reader has not acknowledged yet."""
+        sent = data, self.graph.world.system_ns
+        if not self._is_reliable(subscription):
+            self._put_on_link(subscription, *sent)
+            return
+        waiting = self._unacknowledged.setdefault(subscription, deque(maxlen=self._history))
+        waiting.append(sent)
+        if len(waiting) == 1:
+            self._send_waiting(subscription)
+
+    def _send_waiting(self, subscription: VirtualSubscription) -> None:
+        """Send in order; what the link loses is sent again, unless newer ones took its place."""
+        waiting = self._unacknowledged[subscription]
+        while waiting:
+            if not self._put_on_link(subscription, *waiting[0]):
+                world = self.graph.world
+                again = partial(self._send_again, subscription)
+                world.call_after(world.random.randint(*_RESEND_NS), again)
+                return
+            waiting.popleft()
+
+    def _send_again(self, subscription: VirtualSubscription) -> None:
+        if self.process.alive and subscription.process.alive:
+            self._send_waiting(subscription)
+
+    @property
+    def _history(self) -> int:
+        return max(int(self.qos_profile.depth), 1)
+
+    def _is_reliable(self, subscription: VirtualSubscription) -> bool:
+        both = self.qos_profile, subscription.qos_profile
+        return all(one.reliability == ReliabilityPolicy.RELIABLE for one in both)
+
+    def _put_on_link(self, subscription: VirtualSubscription, data: bytes, sent_ns: int) -> bool:
+        """Send a message once; returns whether it arrives."""
         world = self.graph.world
-        for fate in self.graph.faults.fates(self.topic_name, data, world):
+        fates = self.graph.faults.fates(self.topic_name, data, world)
+        for fate in fates:
             arrival = world.steady_ns + self.graph.transport_ns() + fate.late_ns
             if not fate.overtakes:
                 # One nanosecond later at least, since ties are drawn.
                 arrival = max(arrival, self._arrivals.get(subscription, 0) + 1)
                 self._arrivals[subscription] = arrival
-            sent_ns = world.system_ns
 
             def arrive(data: bytes = fate.data, sent_ns: int = sent_ns) -> None:
                 subscription.arrive(data, sent_ns)
 
             world.call_at(arrival, arrive)
+        return bool(fates)
 
 
 class VirtualSubscription(Endpoint):
