@@ -76,6 +76,8 @@ class Watch:
     ----------
     bounds : Bounds
         Of the rig.
+    release_bound : float
+        From a release, or a loss, to the last motion [s].
 
     Attributes
     ----------
@@ -83,8 +85,9 @@ class Watch:
         The first of each kind.
     """
 
-    def __init__(self, bounds: Bounds) -> None:
+    def __init__(self, bounds: Bounds, release_bound: float = RELEASE_BOUND) -> None:
         self._bounds = bounds
+        self._release_bound = release_bound
         self.violations: list[Violation] = []
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = -1.0
@@ -211,7 +214,7 @@ class Watch:
 
     def _judge_hold(self, at: float, *, begins: bool) -> None:
         idle = at - self._pressed_until
-        if idle > RELEASE_BOUND:
+        if idle > self._release_bound:
             self.violate(
                 "no_motion_without_hold",
                 at,

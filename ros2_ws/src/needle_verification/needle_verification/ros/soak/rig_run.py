@@ -64,6 +64,12 @@ def schedule_of(seed: int) -> list[Fault]:
     return draw_schedule(random.Random(f"faults of {seed}")) if seed % 20 else []
 
 
+def bounds_of_the_rig() -> Bounds:
+    """Return the limits that the driver has unless it is told others."""
+    limits = SafetyLimits()
+    return Bounds(limits.max_depth, limits.max_speed, limits.max_rotation, limits.max_rotation_rate)
+
+
 def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     """Run the rig once.
 
@@ -110,10 +116,7 @@ def _begin(rig: VirtualRig, orders: FaultOrders, fault: Fault) -> None:
 
 def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     """Return what watches over a rig from now on."""
-    limits = SafetyLimits()
-    watch = Watch(
-        Bounds(limits.max_depth, limits.max_speed, limits.max_rotation, limits.max_rotation_rate)
-    )
+    watch = Watch(bounds_of_the_rig())
     joints_spoilt = any(fault.part in _JOINTS for fault in faults)
 
     def see_motors(at: Motors) -> None:
@@ -143,9 +146,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
 
 
 def _has_left(rig: VirtualRig) -> bool:
-    person = rig.nodes.get("person")
-    left = person is not None and rig.person.wish is Wish.LEAVE
-    return left and rig.bench.motors.insertion < OUT
+    return rig.person.wish is Wish.LEAVE and rig.bench.motors.insertion < OUT
 
 
 def _state_of(rig: VirtualRig) -> str:

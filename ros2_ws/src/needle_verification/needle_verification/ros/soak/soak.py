@@ -3,18 +3,24 @@
 from __future__ import annotations
 
 import argparse
+import gc
+import itertools
 import multiprocessing
 import os
+import shutil
 import sys
+import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
+from needle_verification.ros.soak.process_run import run_processes
 from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
-from needle_verification.soak.faults import read_schedule, write_schedule
+from needle_verification.soak.faults import Fault, read_schedule, write_schedule
+from needle_verification.soak.invariants import Violation
 from needle_verification.soak.shrinking import shrink
 
 HELP = """\
@@ -24,11 +30,15 @@ Each run has all nodes of the rig in one process, on one clock and one seed: dri
 drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
 services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
 gives the same run. A run that violates an invariant is shrunk and kept as a file.
+
+With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
+and stopped while a simulated needle is inserted. They want a machine with nothing else to do.
 """
 EXAMPLES = """\
 examples:
   scripts/soak --runs 300                300 runs
   scripts/soak --runs 1 --seed 4711      that run again
+  scripts/soak --runs 300 --processes 3  and three of real processes, some 25 s each
   scripts/soak --schedule FILE           what a file of an earlier run tells
 
 exit codes: 0 nothing was violated, 1 something was, 2 bad input, 130 interrupted.
@@ -48,6 +58,9 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--runs", type=int, default=300, metavar="N", help="how many (300)")
+    parser.add_argument(
+        "--processes", type=int, default=0, metavar="N", help="runs of real processes (0)"
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the first run (1)")
     parser.add_argument("--schedule", type=Path, metavar="FILE", help="seed and faults of one run")
     parser.add_argument(
@@ -58,15 +71,23 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
 
 
 def _soak(options: argparse.Namespace) -> int:
-    if options.runs < 1:
-        raise UserError(f"--runs {options.runs}: at least 1")
+    for name, count in (("--runs", options.runs), ("--processes", options.processes)):
+        if count < 0:
+            raise UserError(f"{name} {count}: at least 0")
+    if options.runs == options.processes == 0:
+        raise UserError("--runs 0 and no --processes: nothing to do")
     begin = time.monotonic()
+    processes = 0
     if options.schedule is not None:
         results: Iterator[RunResult] = iter([run(*read_schedule(options.schedule))])
-        count = 1
+        runs = 1
     else:
-        count = options.runs
-        results = _results(range(options.seed, options.seed + count))
+        runs, processes = options.runs, options.processes
+        first = options.seed
+        results = itertools.chain(
+            _results(range(first, first + runs)),
+            _process_results(range(first, first + processes), options.failures),
+        )
     violations = faults = 0
     simulated = 0.0
     for number, result in enumerate(results, start=1):
@@ -76,18 +97,20 @@ def _soak(options: argparse.Namespace) -> int:
             violations += 1
             _tell(result, options.failures)
         if sys.stderr.isatty():
-            print(f"\r{number} of {count} runs, {violations} violate", end="", file=sys.stderr)
+            text = f"\r{number} of {runs + processes} runs, {violations} violate"
+            print(text, end="", file=sys.stderr)
     figures = {
-        "runs": count,
-        "processes": 0,
+        "runs": runs,
+        "processes": processes,
         "violations": violations,
         "faults_injected": faults,
         "simulated_hours": simulated / 3600.0,
         "wall_s": time.monotonic() - begin,
     }
+    of_processes = f" and {processes} of processes" if processes else ""
     print(
-        f"{count} runs, {faults} faults, {figures['simulated_hours']:.2f} simulated hours in "
-        f"{figures['wall_s']:.0f} s: {violations} violate"
+        f"{runs} runs{of_processes}, {faults} faults, {figures['simulated_hours']:.2f} simulated "
+        f"hours in {figures['wall_s']:.0f} s: {violations} violate"
     )
     if options.json is not None:
         write_json(options.json, figures)
@@ -95,14 +118,27 @@ def _soak(options: argparse.Namespace) -> int:
 
 
 def _results(seeds: range) -> Iterator[RunResult]:
+    if not seeds:
+        return
     # Fresh interpreters: a fork would share what numerical libraries keep for their threads.
     workers = min(len(seeds), os.cpu_count() or 1)
-    with multiprocessing.get_context("spawn").Pool(workers, _keep_to_one_thread) as pool:
+    with multiprocessing.get_context("spawn").Pool(workers, _begin_worker) as pool:
         yield from pool.imap(_run_seed, seeds)
 
 
-def _keep_to_one_thread() -> None:
+def _process_results(seeds: range, folder: Path | None) -> Iterator[RunResult]:
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
+            result = run_processes(seed, Path(name))
+            if result.violations and folder is not None:
+                shutil.copytree(name, folder / f"processes_{seed}", dirs_exist_ok=True)
+            yield result
+
+
+def _begin_worker() -> None:
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    # What is imported stays: the collection after each run need not look at it.
+    gc.freeze()
 
 
 def _run_seed(seed: int) -> RunResult:
@@ -110,21 +146,29 @@ def _run_seed(seed: int) -> RunResult:
 
 
 def _tell(result: RunResult, folder: Path | None) -> None:
+    if not result.digest:
+        # Real time cannot be had again: as it was, not shrunk.
+        _print(f"processes, seed {result.seed}", result.violations, result.faults)
+        return
     names = {one.invariant for one in result.violations}
 
     def still(faults: list[Any]) -> bool:
         return bool(names & {one.invariant for one in run(result.seed, faults).violations})
 
     kept = shrink(result.faults, still)
-    print(f"\nseed {result.seed}:")
-    for violation in result.violations:
-        print(f"  {violation.at:.3f} s {violation.invariant}: {violation.text}")
-    for fault in kept:
-        print(f"    {fault}")
+    _print(f"seed {result.seed}", result.violations, kept)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         why = "; ".join(f"{one.invariant}: {one.text}" for one in result.violations)
         write_schedule(folder / f"seed_{result.seed}.json", result.seed, kept, why)
+
+
+def _print(run_name: str, violations: Iterable[Violation], faults: Iterable[Fault]) -> None:
+    print(f"\n{run_name}:")
+    for violation in violations:
+        print(f"  {violation.at:.3f} s {violation.invariant}: {violation.text}")
+    for fault in faults:
+        print(f"    {fault}")
 
 
 if __name__ == "__main__":

@@ -30,7 +30,8 @@ from needle_verification.ros.soak.virtual_topics import VirtualGraph
 from needle_verification.soak.link_faults import LinkFaults
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
-NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node", "person")
+NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
+PERSON = "person"
 _DEPTHS = (0.003, 0.012)
 _PRESETS = ("best", "paper")
 _INSERTIONS = ("stepwise", "continuous")
@@ -85,13 +86,14 @@ class VirtualRig:
         self.depth = draw.uniform(*_DEPTHS)
         self.preset = draw.choice(_PRESETS)
         self.insertion = draw.choice(_INSERTIONS)
+        self.start(PERSON)
         for name in NODES:
             self.world.call_after(draw.randint(0, NANOSECONDS // 5), partial(self.start, name))
 
     @property
     def person(self) -> Person:
         """The person."""
-        person = self.nodes["person"]
+        person = self.nodes[PERSON]
         assert isinstance(person, Person)
         return person
 

@@ -1,0 +1,182 @@
+"""One run of the rig as real processes: some are killed or stopped, all is watched from outside."""
+
+from __future__ import annotations
+
+import random
+import signal
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from sensor_msgs.msg import JointState, Joy
+
+from needle_common.errors import UserError
+from needle_common.process.ros_domain import own_domain
+from needle_common.ros.conversions import HOLD, values_of
+from needle_verification.ros.drive_hand import DriveHand
+from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
+from needle_verification.soak.faults import Fault, Kind
+from needle_verification.soak.invariants import RELEASE_BOUND, Watch
+from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
+
+PERSON = "simulated_operator"
+PARTS = ("device_driver", "plane_controller", "stereo_tracker", PERSON)
+# The stand-in does not promise to speak often, as the operator of a person does (0.1 s): its hold
+# lives for the driver's own 0.25 s.
+_RELEASE_BOUND = RELEASE_BOUND - 0.1 + 0.25
+_MOST = 3
+_LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
+_DEEP_ENOUGH = 0.002
+# As far as a person sees the needle to be out [m].
+_OUT = 3e-4
+_START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
+
+
+class Witness(DriveHand):
+    """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
+
+    Attributes
+    ----------
+    watch : Watch
+        What it judges with.
+    """
+
+    def __init__(self) -> None:
+        self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
+        self._begun = time.monotonic()
+        super().__init__(steers=False)
+        self.create_subscription(Joy, "device/hold", self._on_hold, HOLD)
+
+    @property
+    def now(self) -> float:
+        """Steady time since it began [s]."""
+        return time.monotonic() - self._begun
+
+    def draw_out(self) -> None:
+        """Mend what a person can mend, then hold until the needle is out.
+
+        Raises
+        ------
+        UserError
+            If it does not come out.
+        """
+        end = self.now + _DRAW_OUT
+        while self.motors[-1].insertion > _OUT:
+            state, activity = self.status.get("state"), self.status.get("activity")
+            if self.now > end:
+                raise UserError(f"it is {self.motors[-1].insertion * 1e3:.2f} mm in; {self.status}")
+            if state in ("FAULT", "ESTOPPED"):
+                self.call("reset")
+            elif state == "DISABLED":
+                self.call("enable", True)
+            elif self.status.get("hold_owner") != self.get_name():
+                # A hold that does not count has to be let go of first.
+                self.pressed = not self.pressed
+            elif activity != "retraction":
+                self.call("retract")
+            self.pause(0.2)
+        self.release()
+
+    def _on_hold(self, message: Joy) -> None:
+        if any(message.buttons):
+            self.watch.see_other_hold(self.now)
+
+    def _on_positions(self, message: JointState) -> None:
+        super()._on_positions(message)
+        at = self.motors[-1]
+        self.watch.see_motors(self.now, at.insertion, at.rotation)
+
+    def _on_status(self, message: DiagnosticStatus) -> None:
+        super()._on_status(message)
+        self.watch.see_device(self.now, values_of(message))
+
+
+def processes_schedule_of(seed: int) -> list[Fault]:
+    """Draw what happens to the processes, from the moment in which the needle is steered [s]."""
+    draw = random.Random(f"faults of processes {seed}")
+    return sorted(
+        (
+            Fault(
+                draw.choice(PARTS),
+                draw.choice((Kind.OFF, Kind.STUCK)),
+                draw.uniform(0.0, _LATEST),
+                _SHORTEST * (_LONGEST / _SHORTEST) ** draw.random(),
+                0.0,
+            )
+            for _ in range(draw.randint(1, _MOST))
+        ),
+        key=lambda fault: fault.at,
+    )
+
+
+def run_processes(seed: int, folder: Path) -> RunResult:
+    """Run the rig in real time, in a ROS domain of its own.
+
+    Parameters
+    ----------
+    seed : int
+        Of the simulation and of what happens.
+    folder : Path
+        Takes the nodes' logs.
+    """
+    faults = processes_schedule_of(seed)
+    with own_domain() as domain:
+        rclpy.init(args=[], domain_id=domain)
+        try:
+            with (
+                closing(Witness()) as witness,
+                closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
+            ):
+                _insert(witness, graph, faults)
+                return RunResult(
+                    seed, tuple(faults), tuple(witness.watch.violations), "", witness.now, False, ()
+                )
+        finally:
+            rclpy.try_shutdown()
+
+
+def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:
+    witness.until(
+        lambda: bool(witness.motors) and witness.motors[-1].insertion > _DEEP_ENOUGH,
+        "steering",
+        _START,
+    )
+    begun = witness.now
+    events: list[tuple[float, Callable[[], None]]] = []
+    for fault in faults:
+        events.append((begun + fault.at, partial(_begin, witness, graph, fault)))
+        events.append((begun + fault.at + fault.lasts, partial(_end, witness, graph, fault)))
+    for at, happen in sorted(events, key=lambda event: event[0]):
+        witness.pause(max(at - witness.now, 0.0))
+        happen()
+    witness.pause(_STILL)
+    # From here on there is one person, and it wants the needle out.
+    graph.end(PERSON)
+    try:
+        witness.draw_out()
+    except UserError as error:
+        witness.watch.violate("the_way_goes_on", witness.now, str(error))
+
+
+def _begin(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+    if graph.exit_code(fault.part) is not None:
+        return
+    if fault.part == "device_driver":
+        witness.watch.see_driver(witness.now, speaks=False)
+    if fault.kind is Kind.OFF:
+        graph.kill(fault.part)
+    else:
+        graph.signal(fault.part, signal.SIGSTOP)
+
+
+def _end(witness: Witness, graph: TrialProcesses, fault: Fault) -> None:
+    if graph.exit_code(fault.part) is not None:
+        graph.start(fault.part)
+    else:
+        graph.signal(fault.part, signal.SIGCONT)
+    if fault.part == "device_driver":
+        witness.watch.see_driver(witness.now, speaks=True)
