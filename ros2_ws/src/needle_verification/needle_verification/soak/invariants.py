@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 # Speeds are judged over so many ticks, 0.1 s: a set-point that a bus brings late, or twice, is
 # caught up within one cycle of 0.02 s.
@@ -26,6 +26,11 @@ _STATUS_LAG = 0.15
 _SPEED_ROOM, _PLACE_ROOM = 1.25, 0.0011
 # The controller knows of a motion when its next tip has come: two steps.
 _BELIEF = 0.0045
+# A needle may still be on its way by one of so many commands.
+_COMMANDS = 4
+# Farther in than commanded [m], and farther turned than the part of the way that was made wants
+# [rad]: a rotation drive falls silent at 3 rad/s, and insertion goes on until that is noticed.
+_BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,6 +104,9 @@ class Watch:
         self._homing_until = -1.0
         self._silent_since: float | None = None
         self._catches_up_until = -1.0
+        self._estop_since: float | None = None
+        self._zero = 0.0
+        self._commands: deque[tuple[tuple[float, float], ...]] = deque(maxlen=_COMMANDS)
         self._moving_since: float | None = None
         self._track: deque[tuple[float, float, float]] = deque(maxlen=_SPEED_TICKS + 1)
 
@@ -134,13 +142,30 @@ class Watch:
         ):
             # Enabled, or reset: a press from before may not count.
             self._must_press_after = at
-        self._status, self._status_at = values, at
-        if values.get("activity") == "homing":
+        if self._is_homing:
+            # Whatever ends it, the drives' own watchdog bounds what is under way.
             self._homing_until = at + WATCHDOG_BOUND
+            if values.get("homed") == "true" and self._before is not None:
+                # The rotation is homed where it stands.
+                self._zero = self._before[2]
+        self._status, self._status_at = values, at
+
+    def see_command(self, points: Sequence[tuple[float, float]]) -> None:
+        """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
+        if self._before is not None:
+            _, insertion, rotation = self._before
+            self._commands.append(((insertion, rotation - self._zero), *points))
 
     def see_driver(self, at: float, *, speaks: bool) -> None:
         """Take whether the driver runs and hears its drives: else it cannot know better."""
         self._silent_since = None if speaks else self._silent_since or at
+        if not speaks:
+            # Who starts anew has not heard it; it starts disabled.
+            self._estop_since = None
+
+    def see_estop(self, at: float, *, pressed: bool) -> None:
+        """Take what is said of the emergency stop."""
+        self._estop_since = (self._estop_since or at) if pressed else None
 
     def see_drives(self, at: float, *, blocked: bool) -> None:
         """Take whether a motor is blocked: freed, it catches up as fast as it can."""
@@ -160,13 +185,12 @@ class Watch:
             self._moving_since = None
             return
         begins, self._moving_since = self._moving_since is None, self._moving_since or at
-        if self._status.get("activity") == "homing" or at <= self._homing_until:
-            self._homing_until = (
-                max(self._homing_until, at) if self._is_homing else self._homing_until
-            )
+        if self._is_homing or at <= self._homing_until:
             return
         self._judge_hold(at, begins=begins)
         self._judge_status(at)
+        if along > _REST_INSERTION:
+            self._judge_way(at, insertion, rotation)
 
     def see_belief(self, at: float, values: Mapping[str, str], *, joints_heard: bool) -> None:
         """Take a needle/controller_status as it is published, while joints reach the controller."""
@@ -213,6 +237,10 @@ class Watch:
                 )
 
     def _judge_hold(self, at: float, *, begins: bool) -> None:
+        if self._estop_since is not None and at - self._estop_since > self._release_bound:
+            self.violate(
+                "estop_stops", at, f"motion {at - self._estop_since:.3f} s after an emergency stop"
+            )
         idle = at - self._pressed_until
         if idle > self._release_bound:
             self.violate(
@@ -228,6 +256,26 @@ class Watch:
                 f"{self._must_press_after:.3f} s, when the device became ready",
             )
 
+    def _judge_way(self, at: float, insertion: float, rotation: float) -> None:
+        """Judge a motion inwards: nobody but a command moves the needle there, and as it says."""
+        off = [
+            abs(rotation - self._zero - _rotation_at(insertion, command))
+            for command in self._commands
+            if insertion <= max(place[0] for place in command) + _BEYOND_COMMAND
+        ]
+        if not off:
+            self.violate(
+                "turns_as_commanded",
+                at,
+                f"it goes in to {insertion * 1e3:.2f} mm, which none of the last commands wants",
+            )
+        elif min(off) > _OUT_OF_PROPORTION:
+            self.violate(
+                "turns_as_commanded",
+                at,
+                f"at {insertion * 1e3:.2f} mm it is {min(off):.2f} rad from the nearest command",
+            )
+
     def _judge_status(self, at: float) -> None:
         state = self._status.get("state", "")
         if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
@@ -237,3 +285,14 @@ class Watch:
             self.violate(
                 "status_is_true", at, f"it moves {lag:.3f} s after device/status said {state}"
             )
+
+
+def _rotation_at(insertion: float, command: Sequence[tuple[float, float]]) -> float:
+    """Return the rotation that a command wants at an insertion, from where it began."""
+    before = command[0]
+    for place in command[1:]:
+        if insertion <= place[0]:
+            share = (insertion - before[0]) / max(place[0] - before[0], 1e-9)
+            return before[1] + min(max(share, 0.0), 1.0) * (place[1] - before[1])
+        before = place
+    return before[1]

@@ -191,7 +191,7 @@ class FaultOrders:
         wrong = {
             "curvature": 4.0 + 10.0 * fault.size,
             "step_length": 5e-4 + 2e-3 * fault.size,
-            "nominal_speed": 1e-3 + 5e-3 * fault.size,
+            "nominal_speed": 1e-3 + 1e-2 * fault.size,
             "depth": 0.03 * fault.size,
         }
         garbage = {"curvature": math.nan, "step_length": -1.0, "curvatur": 1.0, "depth": "deep"}

@@ -24,6 +24,8 @@ from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 # Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
 # out. A killed node counts for 8 s more, and a driver looks for its drives again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
+# A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
+UNDISTURBED_DEPTH, _CONVERGED = 0.04, 0.001
 # The device's faults that take the joints from the controller, or give it others.
 _JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_controller")
 
@@ -80,7 +82,7 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     faults : sequence of Fault
         What goes wrong meanwhile.
     """
-    with virtual_rig(seed) as rig:
+    with virtual_rig(seed, None if faults else UNDISTURBED_DEPTH) as rig:
         watch = _watched(rig, faults)
         orders = FaultOrders(rig)
         for fault in faults:
@@ -94,8 +96,9 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         now = _seconds(rig.world.steady_ns)
         if not _has_left(rig):
             watch.violate("the_way_goes_on", now, _state_of(rig))
-        if not faults and not rig.person.done:
-            watch.violate("undisturbed_converges", now, _state_of(rig))
+        if not faults and not (rig.person.done and abs(rig.bench.deepest_tip[0]) <= _CONVERGED):
+            off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
+            watch.violate("undisturbed_converges", now, f"{off}; {_state_of(rig)}")
         return RunResult(
             seed,
             tuple(faults),
@@ -137,6 +140,9 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
             watch.see_belief(now, values_of(message), joints_heard=not joints_spoilt)
         elif topic == "/device/joint_trajectory":
             rig.graph.digest.update(repr(message).encode())
+            watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+        elif topic == "/device/estop":
+            watch.see_estop(now, pressed=message.data)
         elif topic == "/device/hold" and node == "/stranger" and isinstance(message, Joy):
             watch.see_other_hold(now)
 

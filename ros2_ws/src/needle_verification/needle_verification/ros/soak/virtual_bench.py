@@ -62,6 +62,8 @@ class Bench:
         At the last tick.
     watchers : list of callable
         Called with the motors at every tick.
+    deepest_tip : ndarray, shape (3,)
+        Where the true tip was when it was farthest in, in `rig` [m].
     """
 
     def __init__(self, world: VirtualWorld) -> None:
@@ -76,6 +78,8 @@ class Bench:
         )
         self.motors = Motors(world.steady_ns, 0.0, 0.0)
         self._taken = self.motors
+        self._deepest = 0.0
+        self.deepest_tip = self.tip
         self.watchers: list[Callable[[Motors], None]] = []
         self._tick()
 
@@ -110,6 +114,9 @@ class Bench:
         if any(self._way):
             self._plant.advance(*self._way)
         self._taken = self.motors
+        if self.motors.insertion > self._deepest:
+            self._deepest = self.motors.insertion
+            self.deepest_tip = self._plant.T_rig_tip[:3, 3]
 
 
 class Sight(enum.Enum):

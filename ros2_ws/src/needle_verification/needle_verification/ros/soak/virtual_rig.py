@@ -46,6 +46,8 @@ class VirtualRig:
     ----------
     seed : int
         Of all that is drawn.
+    depth : float, optional
+        How far the needle goes in [m]; drawn if none is given.
 
     Attributes
     ----------
@@ -71,7 +73,7 @@ class VirtualRig:
         Steady time [ns], node and why, of processes that ended by themselves.
     """
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, depth: float | None) -> None:
         self.world = VirtualWorld(seed)
         self.faults = LinkFaults()
         self.graph = VirtualGraph(self.world, self.faults)
@@ -83,7 +85,7 @@ class VirtualRig:
         self.log: list[tuple[int, str, str, str]] = []
         self.ends: list[tuple[int, str, str]] = []
         draw = self.world.random
-        self.depth = draw.uniform(*_DEPTHS)
+        self.depth = draw.uniform(*_DEPTHS) if depth is None else depth
         self.preset = draw.choice(_PRESETS)
         self.insertion = draw.choice(_INSERTIONS)
         self.start(PERSON)
@@ -176,13 +178,13 @@ class VirtualRig:
 
 
 @contextlib.contextmanager
-def virtual_rig(seed: int) -> Iterator[VirtualRig]:
-    """Have a rig, with its own clocks, until the end of the block."""
+def virtual_rig(seed: int, depth: float | None) -> Iterator[VirtualRig]:
+    """Have a rig, with its own clocks, until the end of the block; arguments as of it."""
     # Nodes made of rings of references: collected here, not somewhere in the middle of a run.
     rig = None
     with virtual_nodes():
         try:
-            rig = VirtualRig(seed)
+            rig = VirtualRig(seed, depth)
             with rig.world.own_clocks():
                 yield rig
         finally:

@@ -1,0 +1,117 @@
+"""Bugs that are planted into the rig's own code, one for each invariant at least."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pytest
+
+from needle_controller.laws.roll_law import RollLaw
+from needle_controller.ros import conversions
+from needle_device_driver.ros.device_interface import DeviceInterface
+from needle_device_driver.supervisor.device_core import DeviceCore
+from needle_device_driver.supervisor.hold import Hold
+from needle_device_driver.supervisor.reports import Reply
+from needle_device_driver.supervisor.states import State
+from needle_device_driver.supervisor.supervisor import MotionSupervisor
+from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
+from needle_verification.ros.soak.virtual_rig import VirtualRig
+
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+class PlantedBug(NamedTuple):
+    """A bug, what finds it, and the first seed from 1 on that does."""
+
+    invariant: str
+    plant: Plant
+    seed: int
+
+
+def _hold_never_lapses(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Hold, "is_fresh", lambda hold, _: hold.owner is not None)
+    patch.setattr(Hold, "lapses", lambda *_: False)
+
+
+def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Hold, "require_new_press", lambda _: None)
+
+
+def _speed_unlimited(patch: pytest.MonkeyPatch) -> None:
+    plan = VirtualRig._plan
+
+    def faster(rig: VirtualRig, name: str, process: Any) -> Any:
+        parameters, create = plan(rig, name, process)
+        return parameters | ({"max_speed": 0.02} if name == "device_driver" else {}), create
+
+    patch.setattr(VirtualRig, "_plan", faster)
+
+
+def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
+    tell = DeviceInterface._tell
+
+    def some(interface: DeviceInterface, status: Any, now: float) -> None:
+        if status.state is not State.MOVING:
+            tell(interface, status, now)
+
+    patch.setattr(DeviceInterface, "_tell", some)
+
+
+def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
+    fail = DeviceCore.fail
+    patch.setattr(DeviceCore, "fail", lambda core, _, rule=None: fail(core, "", rule))
+
+
+def _insertion_in_another_unit(patch: pytest.MonkeyPatch) -> None:
+    convert = conversions.to_joint_sample
+
+    def scaled(*message: Any) -> Any:
+        sample = convert(*message)
+        return dataclasses.replace(sample, insertion=1.1 * sample.insertion)
+
+    patch.setattr(conversions, "to_joint_sample", scaled)
+
+
+def _rotation_wired_the_wrong_way(patch: pytest.MonkeyPatch) -> None:
+    axes = EmulatedBus.axes
+
+    def wired(bus: EmulatedBus, now: float) -> dict[str, AxisState]:
+        true = axes(bus, now)
+        turned = true["rotation"]
+        return true | {"rotation": AxisState(-turned.position, -turned.velocity)}
+
+    patch.setattr(EmulatedBus, "axes", wired)
+
+
+def _estop_unheard(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(MotionSupervisor, "receive_estop", lambda *_: None)
+
+
+def _reset_refused(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(MotionSupervisor, "reset", lambda *_: Reply(False, "no"))
+
+
+def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
+    law = RollLaw.__call__
+
+    def away(*arguments: Any) -> Any:
+        command = law(*arguments)
+        return dataclasses.replace(command, rotation_rate=-command.rotation_rate)
+
+    patch.setattr(RollLaw, "__call__", away)
+
+
+PLANTED = {
+    "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 0),
+    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 0),
+    "no limit of speed": PlantedBug("none_beyond_limits", _speed_unlimited, 0),
+    "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 0),
+    "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 0),
+    "another unit": PlantedBug("belief_equals_joints", _insertion_in_another_unit, 0),
+    "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 0),
+    "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 0),
+    "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 0),
+    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 0),
+}
