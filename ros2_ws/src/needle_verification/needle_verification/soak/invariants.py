@@ -95,7 +95,7 @@ class Watch:
         self._release_bound = release_bound
         self.violations: list[Violation] = []
         self._before: tuple[float, float, float] | None = None
-        self._pressed_until = -1.0
+        self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = -1.0
         self._holds = False
         self._must_press_after = 0.0
@@ -125,9 +125,13 @@ class Watch:
             self._pressed_until = at
         self._holds = holds
 
+    def see_hold(self, at: float) -> None:
+        """Take a message by which the hand's own node says that it presses."""
+        self._told_until = at
+
     def see_other_hold(self, at: float) -> None:
         """Take that somebody else pressed: from outside that is a hold like any other."""
-        self._pressed_until = at
+        self._other_until = at
         self._pressed_since = max(self._pressed_since, at)
 
     def see_device(self, at: float, values: Mapping[str, str]) -> None:
@@ -241,12 +245,13 @@ class Watch:
             self.violate(
                 "estop_stops", at, f"motion {at - self._estop_since:.3f} s after an emergency stop"
             )
-        idle = at - self._pressed_until
+        # The hand's hold lasts as long as it presses and its node says so.
+        idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
         if idle > self._release_bound:
             self.violate(
                 "no_motion_without_hold",
                 at,
-                f"motion {idle:.3f} s after the last moment in which anybody held",
+                f"motion {idle:.3f} s after the last moment in which anybody held and said so",
             )
         if begins and self._pressed_since < self._must_press_after:
             self.violate(

@@ -37,12 +37,15 @@ class VirtualWorld:
         The steady clock [ns].
     system_offset_ns : int
         What the system clock is ahead of where it would be without jumps [ns].
+    crashes : list of tuple of str
+        Processes that ended by an error that nothing foresaw, and the error.
     """
 
     def __init__(self, seed: int) -> None:
         self.random = random.Random(seed)
         self.steady_ns = STEADY_START_NS
         self.system_offset_ns = 0
+        self.crashes: list[tuple[str, str]] = []
         self._events: list[tuple[int, float, int, Callable[[], None]]] = []
         self._count = 0
 
@@ -207,6 +210,11 @@ class VirtualProcess:
             self._on_end(str(error))
         except ProcessGoneError:
             return
+        except Exception as error:  # noqa: BLE001 - whatever ends a node
+            # The end of a process that nobody meant to end.
+            self.world.crashes.append((self.name, f"{type(error).__name__}: {error}"))
+            self.kill()
+            self._on_end(str(error))
         finally:
             self._busy = False
         self._plan_turn(self.world.random.randint(*_CALLBACK_NS) + self.slowness_ns)

@@ -96,6 +96,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         now = _seconds(rig.world.steady_ns)
         if not _has_left(rig):
             watch.violate("the_way_goes_on", now, _state_of(rig))
+        for name, error in rig.world.crashes:
+            watch.violate("no_node_crashes", now, f"{name}: {error}")
         if not faults and not (rig.person.done and abs(rig.bench.deepest_tip[0]) <= _CONVERGED):
             off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
             watch.violate("undisturbed_converges", now, f"{off}; {_state_of(rig)}")
@@ -143,8 +145,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
             watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
         elif topic == "/device/estop":
             watch.see_estop(now, pressed=message.data)
-        elif topic == "/device/hold" and node == "/stranger" and isinstance(message, Joy):
-            watch.see_other_hold(now)
+        elif topic == "/device/hold" and isinstance(message, Joy) and any(message.buttons):
+            (watch.see_other_hold if node == "/stranger" else watch.see_hold)(now)
 
     rig.bench.watchers.append(see_motors)
     rig.graph.watchers.append(see)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from needle_device_driver.supervisor.device_core import DeviceCore
-from needle_device_driver.supervisor.hold import Hold
 from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
-from needle_verification.soak.faults import STRANGER, Fault, Kind
+from needle_verification.soak.faults import read_schedule
+from planted_bugs import PLANTED
+
+SCHEDULES = Path(__file__).parent / "schedules"
 
 
 def violated(result: RunResult) -> set[str]:
@@ -29,22 +32,13 @@ def test_faults_violate_nothing(seed: int) -> None:
     assert not result.violations
 
 
-def test_a_hold_that_never_grows_old_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Hold, "is_fresh", lambda hold, _: hold.owner is not None)
-    monkeypatch.setattr(Hold, "lapses", lambda *_: False)
-    # The hand lets go while the operator, which would say so, stands still.
-    faults = [
-        Fault("operator", Kind.STUCK, 2.0, 2.0, 0.5),
-        Fault("person", Kind.OFF, 2.1, 2.0, 0.5),
-    ]
-    assert "no_motion_without_hold" in violated(run(8, faults))
+@pytest.mark.parametrize("path", sorted(SCHEDULES.glob("*.json")), ids=lambda path: path.stem)
+def test_what_once_violated_does_not_any_more(path: Path) -> None:
+    assert not run(*read_schedule(path)).violations
 
 
-def test_a_fault_without_a_word_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    fail = DeviceCore.fail
-    monkeypatch.setattr(DeviceCore, "fail", lambda core, _, rule=None: fail(core, "", rule))
-    faults = [
-        Fault(f"{STRANGER}/device/estop", Kind.WRONG, 2.0, 1.0, 0.5),
-        Fault("insertion drive", Kind.GARBAGE, 4.0, 1.0, 0.5),
-    ]
-    assert "faults_are_named" in violated(run(8, faults))
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    bug = PLANTED[name]
+    bug.plant(monkeypatch)
+    assert bug.invariant in violated(run(bug.seed, schedule_of(bug.seed)))

@@ -12,7 +12,7 @@ from needle_controller.laws.roll_law import RollLaw
 from needle_controller.ros import conversions
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.device_core import DeviceCore
-from needle_device_driver.supervisor.hold import Hold
+from needle_device_driver.supervisor.hold import Hold, HoldMessage
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -36,7 +36,14 @@ def _hold_never_lapses(patch: pytest.MonkeyPatch) -> None:
 
 
 def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Hold, "require_new_press", lambda _: None)
+    receive = Hold.receive
+
+    def armed(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
+        if (sender := hold._senders.get(message.sender)) is not None:
+            sender.armed = True
+        return receive(hold, message, now, counting=counting)
+
+    patch.setattr(Hold, "receive", armed)
 
 
 def _speed_unlimited(patch: pytest.MonkeyPatch) -> None:
