@@ -3,7 +3,8 @@
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
 numpy that apt's message packages were compiled against), `requirements-console.lock` and
-`requirements-console-test.lock` (what the web console and its tests need beside either of them).
+`requirements-console-test.lock` (what the web console and its tests need beside either of them),
+`requirements-docs.lock` (what makes the documents a site, in a folder of its own).
 Only files that Linux x86-64 with CPython 3.10-3.13 can install are hashed; no address of an index
 goes into a lock. Needs Python 3.11 or newer with `packaging` (as in `.venv`), and `uv`.
 """
@@ -153,6 +154,12 @@ def main() -> int:
     )
     write_extra("console", "requirements.lock")
     write_extra("console-test", "requirements.lock", "requirements-console.lock")
+    write(
+        "requirements-docs.lock",
+        "Whole, for a folder of its own.",
+        resolve(wanted_of("requirements-docs.in"), "--python-version", "3.10"),
+        PYTHONS,
+    )
     return 0
 
 
