@@ -29,13 +29,15 @@ PYTHONS = ("310", "311", "312", "313")
 LEFT_OUT = ("opencv-python", "pandas", "requests", "natsort")
 
 
-def resolve(requirements: list[str], *options: str) -> list[dict[str, Any]]:
+def resolve(
+    requirements: list[str], *options: str, left_out: tuple[str, ...] = LEFT_OUT
+) -> list[dict[str, Any]]:
     """Return uv's resolution of the requirement lines, one entry per package and version."""
     with tempfile.TemporaryDirectory() as folder:
         source, result = Path(folder, "requirements.in"), Path(folder, "pylock.toml")
         source.write_text("\n".join(requirements) + "\n", encoding="utf-8")
         never = Path(folder, "overrides.in")
-        lines = [f"{name} ; python_version < '3'\n" for name in LEFT_OUT]
+        lines = [f"{name} ; python_version < '3'\n" for name in left_out]
         never.write_text("".join(lines), encoding="utf-8")
         command = [os.environ.get("UV", "uv"), "pip", "compile", "--quiet", "--universal"]
         command += ["--no-python-downloads", *options, "--overrides", str(never)]
@@ -157,7 +159,7 @@ def main() -> int:
     write(
         "requirements-docs.lock",
         "Whole, for a folder of its own.",
-        resolve(wanted_of("requirements-docs.in"), "--python-version", "3.10"),
+        resolve(wanted_of("requirements-docs.in"), "--python-version", "3.10", left_out=()),
         PYTHONS,
     )
     return 0
