@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from xml.etree import ElementTree
 
 import pytest
 import yaml
@@ -12,7 +13,7 @@ from code_lines import ROOT
 from needle_common.settings.parameter_fields import specs
 from reference.command_pages import commands_page, scripts
 from reference.diagnostic_pages import IN_EVERY_NODE, complaints, diagnostics_page
-from reference.endpoints import MAKERS, OPEN_ENDED, PUBLISHES, SOURCES
+from reference.endpoints import HEARS, MAKERS, OPEN_ENDED, PUBLISHES, SOURCES
 from reference.markdown import cell, code
 from reference.node_pages import node_page, topics_page
 from reference.rig_nodes import RigNode, executables, rig_nodes
@@ -124,3 +125,15 @@ def test_every_command_line_is_there(nodes: list[RigNode]) -> None:
         _, heading, text = page.partition(f"### {name}\n")
         assert heading, name
         assert "usage: " in text.partition("\n###")[0], name
+
+
+def test_the_picture_of_the_graph_is_as_the_nodes_are(nodes: list[RigNode]) -> None:
+    picture = ElementTree.parse(ROOT / "docs/images/graph.svg")
+    by_name = {node.name: node for node in nodes}
+    arrows = [part.attrib for part in picture.iter() if "data-topics" in part.attrib]
+    assert len(arrows) == 5
+    for arrow in arrows:
+        publisher, hearer = by_name[arrow["data-from"]], by_name[arrow["data-to"]]
+        topics = set(arrow["data-topics"].split())
+        assert topics <= {end.name for end, _ in publisher.endpoints(PUBLISHES)}
+        assert topics <= {end.name for end, _ in hearer.endpoints(HEARS)}

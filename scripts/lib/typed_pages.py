@@ -3,7 +3,7 @@
     python scripts/lib/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
 Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`
-is a file of that name; `text` and `mermaid` are not typed. What goes on until Ctrl-C runs until the
+is a file of that name; `text` is not typed. What goes on until Ctrl-C runs until the
 page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block leaves it out.
 """
 
@@ -29,7 +29,7 @@ PAGES = (
     "docs/own_controllers.md",
 )  # fmt: skip
 COMMAND, PROGRAM, FILE = "command", "python", "yaml"
-NOT_TYPED = ("text", "mermaid")
+NOT_TYPED = ("text",)
 # Executables that go on until Ctrl-C, as anything with `--loop`.
 NODES = (
     "sim_rig", "stereo_tracker", "plane_controller", "recorder", "device_driver", "drive_emulator",
