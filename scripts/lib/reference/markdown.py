@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 
@@ -16,16 +17,20 @@ def code(text: str) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table, with an empty line after it; nothing where there are no rows."""
-    lines = [f"| {' | '.join(map(cell, row))} |" for row in rows]
+    """Return a table and an empty line; a column without a word is left out, all without rows."""
+    rows = list(rows)
+    used = [k for k in range(len(head)) if any(row[k] for row in rows)]
+    lines = [f"| {' | '.join(cell(row[k]) for k in used)} |" for row in rows]
     if not lines:
         return ""
-    return "\n".join([f"| {' | '.join(head)} |", f"|{' --- |' * len(head)}", *lines, "", ""])
+    titles = " | ".join(head[k] for k in used)
+    return "\n".join([f"| {titles} |", f"|{' --- |' * len(used)}", *lines, "", ""])
 
 
-def block(text: str) -> str:
-    """Return text as it was printed."""
-    return f"```text\n{text.rstrip()}\n```\n\n"
+def block(text: str, language: str = "text") -> str:
+    """Return text as it was printed, or stands in a file."""
+    fence = max(["```", *(f"{ticks}`" for ticks in re.findall(r"`{3,}", text))], key=len)
+    return f"{fence}{language}\n{text.rstrip()}\n{fence}\n\n"
 
 
 def node_link(name: str, folder: str = "") -> str:

@@ -1,0 +1,81 @@
+"""`scripts/docs`: the documents as a site."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from code_lines import ROOT
+from docs_site.navigation import FRONT
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_common.commands.options import CommandParser
+from needle_common.errors import UserError
+
+HELP = """\
+Write the documents as a site: this checkout's README, docs, packages' READMEs and decision records,
+and a reference made from the code as it is: nodes, topics, services, parameters, diagnostics,
+command lines, libraries. It is read from the disk or any web server, without a network.
+"""
+EPILOG = """\
+exit codes: 0 done; 1 a link leads nowhere, a page is in no section of docs/README.md, or Sphinx
+warns of something else; 2 bad arguments, or something is missing; 130 interrupted. The first call
+installs Sphinx into .docs.
+"""
+OUT = "site"
+_HERE = Path(__file__).parent
+_BUILT = ".buildinfo"
+_FRONT_PAGE = FRONT.replace(".md", ".html")
+_INDEX = f"""\
+<!doctype html>
+<title>Needle steering</title>
+<meta http-equiv="refresh" content="0; url={_FRONT_PAGE}">
+<a href="{_FRONT_PAGE}">Needle steering</a>
+"""
+
+
+def build(out: Path) -> bool:
+    """Write the site into a folder; returns False where Sphinx warned of anything, on stderr."""
+    # These take seconds to import: not for a command line that is refused.
+    from sphinx.cmd.build import main as sphinx  # noqa: PLC0415
+
+    from docs_site.api_pages import api_pages  # noqa: PLC0415
+    from docs_site.source_tree import write_tree  # noqa: PLC0415
+    from reference.write import pages  # noqa: PLC0415
+
+    with tempfile.TemporaryDirectory() as scratch:
+        source, trees = Path(scratch, "source"), Path(scratch, "trees")
+        print("docs: writing the reference from the nodes and commands", file=sys.stderr)
+        write_tree(source, {**pages(), **api_pages()})
+        print("docs: writing the site", file=sys.stderr)
+        how = ("-q", "-W", "--keep-going", "-b", "html", "-c", _HERE, "-d", trees)
+        code = sphinx([str(part) for part in (*how, source, out)])
+    (out / "index.html").write_text(_INDEX, encoding="utf-8")
+    return bool(code == 0)
+
+
+def main() -> int:
+    """Run `docs`; returns its exit code."""
+    return run_command(_docs)
+
+
+def _docs() -> int:
+    parser = CommandParser("docs", HELP, EPILOG)
+    parser.add_argument(
+        "--out", metavar="DIR", default=str(ROOT / OUT), help=f"where to write (default: {OUT}/)"
+    )
+    out = Path(parser.parse_args().out).expanduser()
+    if out.exists() and not out.is_dir():
+        raise UserError(f"--out {out} is not a folder")
+    if out.is_dir() and any(out.iterdir()):
+        if not (out / _BUILT).is_file():
+            raise UserError(f"--out {out}: something else than a site is there")
+        shutil.rmtree(out)
+    good = build(out)
+    print(f"site: {out / 'index.html'}")
+    return EXIT_DONE if good else EXIT_MISSED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""Settings of Sphinx; `docs_site.build` runs it."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+from docutils import nodes
+from sphinx import addnodes
+from sphinx.application import Sphinx
+
+from docs_site.mathml import add_mathml
+
+project = "Needle steering"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+root_doc = "README"
+# Blocks without a language are commands and tables of text.
+highlight_language = "none"
+
+myst_enable_extensions = ["dollarmath"]
+myst_heading_anchors = 4
+
+autodoc_typehints = "none"
+autodoc_member_order = "bysource"
+napoleon_google_docstring = False
+napoleon_use_ivar = True
+# In a docstring, `x` is a name or a value.
+default_role = "py:obj"
+
+html_theme = "furo"
+html_title = project
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_math_renderer = "mathml"
+html_copy_source = False
+html_show_sourcelink = False
+html_show_copyright = False
+_BEFORE_NAPOLEON = 400
+_FULL_NAME = re.compile(r"needle_\w+(\.\w+)+")
+
+
+def _escape(app: Sphinx, what: str, *described: Any) -> None:
+    """Say what reStructuredText would take for marks: |x| is an absolute value."""
+    lines: list[str] = described[-1]
+    lines[:] = [line.replace("|", "\\|") for line in lines]
+    if what in ("attribute", "data"):
+        # Napoleon takes what is before the first colon for a type.
+        lines[:1] = [f": {line}" for line in lines[:1]]
+
+
+def _link_names(app: Sphinx, page: nodes.document) -> None:
+    """Lead a full name in a text, where the libraries' pages have it, to its description."""
+    for literal in list(page.findall(nodes.literal)):
+        name = literal.astext()
+        if _FULL_NAME.fullmatch(name) and not isinstance(literal.parent, nodes.reference):
+            link = addnodes.pending_xref(
+                "", refdomain="py", reftype="obj", reftarget=name, refdoc=app.env.docname
+            )
+            literal.replace_self(link)
+            link += literal
+
+
+def setup(app: Sphinx) -> None:
+    """Add what Sphinx itself lacks."""
+    app.connect("autodoc-process-docstring", _escape, priority=_BEFORE_NAPOLEON)
+    app.connect("doctree-read", _link_names)
+    add_mathml(app)
