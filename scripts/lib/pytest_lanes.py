@@ -30,7 +30,7 @@ RUN = os.environ.get("NEEDLE_TEST_RUN", "")
 LONG_FILES = (
     "tests/test_documents.py",
     "tests/test_lint.py",
-    "tests/test_docs_site.py",
+    "tests/site/test_docs_site.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
     "ros2_ws/src/needle_bringup/test/graph/test_console.py",
@@ -42,7 +42,7 @@ LONG_FILES = (
     "ros2_ws/src/needle_verification/test/checks/test_check_console_hold.py",
 )
 IN_BACKGROUND = re.compile(
-    r"tests/test_(lint|docs_site)\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
+    r"tests/(test_lint|site/test_docs_site)\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
     r".*/needle_sim/test/(camera|needle|path_traced|studies)/.*|"
     r".*/needle_analysis/test/(report|run|rerun)/.*|"
     r".*/needle_verification/test/(studies|tracking|training|paper)/.*"

@@ -27,6 +27,9 @@ napoleon_use_ivar = True
 # In a docstring, `x` is a name or a value.
 default_role = "py:obj"
 
+# The navigation holds pages, not the functions in them: every page would carry all of them.
+toc_object_entries = False
+
 html_theme = "furo"
 html_title = project
 html_static_path = ["static"]

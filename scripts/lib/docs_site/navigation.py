@@ -38,7 +38,7 @@ def toctree(entries: Iterable[str], caption: str = "") -> str:
     lines = [entry.replace(".md", "") for entry in entries]
     if not lines:
         return ""
-    head = [":hidden:", *([f":caption: {caption}"] if caption else [])]
+    head = [":hidden:", ":titlesonly:", *([f":caption: {caption}"] if caption else [])]
     return "\n".join(["", "```{toctree}", *head, "", *lines, "```", ""])
 
 
