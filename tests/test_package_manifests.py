@@ -22,7 +22,7 @@ ROSDEP_KEYS = {
     "tqdm": "python3-tqdm",
     "yaml": "python3-yaml",
 }
-# rosdep knows no key of them: they come from requirements-ros.lock alone, or an extra's.
+# rosdep knows no key of them, or they belong to an extra that has its own lock.
 FROM_THE_LOCK_ALONE = {
     "canopen",
     "drjit",
