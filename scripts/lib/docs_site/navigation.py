@@ -28,7 +28,7 @@ def navigation(overview: str) -> str:
     for title, text in zip(sections[::2], sections[1::2], strict=True):
         entries: dict[str, str] = {}
         for name, path in _PAGE.findall(text):
-            entries.setdefault(os.path.normpath(f"{_FOLDER}/{path}"), name)
+            entries.setdefault(os.path.normpath(f"{_FOLDER}/{path}"), name.replace("`", ""))
         trees.append(toctree([f"{name} </{path}>" for path, name in entries.items()], title))
     return "".join(trees)
 
