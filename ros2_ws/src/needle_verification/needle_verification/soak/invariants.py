@@ -6,8 +6,7 @@ import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
 
-# Speeds are judged over so many ticks, 0.1 s: a set-point that a bus brings late, or twice, is
-# caught up within one cycle of 0.02 s.
+# Speeds are judged over so many ticks, 0.1 s.
 _SPEED_TICKS = 20
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
@@ -22,8 +21,9 @@ WATCHDOG_BOUND = 0.2
 CATCH_UP_BOUND = 0.3
 # How long a status may be behind the motors [s].
 _STATUS_LAG = 0.15
-# Beyond the limits themselves: what drives of such a rig swing over.
-_SPEED_ROOM, _PLACE_ROOM = 1.25, 0.0011
+# Beyond the limits themselves: of set-points that a bus brings late, three of 0.02 s may come at
+# once; what drives of such a rig swing over [m].
+_SPEED_ROOM, _PLACE_ROOM = 1.0 + 3 * 0.02 / 0.1, 0.0011
 # The controller knows of a motion when its next tip has come: two steps.
 _BELIEF = 0.0045
 # A needle may still be on its way by one of so many commands.
@@ -232,7 +232,7 @@ class Watch:
         )
         speeds = (
             ("speed [mm/s]", abs(speed) * 1e3, bounds.max_speed * _SPEED_ROOM * 1e3),
-            ("rotation rate [rad/s]", abs(rate), bounds.max_rotation_rate * 1.6),
+            ("rotation rate [rad/s]", abs(rate), bounds.max_rotation_rate * _SPEED_ROOM),
         )
         for name, value, bound in (*places, *(speeds if at > self._catches_up_until else ())):
             if value > bound:
