@@ -9,18 +9,21 @@ import math
 import sys
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import cv2
 from tqdm import tqdm
 
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, number, output_file
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import read_parameters
+from needle_tracker.answers.annotation import Image, annotate
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.tracking.measurement import Measurement
@@ -45,6 +48,16 @@ Without --insertion the first two pairs that show a needle have no tip: three ha
 examples:
   ros2 run needle_tracker track_images --calibration rig.yaml --left left --right right \\
       --insertion insertion.csv --output tips.csv
+  ros2 run needle_tracker track_images --calibration out/calibration.yaml --left out/left \\
+      --right out/right --insertion out/insertion.csv --output tips.csv \\
+      --truth out/truth.csv --overlay out/seen
+      of a folder out of render_images: how far off the tips are, and pictures of what was found
+
+With --truth, --json has (null without):
+  compared missed tips_without_needle without_truth   how many
+  error_rms_mm error_p95_mm error_max_mm              in 3D; error_x_rms_mm, ... by axis
+  error_sigmas      root mean square of the errors in claimed standard deviations: 1 is as claimed
+  inside_95         share within the ellipsoids that should hold 95 %
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 """
@@ -54,6 +67,7 @@ COLUMNS = (
 )
 _NODE = "stereo_tracker"
 _NAMED = 5  # so many names are shown, the others counted
+_JPEG_QUALITY = 90
 _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images [m]
 
 
@@ -85,10 +99,19 @@ def _run(words: Sequence[str]) -> int:
     calibration = load_calibration(Path(given.calibration))
     insertions = read_insertions(Path(given.insertion)) if given.insertion else None
     pairs = open_pairs(Path(given.left), Path(given.right))
+    truth = TruthComparison(read_truth(Path(given.truth))) if given.truth else None
+    overlays = None if given.overlay is None else _new_folder("--overlay", given.overlay)
+
+    def on_measured(pair: NamedPair, measured: Measurement) -> None:
+        if truth is not None:
+            truth.add(pair.name, measured)
+        if overlays is not None and pair.left is not None and pair.right is not None:
+            write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
+
     tracker = TipTracker(calibration, parameters.tracker_settings(calibration))
     tracker.warm_up()
     begin = time.perf_counter()
-    tracked = track_sequence(pairs, tracker, calibration, insertions)
+    tracked = track_sequence(pairs, tracker, calibration, insertions, on_measured)
     write_rows(output, tracked.rows)
     found = sum(row[1] == "1" for row in tracked.rows)
     result: dict[str, JsonValue] = {
@@ -98,10 +121,15 @@ def _run(words: Sequence[str]) -> int:
         "unreadable": len(tracked.unreadable),
         "without_insertion": tracked.without_insertion,
         "wall_s": time.perf_counter() - begin,
+        **(dict.fromkeys(TruthComparison({}).figures()) if truth is None else truth.figures()),
     }
     print(f"{found} tips in {len(tracked.rows)} pairs: {output}")
     for reason, count in tracked.reasons.most_common():
         print(f"  no tip {count:6d} x  {reason}")
+    if truth is not None:
+        print(truth.describe())
+    if overlays is not None:
+        print(f"drawn: {overlays}")
     if tracked.swapped:
         print(f"warning: {SUSPICION}; exchange --left and --right", file=sys.stderr)
     _warn("without a partner", pairs.unpaired)
@@ -137,6 +165,7 @@ def track_sequence(
     tracker: TipTracker,
     calibration: StereoCalibration,
     insertions: Mapping[str, float] | None,
+    on_measured: Callable[[NamedPair, Measurement], None] = lambda *_: None,
 ) -> TrackedSequence:
     """Run the tracker over a sequence of pairs.
 
@@ -150,6 +179,8 @@ def track_sequence(
         The tracker's.
     insertions : mapping or None
         Insertion [m] by name (with or without the file's ending), None where not known at all.
+    on_measured : callable
+        Told each pair and what it gave.
 
     Returns
     -------
@@ -193,6 +224,7 @@ def track_sequence(
                 raise UserError(f"{pair.name}: {image} is {problem}")
             measured = tracker.skip(f"{image} cannot be used")
             unusable.append(f"{pair.name} ({image} is {problem})")
+        on_measured(pair, measured)
         row = to_row(pair.name, measured)
         if row[1] == "0":
             entry = measured.state is TrackState.ENTRY
@@ -227,6 +259,22 @@ def to_row(name: str, measured: Measurement) -> list[str]:
     return [name, "1", *(f"{value:.9f}" for value in values)]
 
 
+def write_overlay(folder: Path, name: str, picture: Image) -> None:
+    """Write what was made of a pair as a picture, `annotation.annotate`'s, named as the pair.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    _, data = cv2.imencode(".jpg", picture[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])
+    path = folder / f"{Path(name).stem}.jpg"
+    try:
+        path.write_bytes(data.tobytes())
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
 def write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
     """Write the CSV file.
 
@@ -242,6 +290,18 @@ def write_rows(path: Path, rows: Sequence[Sequence[str]]) -> None:
             writer.writerows(rows)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _new_folder(name: str, text: str) -> Path:
+    """Return a folder that was made, or is empty."""
+    folder = Path(text).expanduser()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise UserError(f"{name} {folder}: has something in it; give a new folder")
+    except OSError as error:
+        raise UserError(f"{name} {folder}: {error.strerror}") from error
+    return folder
 
 
 def _warn(what: str, names: Sequence[str]) -> None:
@@ -261,6 +321,18 @@ def _parser() -> CommandParser:
     add("--right", required=True, metavar="DIR", help="folder of the right images, or a video")
     add("--insertion", metavar="FILE", help="CSV with name,insertion_m")
     add("--output", required=True, metavar="FILE.csv", help="where the tips go")
+    add(
+        "--overlay",
+        metavar="DIR",
+        help="new folder for pictures of what was found in each pair: the searched region blue, "
+        "the shaft's end green (yellow: its line alone), red where it is not believed",
+    )
+    add(
+        "--truth",
+        metavar="FILE",
+        help="CSV with name,x_m,y_m,z_m of the true tips, empty where there is no needle "
+        "(render_images writes one): prints errors in mm and in claimed standard deviations",
+    )
     add("--params", metavar="FILE", help="ROS parameter file with stereo_tracker's parameters")
     add("--needle-width-mm", metavar="W", help="diameter of the needle (default: 0.7)")
     add("--json", metavar="FILE", help="write the counts as one flat JSON object")

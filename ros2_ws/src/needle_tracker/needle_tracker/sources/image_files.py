@@ -176,7 +176,7 @@ def read_insertions(path: Path) -> Mapping[str, float]:
                 where = f"--insertion {path}, line {rows.line_num}"
                 if name in insertions:
                     raise UserError(f"{where}: {name!r} has an insertion already")
-                insertions[name] = _finite(text, where)
+                insertions[name] = finite_field(text, where, "insertion_m")
     except OSError as error:
         raise UserError(f"--insertion {path}: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
@@ -184,13 +184,14 @@ def read_insertions(path: Path) -> Mapping[str, float]:
     return insertions
 
 
-def _finite(text: str, where: str) -> float:
+def finite_field(text: str, where: str, column: str) -> float:
+    """Return a field's number; raises UserError that says where if it is not a finite one."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise UserError(f"{where}: insertion_m = {text!r} is not a finite number")
+        raise UserError(f"{where}: {column} = {text!r} is not a finite number")
     return value
 
 

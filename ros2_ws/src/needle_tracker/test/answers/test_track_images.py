@@ -264,3 +264,91 @@ def test_images_of_the_empty_phantom_are_read_and_refused_by_name(
     code, _ = track(folder, calibration_path, "--params", str(params))
     assert code == 2
     assert "right/0.png: not an image of 1024x768" in capsys.readouterr().err
+
+
+def write_truth(folder: Path, drawn: Drawn, off: tuple[float, float, float] = (0, 0, 0)) -> Path:
+    lines = ["name,x_m,y_m,z_m,more"]
+    for mm, (tip, _, _) in zip(LENGTHS_MM, drawn, strict=True):
+        x, y, z = np.asarray(tip) + np.array(off)
+        lines.append(f"image_{mm}.png,{x},{y},{z},")
+    (folder / "truth.csv").write_text("\n".join(lines) + "\n")
+    return folder / "truth.csv"
+
+
+def test_tips_are_held_against_the_truth(
+    folder: Path, calibration_path: Path, drawn: Drawn, capsys: pytest.CaptureFixture[str]
+) -> None:
+    insertion = ("--insertion", str(folder / "insertion.csv"))
+    seen = []
+    for off in ((0.0, 0.0, 0.0), (0.0, 0.0, 0.001)):
+        truth = ("--truth", str(write_truth(folder, drawn, off)), "--json", str(folder / "o.json"))
+        code, rows = track(folder, calibration_path, *insertion, *truth)
+        assert code == 0
+        seen.append(json.loads((folder / "o.json").read_text()))
+        assert (seen[-1]["compared"], seen[-1]["missed"]) == (4, 1)
+        found = np.array([[float(row[f"{a}_m"]) for a in "xyz"] for row in rows[1:]])
+        true = np.array([np.asarray(tip) + np.array(off) for tip, _, _ in drawn[1:]])
+        size = np.linalg.norm(found - true, axis=1) * 1e3
+        assert seen[-1]["error_max_mm"] == pytest.approx(np.max(size), abs=1e-5)
+        assert seen[-1]["error_rms_mm"] == pytest.approx(np.sqrt(np.mean(size**2)), abs=1e-5)
+        assert f"error  {seen[-1]['error_rms_mm']:.3f} mm rms" in capsys.readouterr().out
+    right, wrong = seen
+    assert right["error_sigmas"] < 1.5
+    assert right["inside_95"] == 1.0
+    # A millimetre along the needle is many of its standard deviations.
+    assert wrong["error_z_rms_mm"] == pytest.approx(1.0, abs=0.1)
+    assert wrong["error_sigmas"] > 5.0
+    assert wrong["inside_95"] == 0.0
+    assert wrong["error_y_rms_mm"] < 0.1
+
+
+def test_a_tip_where_there_is_no_needle_is_counted(
+    folder: Path, calibration_path: Path, drawn: Drawn
+) -> None:
+    lines = write_truth(folder, drawn).read_text().splitlines()
+    lines[3] = "image_51.png,,,,"
+    (folder / "truth.csv").write_text("\n".join(lines[:-1]) + "\n")
+    words = ("--insertion", "insertion.csv", "--truth", "truth.csv", "--json", "o.json")
+    paths = (str(folder / w) if "." in w else w for w in words)
+    assert track(folder, calibration_path, *paths)[0] == 0
+    told = json.loads((folder / "o.json").read_text())
+    keys = ("compared", "missed", "tips_without_needle", "without_truth")
+    assert [told[key] for key in keys] == [2, 1, 1, 1]
+    assert track(folder, calibration_path, "--json", str(folder / "o.json"))[0] == 0
+    assert json.loads((folder / "o.json").read_text())["compared"] is None
+
+
+def test_what_was_found_is_drawn(folder: Path, calibration_path: Path) -> None:
+    (folder / "left" / "image_52.png").write_bytes(b"no image")
+    words = ("--insertion", str(folder / "insertion.csv"), "--overlay", str(folder / "seen"))
+    assert track(folder, calibration_path, *words)[0] == 0
+    names = sorted(path.name for path in (folder / "seen").iterdir())
+    assert names == [f"image_{mm}.jpg" for mm in (3, 50, 51, 53)]
+    drawn = cv2.imread(str(folder / "seen" / "image_53.jpg"))
+    assert drawn is not None
+    picture = drawn.astype(int)
+    # Green, as BGR.
+    is_green = (picture[..., 1] - picture[..., 2] > 60) & (picture[..., 1] - picture[..., 0] > 60)
+    assert np.count_nonzero(is_green) > 20
+
+
+@pytest.mark.parametrize(
+    ("truth", "said"),
+    [
+        ("name,x_m,y_m\n", "no column 'z_m'"),
+        ("name,x_m,y_m,z_m\na,1,2,\n", "line 2: z_m = '' is not a finite number"),
+        ("name,x_m,y_m,z_m\na,1,2,3\na,1,2,3\n", "line 3: 'a' has a truth already"),
+    ],
+)
+def test_a_truth_that_is_none_is_refused_in_one_line(
+    folder: Path,
+    calibration_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    truth: str,
+    said: str,
+) -> None:
+    (folder / "t.csv").write_text(truth)
+    assert track(folder, calibration_path, "--truth", str(folder / "t.csv"))[0] == 2
+    assert said in capsys.readouterr().err
+    assert track(folder, calibration_path, "--overlay", str(folder / "left"))[0] == 2
+    assert "has something in it" in capsys.readouterr().err

@@ -1,0 +1,145 @@
+"""What tips are worth where it is known where the needle was: errors, and errors in sigmas."""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from needle_common.commands.cli import JsonValue
+from needle_common.errors import UserError
+from needle_tracker.sources.image_files import finite_field
+from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.track import TrackState
+
+Array = npt.NDArray[np.float64]
+
+_COLUMNS = ("name", "x_m", "y_m", "z_m")
+_INSIDE_95 = 7.814728
+"""Square of a normal error of three axes, in sigmas, that 95 % stay within."""
+
+
+class TruthComparison:
+    """Compares tips with where the needle's end really was, pair by pair.
+
+    Parameters
+    ----------
+    tips : mapping of str to (ndarray, shape (3,), or None)
+        True tip in `rig` [m] by name; None where the images show no needle.
+    """
+
+    def __init__(self, tips: Mapping[str, Array | None]) -> None:
+        self._tips = tips
+        self._errors: list[Array] = []
+        self._squares: list[float] = []
+        self._missed = self._false = self._untold = 0
+
+    def add(self, name: str, measured: Measurement) -> None:
+        """Take what a pair gave; a tip from the stage alone is none."""
+        key = name if name in self._tips else Path(name).stem
+        if key not in self._tips:
+            self._untold += 1
+            return
+        true, tip = self._tips[key], measured.tip
+        if tip is None or measured.state is TrackState.ENTRY:
+            self._missed += true is not None
+            return
+        if true is None:
+            self._false += 1
+            return
+        error = np.asarray(tip.position - true)
+        self._errors.append(error)
+        self._squares.append(float(error @ np.linalg.solve(tip.covariance, error)))
+
+    def figures(self) -> dict[str, JsonValue]:
+        """Return the figures, by the names of `track_images --json`; null where nothing tells."""
+        errors = np.reshape(self._errors, (-1, 3)) * 1e3
+        found: dict[str, JsonValue] = {
+            "compared": len(errors),
+            "missed": self._missed,
+            "tips_without_needle": self._false,
+            "without_truth": self._untold,
+        }
+        names = ("error_rms_mm", "error_p95_mm", "error_max_mm", "error_sigmas", "inside_95")
+        axes = [f"error_{axis}_rms_mm" for axis in "xyz"]
+        if not len(errors):
+            return {**found, **dict.fromkeys((*names, *axes))}
+        size, squares = np.linalg.norm(errors, axis=1), np.array(self._squares)
+        values = (
+            math.sqrt(float(np.mean(size**2))),
+            float(np.percentile(size, 95.0)),
+            float(np.max(size)),
+            math.sqrt(float(np.mean(squares)) / 3.0),
+            float(np.mean(squares <= _INSIDE_95)),
+        )
+        rms = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+        return {
+            **found,
+            **dict(zip(names, values, strict=True)),
+            **dict(zip(axes, rms, strict=True)),
+        }
+
+    def describe(self) -> str:
+        """Return the figures as a person reads them."""
+        seen = self.figures()
+        lines = [
+            f"against the truth: {seen['compared']} tips, {seen['missed']} needles without a tip, "
+            f"{seen['tips_without_needle']} tips without a needle"
+        ]
+        if seen["compared"]:
+            axes = ", ".join(f"{axis} {seen[f'error_{axis}_rms_mm']:.3f}" for axis in "xyz")
+            lines += [
+                f"  error  {seen['error_rms_mm']:.3f} mm rms ({axes}), "
+                f"{seen['error_p95_mm']:.3f} mm (95th percentile), "
+                f"{seen['error_max_mm']:.3f} mm at worst",
+                f"  that is {seen['error_sigmas']:.2f} of the claimed standard deviations (1 is as "
+                f"claimed); {seen['inside_95']:.1%} lie within what should hold 95 %",
+            ]
+        return "\n".join(lines)
+
+
+def read_truth(path: Path) -> dict[str, Array | None]:
+    """Read a CSV of true tips by name, with the columns name, x_m, y_m, z_m.
+
+    Parameters
+    ----------
+    path : Path
+        The file, such as `render_images` writes; other columns are passed over.
+
+    Returns
+    -------
+    dict
+        Name to the tip in `rig` [m], None where the fields are empty: no needle.
+
+    Raises
+    ------
+    UserError
+        Unreadable, a column missing, a value that is not a finite number, or a name given twice.
+    """
+    tips: dict[str, Array | None] = {}
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = csv.DictReader(file, skipinitialspace=True)
+            columns = rows.fieldnames or []
+            for column in _COLUMNS:
+                if column not in columns:
+                    raise UserError(f"--truth {path}: no column {column!r} in its first line")
+            for row in rows:
+                where = f"--truth {path}, line {rows.line_num}"
+                name = (row["name"] or "").strip()
+                if name in tips:
+                    raise UserError(f"{where}: {name!r} has a truth already")
+                texts = {column: (row[column] or "").strip() for column in _COLUMNS[1:]}
+                tips[name] = None
+                if any(texts.values()):
+                    values = [finite_field(text, where, column) for column, text in texts.items()]
+                    tips[name] = np.array(values)
+    except OSError as error:
+        raise UserError(f"--truth {path}: {error.strerror}") from error
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"--truth {path} is not a CSV file: {error}") from error
+    return tips
