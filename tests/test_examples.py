@@ -11,10 +11,22 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from needle_bringup.simulation.needle_options import contradictions
+from needle_bringup.simulation.rig_configuration import (
+    NODES,
+    command_line_parameters,
+    merge,
+    nodes_of,
+    refuse_reserved,
+)
+from needle_bringup.simulation.simulate_options import parse
+from needle_common.settings.parameter_files import read_parameters
 from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.planning.entry import entry_state
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_sim.needle.plant import NeedlePlant, initial_pose
+from needle_sim.ros.parameters import SimRigParameters
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 SETTINGS = SteeringSettings(**PAPER_NOISE)
@@ -88,3 +100,24 @@ def test_sidestep_leads_beside_what_is_in_the_way(own: Any) -> None:
         via, last = planner.via_points(tip, target, sphere)
         assert np.linalg.norm(via - sphere[0, :3]) == pytest.approx(0.009)
         np.testing.assert_array_equal(last, target)
+
+
+@pytest.mark.parametrize(
+    ("name", "warns"),
+    [("thin_needle", False), ("unknown_tissue", True), ("bare_steel", False), ("glare", False)],
+)
+def test_simulate_takes_the_parameter_files(name: str, warns: bool) -> None:
+    path = EXAMPLES / "params" / f"{name}.yaml"
+    given, options = read_parameters(path, NODES), parse([])
+    refuse_reserved(path, given, options)
+    SimRigParameters(**given["sim_rig"])
+    StereoTrackerParameters(**given.get("stereo_tracker", {}))
+    SteeringSettings(**given.get("plane_controller", {}))
+    all_of_it = merge(command_line_parameters(options, Path()), given)
+    assert bool(contradictions(all_of_it, nodes_of(options))) == warns
+
+
+def test_every_parameter_file_is_tried() -> None:
+    page = (EXAMPLES / "README.md").read_text("utf-8")
+    for path in (EXAMPLES / "params").iterdir():
+        assert f"`{path.name}`" in page

@@ -26,7 +26,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "docs/setup.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
-    "docs/own_controllers.md",
+    "docs/own_controllers.md", "docs/examples/README.md",
 )  # fmt: skip
 COMMAND, PROGRAM, FILE = "command", "python", "yaml"
 NOT_TYPED = ("text",)

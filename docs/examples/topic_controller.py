@@ -1,0 +1,106 @@
+"""A controller from topics alone: tips in, steps out, nothing of needle_controller in it.
+
+It stands in plane_controller's place beside sim_rig, which tells it the tip, and the stand-in for a
+person, which starts it. A line through the last tips says where the needle is headed; the bevel is
+turned up or down by how far that is from where it should be headed. All is SI; x is up, z ahead.
+"""
+
+import contextlib
+
+import numpy as np
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from geometry_msgs.msg import PointStamped
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+
+PLANE, DEPTH, STEP, SPEED = 0.003, 0.12, 0.001, 0.002  # x of the plane; a step and its speed
+LOOK_BACK, LEVEL_OUT, GAIN = 0.02, 0.04, 10.0  # tips that count; where the plane is aimed at
+MOST_TURN, JOINTS = (
+    0.5,
+    ["insertion_joint", "rotation_joint"],
+)  # of the base in a step; what is moved
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class TopicController(Node):
+    """Answers every tip with the next step, until the depth is reached."""
+
+    def __init__(self):
+        super().__init__("plane_controller")
+        self.starts, self.joints, self.tips = 0, [0.0, 0.0], []
+        self.seen = self.after = 0  # stamps: the newest tip's, and what the next must be newer than
+        self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", 10)
+        self.status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
+        self.create_subscription(JointState, "joint_states", self.take_joints, 10)
+        self.create_subscription(PointStamped, "needle/tip", self.take_tip, 10)
+        self.create_subscription(Header, "device/result", self.take_result, 10)
+        self.create_subscription(DiagnosticStatus, "device/status", self.take_device, LATCHED)
+        self.create_service(Trigger, "~/start", self.start)
+        self.say("IDLE", "nothing")
+
+    def say(self, state, awaiting):
+        """Tell sim_rig whether a tip is wanted, and everybody how far the needle is."""
+        self.awaiting = awaiting
+        keys = {"state": state, "awaiting": awaiting, "tip_after_ns": self.after, "depth_m": DEPTH}
+        keys |= {"starts": self.starts, "step": len(self.tips), "insertion_m": self.joints[0]}
+        values = [KeyValue(key=key, value=str(value)) for key, value in keys.items()]
+        self.status.publish(DiagnosticStatus(name="plane_controller: steering", values=values))
+
+    def start(self, _, answer):
+        """Begin: as soon as somebody holds, the next tip leads to the first step."""
+        self.starts, self.tips, answer.success = self.starts + 1, [], True
+        self.say("STEERING", "hold")
+        return answer
+
+    def take_device(self, device):
+        """Go on when somebody holds: without that the device takes no step."""
+        held = any(pair.key == "hold_owner" and pair.value for pair in device.values)
+        if held and self.awaiting == "hold":
+            self.say("STEERING", "tip")
+
+    def take_joints(self, joints):
+        """Keep how far the needle's base is in and turned."""
+        self.joints = [joints.position[joints.name.index(joint)] for joint in JOINTS]
+
+    def take_tip(self, tip):
+        """Turn the bevel by how far the needle is from its way, and go on by a step."""
+        self.seen = tip.header.stamp.sec * 10**9 + tip.header.stamp.nanosec
+        if self.awaiting != "tip" or self.seen <= self.after:
+            return
+        self.tips.append((tip.point.x - PLANE, tip.point.z))
+        x, z = np.array([t for t in self.tips if t[1] >= tip.point.z - LOOK_BACK]).T
+        slope, height = np.polyfit(z, x, 1) if len(z) > 3 else (0.0, x[-1])
+        self.above = slope * z[-1] + height
+        # Roll +90 deg bends up, -90 deg down; in between it bends less.
+        roll = np.clip(GAIN * (-self.above / LEVEL_OUT - slope), -1.0, 1.0) * np.pi / 2.0
+        turn = float(np.clip(roll - self.joints[1], -MOST_TURN, MOST_TURN))
+        self.aim = min(self.joints[0] + STEP, DEPTH)
+        point = JointTrajectoryPoint(positions=[self.aim, self.joints[1] + turn])
+        point.time_from_start.nanosec = int(STEP / SPEED * 1e9)
+        self.awaiting = "result"
+        step = JointTrajectory(header=tip.header, joint_names=JOINTS, points=[point])
+        self.commands.publish(step)
+
+    def take_result(self, result):
+        """Ask for the next tip once the step is done, or for the hold that has ended it."""
+        if self.awaiting != "result":
+            return
+        self.after = self.seen  # a tip of before the answer may be one of before the step's end
+        if result.frame_id != "succeeded":
+            self.say("STEERING", "hold")
+        elif self.aim < DEPTH:
+            self.say("STEERING", "tip")
+        else:
+            self.say("DONE", "nothing")
+            self.get_logger().info(f"done, {self.above * 1e3:.2f} mm above the plane")
+
+
+rclpy.init()
+with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
+    rclpy.spin(TopicController())
