@@ -25,6 +25,7 @@ ROSDEP_KEYS = {
 # rosdep knows no key of them, or they belong to an extra that has its own lock.
 FROM_THE_LOCK_ALONE = {
     "canopen",
+    "distributed",
     "drjit",
     "fastapi",
     "lz4",

@@ -2,9 +2,9 @@
 
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
-numpy that apt's message packages were compiled against), `requirements-console.lock` and
-`requirements-console-test.lock` (what the web console and its tests need beside either of them),
-`requirements-docs.lock` (what makes the documents a site, in a folder of its own).
+numpy that apt's message packages were compiled against), and what extras need beside either of
+them: the web console and its tests, studies on a cluster; `requirements-docs.lock` has
+what makes the documents a site, in a folder of its own.
 Only files that Linux x86-64 with CPython 3.10-3.13 can install are hashed; no address of an index
 goes into a lock. Needs Python 3.11 or newer with `packaging` (as in `.venv`), and `uv`.
 """
@@ -125,11 +125,15 @@ def pins_of(lock: str) -> list[str]:
     return [line.removesuffix(" \\") for line in lines if re.match(r"[\w.-]+==", line)]
 
 
-def write_extra(name: str, *below: str) -> None:
-    """Write the lock of an extra: what it needs beside the locks below it, as they pin it."""
+def write_extra(name: str, *below: str, beside: tuple[str, ...] = ()) -> None:
+    """Write the lock of an extra: what it needs beyond the locks below it, as they pin it.
+
+    What it has in common with the locks beside it is pinned as there: all can be installed at once.
+    """
     with tempfile.TemporaryDirectory() as folder:
         pins = Path(folder, "constraints.txt")
-        pins.write_text("\n".join(line for lock in below for line in pins_of(lock)) + "\n")
+        lines = {line: None for lock in (*below, *beside) for line in pins_of(lock)}
+        pins.write_text("\n".join(lines) + "\n")
         packages = resolve(
             wanted_of(f"requirements-{name}.in"), "--python-version", "3.10", "-c", str(pins)
         )
@@ -162,6 +166,7 @@ def main() -> int:
         resolve(wanted_of("requirements-docs.in"), "--python-version", "3.10", left_out=()),
         PYTHONS,
     )
+    write_extra("cluster", "requirements.lock", beside=("requirements-console.lock",))
     return 0
 
 

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.errors import UserError
 from needle_sim.needle.se3 import FloatArray
+from needle_verification.studies.cluster_study import run_parts
 from needle_verification.studies.monte_carlo_options import MonteCarloOptions, parse
 from needle_verification.studies.study_parts import parts_of, results_of, settings_of
 
@@ -51,24 +52,38 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def monte_carlo(options: MonteCarloOptions) -> int:
     """Run a study as asked, print its figures and write its files."""
     parts = parts_of(options)
+    witness = parts[0].of_first(2)
     # What is compiled is compiled now, not in the time that is reported.
-    parts[0].of_first(2).run()
+    witness.run()
     begin, worked_before = time.perf_counter(), time.process_time()
-    needles = sum(len(part.starts) for part in parts)
+    steps = settings_of(options).steps
     with tqdm(
-        total=needles * settings_of(options).steps,
+        total=sum(len(part.starts) for part in parts) * steps,
         unit="step",
         unit_scale=True,
         delay=1.0,
         leave=False,
         disable=not sys.stderr.isatty(),
     ) as bar:
-        results = results_of(parts, [part.run(bar.update) for part in parts])
-    worked, wall = time.process_time() - worked_before, time.perf_counter() - begin
+        if options.scheduler:
+            done = run_parts(
+                options.scheduler, parts, witness, lambda needles: bar.update(needles * steps)
+            )
+            outcomes, worked = done.outcomes, done.cpu_s
+            for machine in done.differing:
+                print(
+                    f"warning: {machine} rounds otherwise than this machine (another processor?): "
+                    "figures may differ in their last digits",
+                    file=sys.stderr,
+                )
+        else:
+            outcomes = [part.run(bar.update) for part in parts]
+            worked = time.process_time() - worked_before
+    results, wall = results_of(parts, outcomes), time.perf_counter() - begin
     seen = {**results.figures, "cpu_s": worked, "wall_s": wall}
     print(describe(seen))
     if options.csv is not None:
-        write_csv(options.csv, results.columns)
+        write_csv(options.csv, results.columns, options.of_a_run)
     if options.json is not None:
         asked: dict[str, JsonValue] = {
             "controller": options.controller,
@@ -95,8 +110,17 @@ def describe(result: Mapping[str, JsonValue]) -> str:
     return "\n".join(lines)
 
 
-def write_csv(path: Path, columns: Mapping[str, FloatArray]) -> None:
+def write_csv(path: Path, columns: Mapping[str, FloatArray], of_all: Mapping[str, str]) -> None:
     """Write one line for each run; `settle_mm` is empty where a run ends outside.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    columns : mapping of str to ndarray, shape (N,)
+        What differs from run to run.
+    of_all : mapping
+        What they have in common: the files of several studies make one table.
 
     Raises
     ------
@@ -106,9 +130,10 @@ def write_csv(path: Path, columns: Mapping[str, FloatArray]) -> None:
     try:
         with path.open("w", encoding="utf-8", newline="") as stream:
             writer = csv.writer(stream)
-            writer.writerow(columns)
-            for row in np.stack(list(columns.values()), axis=-1):
-                writer.writerow(f"{value:.6g}" if np.isfinite(value) else "" for value in row)
+            writer.writerow(["run", *columns, *of_all])
+            for number, row in enumerate(np.stack(list(columns.values()), axis=-1)):
+                values = (f"{value:.6g}" if np.isfinite(value) else "" for value in row)
+                writer.writerow([number, *values, *of_all.values()])
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}") from error
 

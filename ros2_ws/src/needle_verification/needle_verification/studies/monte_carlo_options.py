@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from needle_common.commands.options import (
@@ -64,16 +64,25 @@ examples:
   ros2 run needle_sim monte_carlo --targets 2000 --controller rrt
   ros2 run needle_sim monte_carlo --estimator particle_filter --draws 1
   ros2 run needle_sim monte_carlo --outliers 0.05 --outlier-mm 2,3.5 --slip 0.02 --bump-mm 2
+  ros2 run needle_sim monte_carlo --draws 1000 --scheduler tcp://10.0.0.5:8786 --csv runs.csv
 
 exit codes: 0 ran, 2 bad input or something missing, 130 interrupted.
 """
 
 _DEPTH_MM, _DEPTH_OF_POINTS_MM = "120", "150"
+# Of the study, not of a run: each run has a start of its own.
+_OF_THE_STUDY = (
+    "grid", "draws", "x_mm", "pitch_deg", "roll_deg", "initial", "targets",
+    "scheduler", "json", "csv",
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
 class MonteCarloOptions:
-    """Options of one study; SI."""
+    """Options of one study; SI.
+
+    `of_a_run` has what each run is run with beside its start and its point, as it was typed.
+    """
 
     controller: str
     estimator: str
@@ -94,8 +103,10 @@ class MonteCarloOptions:
     target_drift: float
     target_breath: float
     seed: int
+    scheduler: str
     json: Path | None
     csv: Path | None
+    of_a_run: Mapping[str, str]
 
 
 def parse(arguments: Sequence[str]) -> MonteCarloOptions:
@@ -156,9 +167,19 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         target_drift=number("--target-drift-mm", given.target_drift_mm, 0.0, 100.0, "mm") * 1e-3,
         target_breath=number("--target-breath-mm", given.target_breath_mm, 0.0, 100.0, "mm") * 1e-3,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
+        scheduler=given.scheduler,
         json=output_file("--json", given.json),
         csv=output_file("--csv", given.csv),
+        of_a_run=_of_a_run({**vars(given), "depth_mm": depth}),
     )
+
+
+def _of_a_run(given: Mapping[str, str]) -> Mapping[str, str]:
+    """Return the options that every run has, by name; how much a base turns is a result."""
+    renamed = {"rotation_deg": "most_rotation_deg"}
+    return {
+        renamed.get(name, name): value for name, value in given.items() if name not in _OF_THE_STUDY
+    }
 
 
 def _parser() -> CommandParser:
@@ -265,8 +286,19 @@ def _parser() -> CommandParser:
         metavar="X_MM,PITCH_DEG,ROLL_DEG",
         help="all runs from this one start instead of a grid",
     )
+    add(
+        "--scheduler",
+        default="",
+        metavar="ADDRESS",
+        help="steer the needles on the Dask cluster of this scheduler, such as "
+        "tcp://10.0.0.5:8786, to the same figures (docs/cluster.md)",
+    )
     add("--json", metavar="FILE", help="write the figures as one flat JSON object")
-    add("--csv", metavar="FILE", help="one line for each run: its start and what became of it")
+    add(
+        "--csv",
+        metavar="FILE",
+        help="one line for each run: what it was run with, and what became of it",
+    )
     return parser
 
 
