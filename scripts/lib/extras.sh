@@ -22,8 +22,8 @@ _install() {
     lock="$(dirname -- "$VIRTUAL_ENV")/requirements-$1.lock"
     ! cmp -s -- "$lock" "$stamp" || return 0
     echo "setup: installing the packages of requirements-$1.lock" >&2
-    run python -m pip install --quiet --no-input --disable-pip-version-check --no-deps --require-hashes \
-        "${@:3}" --requirement "$lock"
+    run python -m pip install --quiet --no-input --disable-pip-version-check --no-deps --no-build-isolation \
+        --require-hashes "${@:3}" --requirement "$lock"
     if [ "$code" != 0 ]; then
         echo "setup: could not install the packages of requirements-$1.lock" >&2
         exit 2

@@ -3,8 +3,8 @@
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
 numpy that apt's message packages were compiled against), and what extras need beside either of
-them: the web console and its tests, studies on a cluster; `requirements-docs.lock` has
-what makes the documents a site, in a folder of its own.
+them: the web console and its tests, studies on a cluster, OpenIGTLink;
+`requirements-docs.lock` has what makes the documents a site, in a folder of its own.
 Only files that Linux x86-64 with CPython 3.10-3.13 can install are hashed; no address of an index
 goes into a lock. Needs Python 3.11 or newer with `packaging` (as in `.venv`), and `uv`.
 """
@@ -167,6 +167,7 @@ def main() -> int:
         PYTHONS,
     )
     write_extra("cluster", "requirements.lock", beside=("requirements-console.lock",))
+    write_extra("openigtlink", "requirements.lock")
     return 0
 
 

@@ -247,6 +247,7 @@ WAYS: dict[str, tuple[Way, ...]] = {
         Way("in simulated time", ("use_sim_time:=true",)),
     ),
     "live_view": (Way(then=_look),),
+    "openigtlink": (Way("", ("port:=0",), then=lambda node, _: node._show()),),
     "operator": (
         Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), _with_pedal, _tick),
         Way("source joy", ("source:=joy", "key:=0"), then=_tick),

@@ -11,41 +11,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Path as PathMessage
 from rclpy.context import Context
-from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.parameter import Parameter
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CompressedImage, Image, JointState
+from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import String
 from visualization_msgs.msg import MarkerArray
 
 from needle_analysis.live.latest_images import LatestImages
-from needle_analysis.live.live_needle import Belief, LiveNeedle, SeenTip
 from needle_analysis.live.marked_image import marked_image
 from needle_analysis.ros import live_messages
+from needle_analysis.ros.needle_hearing import NeedleHearing
 from needle_analysis.ros.transform_publishers import transform_publishers
 from needle_common.errors import UserError
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.conversions import (
     IMAGES_BEST_EFFORT,
-    JOINT_STATES,
     LATCHED,
     RELIABLE,
     to_nanoseconds,
-    values_of,
 )
-from needle_common.ros.discovery import unpublished
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
-from needle_controller.model.target_plane import plane_from_pose
 from needle_tracker.optics.calibration import SIDES, calibration_from
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
-from needle_tracker.ros.conversions import insertion_of, rotation_of, to_frame
+from needle_tracker.ros.conversions import to_frame
 
 HELP = """
 live_view: shows the needle to RViz, Foxglove and the like while it is steered. Each of its topics
@@ -57,9 +51,6 @@ Publishes   ~/tip, ~/path, ~/markers (shaft, tip, estimate, 95 % ellipsoid, plan
             ~/left/compressed, ~/right/compressed (JPEG, shaft and tip drawn in); /tf, /tf_static
             where tf2_msgs is installed
 """
-# Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.
-_FARTHEST = 10.0
-_QUOTED = 40  # characters of a text that is not understood
 OUTPUTS: dict[str, type[Any]] = {
     "~/tip": PoseStamped,
     "~/path": PathMessage,
@@ -82,7 +73,7 @@ class LiveViewParameters:
 
 
 class LiveViewNode(WholeNode):
-    """The ROS shell of `LiveNeedle`.
+    """Shows a `LiveNeedle` in ROS's own messages.
 
     Parameters
     ----------
@@ -100,7 +91,8 @@ class LiveViewNode(WholeNode):
         super().__init__("live_view", context=context, parameter_overrides=parameter_overrides)
         values = NodeParameters(self, LiveViewParameters).values
         self._diagnostics = DiagnosticsPublisher(self)
-        self._needle = LiveNeedle()
+        hearing = NeedleHearing(self, self._diagnostics)
+        self._needle = hearing.needle
         self._images = {side: LatestImages() for side in SIDES}
         self._cameras: dict[str, RefractedCamera] = {}
         self._hears_images: dict[str, Subscription[Any]] = {}
@@ -108,69 +100,16 @@ class LiveViewNode(WholeNode):
             topic: self.create_publisher(kind, topic, RELIABLE) for topic, kind in OUTPUTS.items()
         }
         self._tf = transform_publishers(self)
-        hear = self.create_subscription
-        tips = hear(PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip, RELIABLE)
-        joints = hear(JointState, "joint_states", self._on_joints, JOINT_STATES)
-        hear(PoseWithCovarianceStamped, "needle/estimate", self._on_estimate, RELIABLE)
-        hear(DiagnosticStatus, "needle/controller_status", self._on_controller, LATCHED)
-        hear(String, "stereo_tracker/calibration", self._on_calibration, LATCHED)
-        # A latched plane comes to whoever comes late, a plain one to the plain subscription alone.
-        hear(PoseStamped, "target_plane", self._on_plane, RELIABLE)
-        hear(
-            PoseStamped,
-            "target_plane",
-            self._on_plane,
-            LATCHED,
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        self.create_subscription(
+            String, "stereo_tracker/calibration", self._on_calibration, LATCHED
         )
         self._life = LifeSigns(
             self,
             self._diagnostics,
             "shows the needle while somebody looks",
-            lambda: unpublished(self, [tips, joints]),
+            hearing.missing,
         )
         self.create_timer(1.0 / values.rate, self._show, clock=STEADY_CLOCK)
-
-    # ---- what is heard ------------------------------------------------------------------------
-
-    def _on_joints(self, message: JointState) -> None:
-        insertion = insertion_of(message)
-        if insertion is not None and _is_near(insertion):
-            self._needle.take_insertion(insertion)
-
-    def _on_tip(self, message: PoseWithCovarianceStamped) -> None:
-        stamp_ns = to_nanoseconds(message.header.stamp)
-        place, _, covariance = _parts(message)
-        q = message.pose.pose.orientation
-        quaternion = np.array([q.x, q.y, q.z, q.w])
-        if _is_near(place, covariance, quaternion):
-            self._needle.take_tip(SeenTip(stamp_ns, place, quaternion, covariance))
-        else:
-            self._needle.take_no_tip(stamp_ns)
-
-    def _on_estimate(self, message: PoseWithCovarianceStamped) -> None:
-        place, rotation, covariance = _parts(message)
-        if rotation is None or not _is_near(place, covariance):
-            raise ValueError("no needle can be there, or it has no orientation")
-        self._needle.take_belief(Belief(place, rotation, covariance))
-
-    def _on_controller(self, message: DiagnosticStatus) -> None:
-        values = values_of(message)
-        offset, point = values.get("target_offset_m", ""), values.get("target_point_m", "")
-        beside = float(offset) if offset else None
-        x_y_z = np.array([float(part) for part in point.split(",")]) if point else None
-        if not _is_near(beside or 0.0) or (x_y_z is not None and not _is_place(x_y_z)):
-            raise ValueError(f"no target is at {offset[:_QUOTED]!r} and {point[:_QUOTED]!r}")
-        self._needle.take_targets(beside, x_y_z)
-
-    def _on_plane(self, message: PoseStamped) -> None:
-        p, q = message.pose.position, message.pose.orientation
-        try:
-            plane = plane_from_pose(message.header.frame_id, [p.x, p.y, p.z], [q.x, q.y, q.z, q.w])
-        except UserError as error:
-            self._diagnostics.refuse("target_plane", "no plane", str(error))
-            return
-        self._needle.take_plane(plane)
 
     def _on_calibration(self, message: String) -> None:
         try:
@@ -237,22 +176,6 @@ class LiveViewNode(WholeNode):
             shaft = self._cameras[side].project(self._needle.shaft)
         data = marked_image(image, shaft, f"{side}: {note}")
         self._outputs[topic].publish(live_messages.to_image(data, side, stamp_ns))
-
-
-def _is_near(*parts: Any) -> bool:
-    """Return whether all numbers are finite, and such that a needle of a rig may have."""
-    return all(bool(np.all(np.abs(part) <= _FARTHEST)) for part in parts)
-
-
-def _is_place(values: Any) -> bool:
-    return values.shape == (3,) and _is_near(values)
-
-
-def _parts(message: PoseWithCovarianceStamped) -> tuple[Any, Any, Any]:
-    """Return place, rotation (None: no orientation) and covariance of the place."""
-    p = message.pose.pose.position
-    covariance = np.array(message.pose.covariance).reshape(6, 6)[:3, :3]
-    return np.array([p.x, p.y, p.z]), rotation_of(message.pose.pose), covariance
 
 
 def main() -> int:

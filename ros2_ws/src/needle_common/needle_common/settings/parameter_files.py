@@ -23,6 +23,7 @@ NODES = (
     "operator",
     "simulated_operator",
     "live_view",
+    "openigtlink",
     "player",
 )
 """Names of the rig's nodes."""

@@ -1,0 +1,116 @@
+"""The port that says the same to all: whatever they send, and however slowly they read."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import struct
+from collections.abc import Iterator
+
+import pytest
+
+from needle_analysis.link.link_server import MOST_LISTENERS, STALLED, LinkServer
+from needle_common.errors import UserError
+
+HEADER = struct.Struct("> H 12s 20s II Q Q")
+
+
+@pytest.fixture
+def server() -> Iterator[LinkServer]:
+    with contextlib.closing(LinkServer("127.0.0.1", 0)) as one:
+        yield one
+
+
+def listener(server: LinkServer) -> socket.socket:
+    connection = socket.create_connection(("127.0.0.1", server.port), timeout=5.0)
+    before = server.listeners
+    while server.listeners == before:
+        server.turn(0.0)
+    return connection
+
+
+def read(connection: socket.socket, count: int) -> bytes:
+    data = b""
+    while len(data) < count:
+        data += connection.recv(count - len(data))
+    return data
+
+
+def test_all_hear_the_same(server: LinkServer) -> None:
+    with listener(server) as one, listener(server) as other:
+        server.say(b"needle", 0.0)
+        assert read(one, 6) == read(other, 6) == b"needle"
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        random.Random(1).randbytes(100_000),
+        b"\x00",
+        # A message of 2^64 bytes, of which none comes; a name that is no text; another protocol.
+        HEADER.pack(1, b"TRANSFORM", b"Tip", 0, 0, 2**64 - 1, 0),
+        HEADER.pack(1, b"\xff" * 12, b"\xfe" * 20, 0, 0, 4, 0) + b"1234",
+        b"GET / HTTP/1.1\r\n\r\n",
+    ],
+)
+def test_garbage_harms_nobody(server: LinkServer, garbage: bytes) -> None:
+    with listener(server) as good, listener(server) as bad:
+        bad.sendall(garbage)
+        server.turn(0.0)
+        server.say(b"needle", 0.0)
+        assert read(good, 6) == read(bad, 6) == b"needle"
+        # Half a message, then gone: with a reset.
+        bad.sendall(garbage[:7])
+        bad.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        bad.close()
+        while server.listeners == 2:
+            server.turn(0.0)
+        server.say(b"again", 0.0)
+        assert read(good, 5) == b"again"
+
+
+def test_who_goes_is_let_go(server: LinkServer) -> None:
+    with listener(server) as one:
+        one.shutdown(socket.SHUT_WR)
+        while server.listeners:
+            server.turn(0.0)
+        assert one.recv(1) == b""
+
+
+def test_more_than_there_is_room_for_are_turned_away(server: LinkServer) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST_LISTENERS):
+            stack.enter_context(listener(server))
+        late = socket.create_connection(("127.0.0.1", server.port), timeout=5.0)
+        stack.enter_context(late)
+        while not server.turned_away:
+            server.turn(0.0)
+        assert late.recv(1) == b""
+        assert server.listeners == MOST_LISTENERS
+
+
+def test_who_does_not_read_holds_nobody_up_and_is_let_go(server: LinkServer) -> None:
+    data = bytes(50_000_000)
+    with listener(server) as asleep:
+        server.say(data, 1.0)
+        with listener(server) as awake:
+            # What it has not read yet is not added to: its next message begins where one ends.
+            server.say(b"needle", 2.0)
+            assert read(awake, 6) == b"needle"
+            server.turn(1.0 + STALLED)
+            assert server.listeners == 2
+            server.turn(1.1 + STALLED)
+            assert server.listeners == 1
+        asleep.settimeout(5.0)
+        received = 0
+        with contextlib.suppress(ConnectionError):
+            while part := asleep.recv(1_000_000):
+                received += len(part)
+                assert b"needle" not in part
+        assert received < len(data)
+
+
+def test_a_port_in_use_is_refused_in_one_line(server: LinkServer) -> None:
+    with pytest.raises(UserError, match=rf"127\.0\.0\.1, port {server.port}: Address already"):
+        LinkServer("127.0.0.1", server.port)
