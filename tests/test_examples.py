@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import importlib
 import math
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -121,3 +123,18 @@ def test_every_parameter_file_is_tried() -> None:
     page = (EXAMPLES / "README.md").read_text("utf-8")
     for path in (EXAMPLES / "params").iterdir():
         assert f"`{path.name}`" in page
+
+
+@pytest.mark.parametrize("notebook", sorted(EXAMPLES.glob("*.ipynb")), ids=lambda path: path.name)
+def test_a_notebook_runs(notebook: Path) -> None:
+    for name in ("pandas", "nbclient", "ipykernel"):
+        pytest.importorskip(name, reason="the notebooks' lock is not installed: docs/notebooks.md")
+    # In a process: what runs it leaves an event loop behind.
+    run = "import sys; from nbclient.cli import main; sys.exit(main())"
+    done = subprocess.run(
+        [sys.executable, "-c", run, "--timeout=60", str(notebook)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr

@@ -32,6 +32,7 @@ FROM_THE_LOCK_ALONE = {
     "mcap",
     "mitsuba",
     "nicegui",
+    "pandas",
     "pyigtl",
     "rosbags",
     "uvicorn",

@@ -3,7 +3,7 @@
 Writes `requirements.lock` (everything, for PyPI's wheels of ROS 2 Jazzy) and
 `requirements-ros.lock` (what Ubuntu 24.04 with ROS 2 Jazzy from apt lacks: no ROS packages, and the
 numpy that apt's message packages were compiled against), and what extras need beside either of
-them: the web console and its tests, studies on a cluster, OpenIGTLink;
+them: the web console and its tests, studies on a cluster, OpenIGTLink, notebooks;
 `requirements-docs.lock` has what makes the documents a site, in a folder of its own.
 Only files that Linux x86-64 with CPython 3.10-3.13 can install are hashed; no address of an index
 goes into a lock. Needs Python 3.11 or newer with `packaging` (as in `.venv`), and `uv`.
@@ -135,7 +135,9 @@ def write_extra(name: str, *below: str, beside: tuple[str, ...] = ()) -> None:
         lines = {line: None for lock in (*below, *beside) for line in pins_of(lock)}
         pins.write_text("\n".join(lines) + "\n")
         packages = resolve(
-            wanted_of(f"requirements-{name}.in"), "--python-version", "3.10", "-c", str(pins)
+            wanted_of(f"requirements-{name}.in"),
+            *("--python-version", "3.10", "-c", str(pins)),
+            left_out=(),
         )
     there = {line.partition("==")[0] for lock in below for line in pins_of(lock)}
     packages = [package for package in packages if package["name"] not in there]
@@ -168,6 +170,8 @@ def main() -> int:
     )
     write_extra("cluster", "requirements.lock", beside=("requirements-console.lock",))
     write_extra("openigtlink", "requirements.lock")
+    above = ("requirements-console.lock", "requirements-cluster.lock")
+    write_extra("notebook", "requirements.lock", beside=above)
     return 0
 
 
