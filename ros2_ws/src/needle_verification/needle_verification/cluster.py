@@ -14,7 +14,7 @@ import logging
 import platform
 import re
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -33,13 +33,10 @@ _PACKAGES = (
 )  # fmt: skip
 
 
-def run_on_cluster(
-    address: str,
-    work: Callable[[Part], Result],
-    parts: Sequence[Part],
-    on_result: Callable[[int, Result], None] = lambda *_: None,
-) -> list[Result]:
-    """Return the results of `work` on each part, in the order of the parts.
+def on_cluster(
+    address: str, work: Callable[[Part], Result], parts: Sequence[Part]
+) -> Iterator[Result]:
+    """Yield the results of `work` on each part, in the order of the parts.
 
     Parameters
     ----------
@@ -49,8 +46,6 @@ def run_on_cluster(
         A function of a module, which workers can import.
     parts : sequence
         What can be pickled.
-    on_result : callable
-        Told each part's number and result as they come.
 
     Raises
     ------
@@ -75,29 +70,31 @@ def run_on_cluster(
         client = distributed.Client(address, timeout=CONNECTS_WITHIN)
     except OSError as error:
         raise UserError(f"--scheduler {address}: {_line(error)}") from error
-    results: dict[int, Result] = {}
     with client:
         run = functools.partial(_run, work, identity())
         futures = client.map(run, parts, pure=False, batch_size=100)
         numbers = {future.key: number for number, future in enumerate(futures)}
         done = distributed.as_completed(futures)
         futures.clear()
+        # Results that have come before those of parts ahead of them.
+        early: dict[int, Result] = {}
+        told = 0
         try:
             for future in done:
-                number = numbers[future.key]
-                results[number] = future.result()
+                early[numbers[future.key]] = future.result()
                 # The cluster may forget it.
                 future.release()
-                on_result(number, results[number])
+                while told in early:
+                    yield early.pop(told)
+                    told += 1
         except distributed.KilledWorker as error:
             raise UserError(
                 f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
             ) from error
         except (OSError, distributed.CancelledError) as error:
             raise UserError(
-                f"--scheduler {address}: lost after {len(results)} of {len(parts)} parts"
+                f"--scheduler {address}: lost, with {told} of {len(parts)} parts done"
             ) from error
-    return [results[number] for number in range(len(parts))]
 
 
 @functools.lru_cache(maxsize=1)

@@ -14,7 +14,7 @@ import numpy as np
 
 from needle_sim.studies.figures_of_merit import Outcomes
 from needle_sim.studies.point_study import PointOutcomes
-from needle_verification.cluster import run_on_cluster
+from needle_verification.cluster import on_cluster
 from needle_verification.studies.study_parts import StudyPart
 
 
@@ -97,12 +97,13 @@ def run_parts(
     Raises
     ------
     UserError
-        As of `cluster.run_on_cluster`.
+        As of `cluster.on_cluster`.
     """
     asked = [ClusterPart(part, witness) for part in parts]
-    done = run_on_cluster(
-        address, run_part, asked, lambda number, _: on_progress(len(parts[number].starts))
-    )
+    done = []
+    for part, result in zip(parts, on_cluster(address, run_part, asked), strict=True):
+        done.append(result)
+        on_progress(len(part.starts))
     wanted = digest(witness.run())
     return StudyDone(
         [part.outcomes for part in done],
