@@ -13,6 +13,7 @@ from needle_controller.ros import conversions
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
+from needle_device_driver.supervisor.motion_run import MotionRun
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -53,7 +54,11 @@ def _speed_unlimited(patch: pytest.MonkeyPatch) -> None:
         parameters, create = plan(rig, name, process)
         return parameters | ({"max_speed": 0.02} if name == "device_driver" else {}), create
 
+    advance = MotionRun.advance
     patch.setattr(VirtualRig, "_plan", faster)
+    patch.setattr(
+        MotionRun, "advance", lambda run, at, period, scale: advance(run, at, period, 2.0 * scale)
+    )
 
 
 def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
@@ -111,14 +116,14 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 
 
 PLANTED = {
-    "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 0),
-    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 0),
+    "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 75),
+    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 10),
     "no limit of speed": PlantedBug("none_beyond_limits", _speed_unlimited, 0),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 0),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 0),
     "another unit": PlantedBug("belief_equals_joints", _insertion_in_another_unit, 0),
-    "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 0),
-    "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 0),
-    "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 0),
-    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 0),
+    "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
+    "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 125),
+    "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 5),
+    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 20),
 }

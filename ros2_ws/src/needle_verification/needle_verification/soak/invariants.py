@@ -96,7 +96,7 @@ class Watch:
         self.violations: list[Violation] = []
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
-        self._pressed_since = -1.0
+        self._pressed_since = self._other_since = -1.0
         self._holds = False
         self._must_press_after = 0.0
         self._status: Mapping[str, str] = {}
@@ -131,8 +131,9 @@ class Watch:
 
     def see_other_hold(self, at: float) -> None:
         """Take that somebody else pressed: from outside that is a hold like any other."""
+        if at - self._other_until > self._release_bound:
+            self._other_since = at
         self._other_until = at
-        self._pressed_since = max(self._pressed_since, at)
 
     def see_device(self, at: float, values: Mapping[str, str]) -> None:
         """Take a device/status as it is published."""
@@ -253,11 +254,12 @@ class Watch:
                 at,
                 f"motion {idle:.3f} s after the last moment in which anybody held and said so",
             )
-        if begins and self._pressed_since < self._must_press_after:
+        since = max(self._pressed_since, self._other_since)
+        if begins and since < self._must_press_after:
             self.violate(
                 "no_motion_by_itself",
                 at,
-                f"motion by a press of {self._pressed_since:.3f} s, from before "
+                f"motion by a press of {since:.3f} s, from before "
                 f"{self._must_press_after:.3f} s, when the device became ready",
             )
 
