@@ -40,7 +40,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    if not TOOLS.is_dir():
+    if not (TOOLS / ".needle-docs").is_file():
         pytest.skip("Sphinx is not installed: scripts/docs does it")
     out = tmp_path_factory.mktemp("docs") / "site"
     done = subprocess.run(
