@@ -13,12 +13,10 @@ from needle_controller.ros import conversions
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
-from needle_device_driver.supervisor.motion_run import MotionRun
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.ros.soak.virtual_rig import VirtualRig
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -47,18 +45,15 @@ def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Hold, "receive", armed)
 
 
-def _speed_unlimited(patch: pytest.MonkeyPatch) -> None:
-    plan = VirtualRig._plan
+def _screw_of_twice_the_lead(patch: pytest.MonkeyPatch) -> None:
+    axes = EmulatedBus.axes
 
-    def faster(rig: VirtualRig, name: str, process: Any) -> Any:
-        parameters, create = plan(rig, name, process)
-        return parameters | ({"max_speed": 0.02} if name == "device_driver" else {}), create
+    def doubled(bus: EmulatedBus, now: float) -> dict[str, AxisState]:
+        true = axes(bus, now)
+        along = true["insertion"]
+        return true | {"insertion": AxisState(2.0 * along.position, 2.0 * along.velocity)}
 
-    advance = MotionRun.advance
-    patch.setattr(VirtualRig, "_plan", faster)
-    patch.setattr(
-        MotionRun, "advance", lambda run, at, period, scale: advance(run, at, period, 2.0 * scale)
-    )
+    patch.setattr(EmulatedBus, "axes", doubled)
 
 
 def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
@@ -118,9 +113,9 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 75),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 10),
-    "no limit of speed": PlantedBug("none_beyond_limits", _speed_unlimited, 0),
-    "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 0),
-    "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 0),
+    "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
+    "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
+    "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 5),
     "another unit": PlantedBug("belief_equals_joints", _insertion_in_another_unit, 0),
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 125),

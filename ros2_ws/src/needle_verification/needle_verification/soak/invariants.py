@@ -26,8 +26,9 @@ _STATUS_LAG = 0.15
 _SPEED_ROOM, _PLACE_ROOM = 1.0 + 3 * 0.02 / 0.1, 0.0011
 # The controller knows of a motion when its next tip has come: two steps.
 _BELIEF = 0.0045
-# A needle may still be on its way by one of so many commands.
-_COMMANDS = 4
+# A needle may still be on its way by one of so many commands: a path ends when its tip is 2 s old,
+# also where newer ones were refused, and tips come 20 times a second.
+_COMMANDS = 50
 # Farther in than commanded [m], and farther turned than the part of the way that was made wants
 # [rad]: a rotation drive falls silent at 3 rad/s, and insertion goes on until that is noticed.
 _BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5

@@ -25,7 +25,7 @@ def test_an_undisturbed_run_converges_and_a_seed_gives_one_run() -> None:
     assert run(20, []).digest == one.digest
 
 
-@pytest.mark.parametrize("seed", [4, 7])
+@pytest.mark.parametrize("seed", range(2, 14))
 def test_faults_violate_nothing(seed: int) -> None:
     result = run(seed, schedule_of(seed))
     assert result.faults
