@@ -236,21 +236,30 @@ def _check_bounds(
             f"insertion {back.leg.insertion * 1e3:.4g} mm is not ahead of the point before, "
             f"{back.start[0] * 1e3:.4g} mm",
         )
-    # Who commands counts from where the axes are, which may be beside where they were told to be,
-    # and a message's times are whole nanoseconds. The motion itself is held to both bounds.
-    speed = max((piece.length - limits.insertion_tolerance) / piece.leg.duration for piece in way)
+    # Who commands counts from where the axes are, which may be beside where they were told to be by
+    # their tolerance, and a message's times are whole nanoseconds. The motion itself is held to the
+    # bounds of speed and rate.
+    beside, askew = limits.insertion_tolerance, limits.rotation_tolerance
+    speed = max((piece.length - beside) / piece.leg.duration for piece in way)
     rotation = max(abs(piece.leg.rotation - context.rotation) for piece in way)
-    rate = max((piece.turn - limits.rotation_tolerance) / piece.leg.duration for piece in way)
+    rate = max((piece.turn - askew) / piece.leg.duration for piece in way)
     turns = max(abs(piece.leg.rotation) for piece in way) / (2 * math.pi)
     bounded = (
-        (Rule.MAX_DEPTH, "depth", end * 1e3, limits.max_depth * 1e3, "mm"),
-        (Rule.MAX_STEP_LENGTH, "step", length * 1e3, limits.max_step_length * 1e3, "mm"),
-        (Rule.MAX_SPEED, "speed", speed * 1e3, limits.max_speed * 1e3, "mm/s"),
-        (Rule.MAX_ROTATION_STEP, "rotation", rotation, limits.max_rotation_step, "rad"),
-        (Rule.MAX_ROTATION_RATE, "rotation rate", rate, limits.max_rotation_rate, "rad/s"),
-        (Rule.MAX_TURNS, "accumulated rotation", turns, limits.max_turns, "turns"),
+        (Rule.MAX_DEPTH, "depth", end * 1e3, limits.max_depth * 1e3, 0.0, "mm"),
+        (
+            Rule.MAX_STEP_LENGTH,
+            "step",
+            length * 1e3,
+            limits.max_step_length * 1e3,
+            beside * 1e3,
+            "mm",
+        ),
+        (Rule.MAX_SPEED, "speed", speed * 1e3, limits.max_speed * 1e3, 0.0, "mm/s"),
+        (Rule.MAX_ROTATION_STEP, "rotation", rotation, limits.max_rotation_step, askew, "rad"),
+        (Rule.MAX_ROTATION_RATE, "rotation rate", rate, limits.max_rotation_rate, 0.0, "rad/s"),
+        (Rule.MAX_TURNS, "accumulated rotation", turns, limits.max_turns, 0.0, "turns"),
     )
-    for rule, name, value, bound, unit in bounded:
-        if value > bound * _ROUNDING:
+    for rule, name, value, bound, room, unit in bounded:
+        if value > (bound + room) * _ROUNDING:
             return Refusal(rule, f"{name} {value:.6g} {unit} is beyond {bound:.6g} {unit}")
     return None

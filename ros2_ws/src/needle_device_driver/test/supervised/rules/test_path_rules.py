@@ -121,8 +121,17 @@ def test_command_state_a_step_never_takes_the_place_of_a_path_nor_a_path_of_a_st
 
 def test_max_step_length_bounds_how_far_ahead_a_path_ends(bench: Bench) -> None:
     bench.ready()
-    path(bench, (0.0, 0.0), (1.0, 0.0), (2.001, 0.0))
+    path(bench, (0.0, 0.0), (1.0, 0.0), (2.006, 0.0))
     refused(bench, Rule.MAX_STEP_LENGTH)
+
+
+def test_max_step_length_takes_a_path_from_where_the_axes_rest_beside_their_set_points(
+    bench: Bench,
+) -> None:
+    bench.ready()
+    rest = bench.limits.insertion_tolerance * 1e3
+    path(bench, (rest, 0.0), (1.0 + rest, 0.0), (2.0 + rest, 0.0))
+    assert in_state(bench, State.MOVING)
 
 
 def test_max_step_length_no_path_outlives_its_commands_by_more(bench: Bench) -> None:
