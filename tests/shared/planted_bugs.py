@@ -71,14 +71,15 @@ def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(DeviceCore, "fail", lambda core, _, rule=None: fail(core, "", rule))
 
 
-def _insertion_in_another_unit(patch: pytest.MonkeyPatch) -> None:
-    convert = conversions.to_joint_sample
+def _insertion_told_too_deep(patch: pytest.MonkeyPatch) -> None:
+    convert = conversions.to_diagnostic
 
-    def scaled(*message: Any) -> Any:
-        sample = convert(*message)
-        return dataclasses.replace(sample, insertion=1.1 * sample.insertion)
+    def scaled(steering: Any, preset: str) -> Any:
+        diagnostic = convert(steering, preset)
+        told = {"insertion_m": repr(1.1 * steering.insertion)}
+        return dataclasses.replace(diagnostic, values={**diagnostic.values, **told})
 
-    patch.setattr(conversions, "to_joint_sample", scaled)
+    patch.setattr(conversions, "to_diagnostic", scaled)
 
 
 def _rotation_wired_the_wrong_way(patch: pytest.MonkeyPatch) -> None:
@@ -116,7 +117,7 @@ PLANTED = {
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 5),
-    "another unit": PlantedBug("belief_equals_joints", _insertion_in_another_unit, 0),
+    "an insertion told too deep": PlantedBug("belief_equals_joints", _insertion_told_too_deep, 1),
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 125),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 5),
