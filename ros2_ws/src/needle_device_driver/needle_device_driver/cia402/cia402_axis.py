@@ -350,11 +350,14 @@ class Cia402Axis(Axis):
             self._origin += 1
         self.monitor.begin_set_up()
         self.missing_optional_objects = set_up(
-            self._link, self._settings, period=self._period, homed=self._homed
+            self._link, self.monitor, self._settings, period=self._period, homed=self._homed
         )
         self._limits_due = False
         await_start(self._link, self.monitor, self._settings, self._period)
         arm_watchdog(self._link, self._settings, self._watchdog)
+        if self.monitor.rebooted:
+            # What it was told before is gone.
+            raise DriveError(f"node {self._settings.node_id} started anew while it was set up")
         self.monitor.end_set_up()
         self._opening = self._link.openings
         self._refresh()

@@ -146,6 +146,10 @@ class DriveMonitor:
         with self._lock:
             self._watching = False
             self._heartbeats = 0
+
+    def forget_start(self) -> None:
+        """Take note that the node answers: a start that it tells of from now on is another one."""
+        with self._lock:
             self.rebooted = False
 
     def end_set_up(self) -> None:
@@ -228,7 +232,7 @@ class DriveMonitor:
         self._heartbeat_time = time
         # The upper bit toggles in the older protocol, node guarding.
         self._nmt_state = state & 0x7F
-        if self._nmt_state == NMT_BOOT_UP and self._watching:
+        if self._nmt_state == NMT_BOOT_UP:
             self.rebooted = True
 
     def _on_emergency(self, data: bytes, _: float) -> None:

@@ -11,6 +11,7 @@ from needle_device_driver.cia402.cia402 import (
     DriveCommand,
     drive_state,
 )
+from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
 from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
 from needle_device_driver.link import objects as od
@@ -39,7 +40,7 @@ class _Need(enum.Enum):
 
 
 def set_up(
-    link: CanLink, settings: DriveSettings, *, period: float, homed: bool
+    link: CanLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
 ) -> tuple[str, ...]:
     """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
 
@@ -47,6 +48,8 @@ def set_up(
     ----------
     link : CanLink
         The bus, open.
+    monitor : DriveMonitor
+        The drive's; a start that it hears of once the drive has answered voids the set-up.
     settings : DriveSettings
         What the drive shall be.
     period : float
@@ -70,6 +73,7 @@ def set_up(
     access = ObjectAccess(link, node)
     link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
     profile = access.read(od.DEVICE_TYPE) & 0xFFFF
+    monitor.forget_start()
     if profile != od.CIA402:
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
     # Not while this set-up keeps the loop from its heartbeat.

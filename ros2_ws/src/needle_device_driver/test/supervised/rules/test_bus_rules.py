@@ -7,7 +7,9 @@ from collections.abc import Callable
 import can
 import pytest
 
+from needle_device_driver.cia402 import drive_setup
 from needle_device_driver.link.can_link import LinkError
+from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import State
 
@@ -315,6 +317,34 @@ def test_drive_reboot_during_the_set_up_of_a_reset_is_not_forgotten(
     assert in_state(bench, State.FAULT)
     assert bench.supervisor.reset(bench.clock()).success
     assert not bench.status.homed
+
+
+def test_drive_reboot_within_its_set_up_voids_it(
+    drive_bench: DriveBench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = drive_bench
+    bench.homed()
+    silence, reboots = drive_setup.silence_unused, [True]
+
+    def reboots_once(access: ObjectAccess) -> None:
+        if reboots:
+            reboots.clear()
+            bench.insertion.reboot()
+            bench.bus.flush()
+        silence(access)
+
+    monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
+    bench.insertion.reboot()
+    bench.bus.flush()
+    bench.cycle(1)
+    assert in_state(bench, State.FAULT)
+    # What it was told before it started anew is gone: only a whole set-up counts.
+    refused = bench.supervisor.reset(bench.clock())
+    assert not refused.success
+    assert "started anew while it was set up" in refused.message
+    assert bench.supervisor.reset(bench.clock()).success
+    bench.cycle(5)
+    assert in_state(bench, State.DISABLED)
 
 
 def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
