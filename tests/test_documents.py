@@ -21,6 +21,8 @@ from needle_tracker.calibrating.calibration_session import parse_session
 from typed_pages import PAGES, ROOT, PageError, Session, blocks
 
 SHORT_MM = 6
+# From which a curvature is told.
+ARC_MM = 12
 FREE_VIEWS = 12
 SHARED = ("README.md", "docs", "ros2_ws")
 
@@ -64,10 +66,12 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
             # not busy. Without the right to go first it goes with the rest.
             return f"nice -n -10 {command}"
         if "pip install" in command:
-            # A link into the environment would stay behind.
-            return f"cp -rL docs/examples {scratch}; {command}".replace(
-                "--editable docs/examples", f"{scratch}/examples"
-            )
+            # A link into the environment would stay behind: a copy, whose modules are links.
+            folder = command.split()[-1]
+            name = Path(folder).name
+            copied = command.replace(f"--editable {folder}", f"{scratch}/{name}")
+            linked = f"rm -r {scratch}/own/{name}; ln -s $PWD/{folder}/{name} {scratch}/own/"
+            return f"cp -rL {folder} {scratch} && {copied} && {linked}"
         if "monte_carlo" in command and "--depth-mm" not in command:
             words, _, _ = command.partition("#")
             return f"{words} --depth-mm {SHORT_MM}"
@@ -76,7 +80,8 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
         if not command.startswith("scripts/simulate"):
             return command
         words, _, _ = command.partition("#")
-        words = re.sub(r"--depth-mm \d+", "", words) + f" --depth-mm {SHORT_MM}"
+        depth = ARC_MM if "--controller open_loop" in words else SHORT_MM
+        words = re.sub(r"--depth-mm \d+", "", words) + f" --depth-mm {depth}"
         words = re.sub(r"--target \S+", f"--target 0,0,{SHORT_MM - 1}", words)
         wanted = re.search(r" --bag (\S+)", words)
         bag = wanted[1] if wanted else f"{scratch}/run_{next(numbers)}"
@@ -198,13 +203,19 @@ six: 1
     assert found == [
         (3, "command", "one\ntwo \\\n    more", "", False),
         (13, "command", "four", "", False),
-        (23, "yaml", "six: 1", "a.yaml", True),
+        (23, "file", "six: 1", "a.yaml", True),
     ]
 
 
 def test_a_yaml_file_without_a_name_cannot_be_typed() -> None:
     with pytest.raises(PageError, match="line 1"):
         blocks("```yaml\na: 1\n```\n")
+
+
+def test_a_fence_with_a_name_is_a_file() -> None:
+    page = "```python a/b.py\nx = 1\n```\n\n```python\nprint(1)\n```\n\n```toml c.toml\n```\n"
+    found = [(block.kind, block.name) for block in blocks(page)]
+    assert found == [("file", "a/b.py"), ("python", ""), ("file", "c.toml")]
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])

@@ -2,9 +2,10 @@
 
     python scripts/lib/typed_pages.py [PAGE ...]       # in a fresh clone, at full length
 
-Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`
-is a file of that name; `text` is not typed. What goes on until Ctrl-C runs until the
-page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block leaves it out.
+Code blocks that are indented, or fenced as `sh`, are commands; `python` is a program; `yaml NAME`,
+`toml NAME` and `python NAME` are files of that name; `text` is not typed. What goes on until
+Ctrl-C runs until the page's end, or `<!-- Ctrl-C -->`. `<!-- not typed: WHY -->` before a block
+leaves it out.
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = (
     "docs/setup.md", "README.md", "bags/README.md", "docs/hardware.md", "docs/calibration.md",
-    "docs/own_controllers.md", "docs/examples/README.md",
+    "docs/own_controllers.md", "docs/examples/README.md", "docs/own_estimator.md",
+    "docs/first_run.md", "docs/own_rig.md", "docs/report_a_problem.md",
 )  # fmt: skip
-COMMAND, PROGRAM, FILE = "command", "python", "yaml"
+COMMAND, PROGRAM, FILE = "command", "python", "file"
+FILES = ("yaml", "toml", "python")
 NOT_TYPED = ("text",)
 # Executables that go on until Ctrl-C, as anything with `--loop`.
 NODES = (
@@ -81,7 +84,7 @@ def blocks(page: str) -> list[Block]:
     Raises
     ------
     PageError
-        For a fence of an unknown kind, or a YAML block without a name.
+        For a fence of an unknown kind, or a file's without a name.
     """
     found = []
     marks: list[str] = []
@@ -103,8 +106,8 @@ def blocks(page: str) -> list[Block]:
         marks.clear()
         if left_out or kind in NOT_TYPED:
             continue
-        known = {"sh": COMMAND, PROGRAM: PROGRAM, FILE: FILE}
-        if kind not in known or (kind == FILE and not name):
+        known = dict.fromkeys(FILES, FILE) if name else {"sh": COMMAND, "python": PROGRAM}
+        if kind not in known:
             raise PageError(f"line {line}: a block of kind '{kind} {name}' cannot be typed")
         found.append(Block(line, known[kind], text, name, ends_nodes))
     return found
@@ -167,7 +170,9 @@ class Session:
         found = blocks(page.read_text("utf-8"))
         for block in found:
             if block.kind == FILE:
-                (self._folder / block.name).write_text(f"{block.text}\n", encoding="utf-8")
+                file = self._folder / block.name
+                file.parent.mkdir(parents=True, exist_ok=True)
+                file.write_text(f"{block.text}\n", encoding="utf-8")
         with tempfile.TemporaryDirectory(prefix="typed_") as logs:
             self._logs = Path(logs)
             self._type_blocks(page, found)
