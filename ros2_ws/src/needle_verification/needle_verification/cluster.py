@@ -23,7 +23,7 @@ from needle_common.errors import UserError
 Part = TypeVar("Part")
 Result = TypeVar("Result")
 
-CONNECTS_WITHIN = 10.0
+CONNECTS_WITHIN = 30.0
 """How long a scheduler has to answer [s]."""
 _RECKONED_WITH = ("numpy", "scipy", "numba")
 _PACKAGES = (
@@ -37,6 +37,8 @@ def on_cluster(
     address: str, work: Callable[[Part], Result], parts: Sequence[Part]
 ) -> Iterator[Result]:
     """Yield the results of `work` on each part, in the order of the parts.
+
+    A connection that is lost is made again, for the parts that are missing.
 
     Parameters
     ----------
@@ -66,35 +68,40 @@ def on_cluster(
         ) from error
     # What it has to say comes as an exception, too.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
-    try:
-        client = distributed.Client(address, timeout=CONNECTS_WITHIN)
-    except OSError as error:
-        raise UserError(f"--scheduler {address}: {_line(error)}") from error
-    with client:
-        run = functools.partial(_run, work, identity())
-        futures = client.map(run, parts, pure=False, batch_size=100)
-        numbers = {future.key: number for number, future in enumerate(futures)}
-        done = distributed.as_completed(futures)
-        futures.clear()
-        # Results that have come before those of parts ahead of them.
-        early: dict[int, Result] = {}
-        told = 0
+    run = functools.partial(_run, work, identity())
+    # Results that have come before those of parts ahead of them.
+    early: dict[int, Result] = {}
+    told = 0
+    while told < len(parts):
+        missing = [number for number in range(told, len(parts)) if number not in early]
         try:
-            for future in done:
-                early[numbers[future.key]] = future.result()
-                # The cluster may forget it.
-                future.release()
-                while told in early:
-                    yield early.pop(told)
-                    told += 1
-        except distributed.KilledWorker as error:
-            raise UserError(
-                f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
-            ) from error
-        except (OSError, distributed.CancelledError) as error:
-            raise UserError(
-                f"--scheduler {address}: lost, with {told} of {len(parts)} parts done"
-            ) from error
+            client = distributed.Client(address, timeout=CONNECTS_WITHIN)
+        except OSError as error:
+            raise UserError(f"--scheduler {address}: {_line(error)}") from error
+        with client:
+            wanted = [parts[number] for number in missing]
+            futures = client.map(run, wanted, pure=False, batch_size=100)
+            numbers = {future.key: n for future, n in zip(futures, missing, strict=True)}
+            done = distributed.as_completed(futures)
+            futures.clear()
+            try:
+                for future in done:
+                    early[numbers[future.key]] = future.result()
+                    # The cluster may forget it.
+                    future.release()
+                    while told in early:
+                        yield early.pop(told)
+                        told += 1
+            except distributed.KilledWorker as error:
+                raise UserError(
+                    f"--scheduler {address}: {_line(error)} (out of memory? their logs say more)"
+                ) from error
+            except (OSError, distributed.CancelledError) as error:
+                # With the connection the scheduler forgets what it was asked for.
+                if told + len(early) == len(parts) - len(missing):
+                    raise UserError(
+                        f"--scheduler {address}: lost, with {told} of {len(parts)} parts done"
+                    ) from error
 
 
 @functools.lru_cache(maxsize=1)

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -130,6 +131,25 @@ def test_a_machine_that_rounds_otherwise_is_named(
 
 
 @NEEDED
+def test_a_lost_connection_is_made_again(
+    two_workers: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import distributed  # noqa: PLC0415
+
+    whole = distributed.as_completed
+
+    def cut(done: Iterator[Any]) -> Iterator[Any]:
+        monkeypatch.setattr(distributed, "as_completed", whole)
+        yield next(done)
+        raise distributed.CancelledError
+
+    monkeypatch.setattr(distributed, "as_completed", lambda futures: cut(whole(futures)))
+    asked = [ClusterPart(part, PARTS[0].of_first(2)) for part in PARTS]
+    done = on_cluster(two_workers.address, run_part, asked)
+    assert [digest(part.outcomes) for part in done] == [digest(part.run()) for part in PARTS]
+
+
+@NEEDED
 def test_a_lost_scheduler_ends_the_study_in_one_line(tmp_path: Path) -> None:
     started = Cluster(tmp_path, 1, "--no-nanny")
     with pytest.raises(UserError, match="lost, with 0 of 1 parts done"):
@@ -143,7 +163,7 @@ def test_a_scheduler_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
     with pytest.raises(UserError, match=f"tcp://127.0.0.1:{port}: Timed out"):
-        list(on_cluster(f"tcp://127.0.0.1:{port}", run_part, []))
+        list(on_cluster(f"tcp://127.0.0.1:{port}", end_every, [None]))
 
 
 def test_without_dask_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
