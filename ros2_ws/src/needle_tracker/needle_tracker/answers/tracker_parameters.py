@@ -136,7 +136,8 @@ class StereoTrackerParameters:
     free_step: float = fixed_parameter(
         5.0e-3,
         "m",
-        "Largest move of the tip per pair where the insertion is not known.",
+        "Largest move of the tip per pair where the insertion is not known, unless both views "
+        "show that it has come since an earlier pair.",
         0.1e-3,
         0.1,
     )

@@ -22,6 +22,8 @@ _EVERY, _LAG = 8, 2
 _LEAST_LEVEL = 1.0
 SURE = 128
 """Of 255: so much of a map is needle."""
+LEAST_NEW = 3.0
+"""So much of the needle must be new for its end to be plain of it [widths]."""
 
 
 class Background:

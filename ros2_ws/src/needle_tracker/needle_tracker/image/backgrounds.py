@@ -7,11 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from needle_tracker.image.background import Background
+from needle_tracker.image.background import LEAST_NEW, Background
 from needle_tracker.image.detection import Image
 from needle_tracker.optics.refraction import RefractedCamera
-
-_LEAST_NEW = 3.0  # so much of the needle must be new for its end to be plain of it [widths]
 
 Pair = tuple[Background, Background]
 
@@ -43,7 +41,7 @@ class Backgrounds:
     ) -> None:
         self._views = views
         self._hole_clearance = hole_clearance
-        self._least_new = _LEAST_NEW * needle_width
+        self._least_new = LEAST_NEW * needle_width
         self._kept: Pair | None = None
         self._insertion = np.inf
         if empty is not None:

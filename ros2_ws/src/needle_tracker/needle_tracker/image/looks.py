@@ -16,13 +16,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.image import detection, tip_fit
-from needle_tracker.image.background import SURE, Background
+from needle_tracker.image.background import LEAST_NEW, SURE, Background
 from needle_tracker.image.detection import DetectionSettings, Image, Path
 from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end, hidden_sigma
 from needle_tracker.image.needle_map import TILE, Box, Mask, NeedleMap, tile_counts
 from needle_tracker.image.search_grid import SearchGrid
 from needle_tracker.image.tip_fit import HIDDEN_END_PX, HIDDEN_FACTOR, Expected, ImageTip
 
+Array = NDArray[np.float64]
 Rows = tuple[int, int] | None
 """First and last row of a grid in which a path may end; None: any."""
 
@@ -121,12 +122,26 @@ class MapLook:
         before = self._map_before.draw(background.before, box, there)
         return background.joined(self._map.draw(image, box, tiles), new, before)
 
-    def _beyond_seam(self, image: Image, point: NDArray[np.float64]) -> float:
+    def _beyond_seam(self, image: Image, point: Array) -> float:
         """Return how far a point is beyond where the map is put together [px]."""
         background = self.background
         if background is None or background.difference(image) is None:
             return -math.inf
         return background.beyond_seam(point)
+
+    def _has_come(self, image: Image, point: Array, direction: Array, width: float) -> bool:
+        """Return whether there was nothing like the needle's end in an earlier image."""
+        background = self.background
+        if background is None:
+            return False
+        if background.difference(image) is not None:
+            return background.beyond_seam(point) > width
+        begin = point - LEAST_NEW * width * direction
+        low, high = np.minimum(begin, point) - width, np.maximum(begin, point) + width + 1.0
+        box = (int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
+        before = self._map_before.draw(background.before, box)
+        there = before[max(box[1], 0) : box[3], max(box[0], 0) : box[2]]
+        return bool(there.max(initial=0) < 255.0 * _SURE_ENOUGH)
 
     def find_paths(
         self,
@@ -186,7 +201,8 @@ class MapLook:
         height, wide = image.shape
         if sure < _SURE_ENOUGH or not (2.0 <= u <= wide - 3.0 and 2.0 <= v <= height - 3.0):
             return None
-        point, hidden = np.array([u, v]), hidden_sigma(along, self._bevel_length_px)
+        point, direction = np.array([u, v]), np.array([d_u, d_v])
+        hidden = hidden_sigma(along, self._bevel_length_px)
         along = math.hypot(along, _END_SYSTEMATIC * width)
         across = math.hypot(across, _LINE_SYSTEMATIC * width)
         clear = inside > _CLEAR_INSIDE and along < CLEAR_WIDTHS * width
@@ -199,7 +215,7 @@ class MapLook:
             return None
         return ImageTip(
             point=point,
-            direction=np.array([d_u, d_v]),
+            direction=direction,
             sigma_across=across * (1.0 if clear else HIDDEN_FACTOR),
             sigma_along=math.hypot(hidden, _END_SYSTEMATIC * width) if clear else HIDDEN_END_PX,
             sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC / LINE_WIDTHS),
@@ -208,7 +224,7 @@ class MapLook:
             clear=clear,
             bright=True,
             allowance=_ALLOWANCE * width,
-            come=beyond > width,
+            come=self._has_come(image, point, direction, width),
         )
 
 

@@ -27,7 +27,6 @@ from needle_tracker.optics.calibration import SIDES
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
-    has_come,
     is_half_sound,
     is_sound,
     look_alike,
@@ -285,25 +284,19 @@ class Acquisition:
         alike = self._usual.is_like(found)
         if tip is not None and track.is_excluded(tip, insertion):
             return sights_to_exclude(track.state, found, alike=alike)
+        come = insertion is None
         if measured.tip is None:
-            refused = measured.reason in (
-                NoTip.TOO_FAR,
-                NoTip.SURPRISING,
-                NoTip.UNCERTAIN,
-            )
-            return (
-                sights_to_contradict(track.state, found, alike=alike, on_way=on_way)
-                if refused
-                else 0
-            )
-        if track.fits(measured.tip, insertion, on_way=False):
-            return 0
-        if self._is_borne_out(measured.tip, found, insertion, on_way=on_way):
+            if measured.reason not in (NoTip.TOO_FAR, NoTip.SURPRISING, NoTip.UNCERTAIN):
+                return 0
+            come = come and measured.reason == NoTip.TOO_FAR
+            return sights_to_contradict(track.state, found, alike=alike, on_way=on_way, come=come)
+        if (
+            track.fits(measured.tip, insertion, on_way=False)
+            or self._is_borne_out(measured.tip, found, insertion, on_way=on_way)
+            or self._begins_at_entry(measured, insertion)
+        ):
             return 0
         near = on_way and track.fits(measured.tip, insertion, on_way=True)
-        come = insertion is None and has_come(found)
-        if come or self._begins_at_entry(measured, insertion):
-            return 0
         return sights_to_confirm(
             track.state,
             measured.image_tips,
@@ -311,6 +304,7 @@ class Acquisition:
             possible=self._usual.allows(found),
             near=near,
             guided=guided,
+            come=come,
         )
 
     def _is_borne_out(

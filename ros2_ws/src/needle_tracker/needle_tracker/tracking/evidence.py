@@ -155,7 +155,9 @@ def _hardly_known(tip: ImageTip) -> ImageTip:
     return dataclasses.replace(tip, sigma_across=math.hypot(tip.sigma_across, unlike))
 
 
-def sights_to_contradict(state: TrackState, found: Found, *, alike: bool, on_way: bool) -> int:
+def sights_to_contradict(
+    state: TrackState, found: Found, *, alike: bool, on_way: bool, come: bool
+) -> int:
     """Return how many sights in a row win against a track that contradicts them; 0 where none do.
 
     Parameters
@@ -168,7 +170,12 @@ def sights_to_contradict(state: TrackState, found: Found, *, alike: bool, on_way
         Whether the needle stands out as it did.
     on_way : bool
         Whether it lies where its tip has been.
+    come : bool
+        Whether nothing but the last place, without the insertion, speaks against an end that has
+        come: a needle goes as far between two pairs as it likes.
     """
+    if come and has_come(found):
+        return 1
     # While the needle is followed, what looks unlike it is what lies beside or over it.
     unlike = state is TrackState.TRACKING and not alike
     if unlike or not is_sound(found, SOUND_PX, _NEAR_ALONG_PX):
@@ -194,7 +201,14 @@ def sights_to_exclude(state: TrackState, found: Found, *, alike: bool) -> int | 
 
 
 def sights_to_confirm(
-    state: TrackState, found: Found, *, alike: bool, possible: bool, near: bool, guided: bool
+    state: TrackState,
+    found: Found,
+    *,
+    alike: bool,
+    possible: bool,
+    near: bool,
+    guided: bool,
+    come: bool,
 ) -> int | None:
     """Return how many sights in a row are wanted of a tip that nothing contradicts.
 
@@ -212,13 +226,15 @@ def sights_to_confirm(
         Whether it lies on the needle's way, and where it should have got to.
     guided : bool
         Whether one view's end was found from what the other shows and the needle's way.
+    come : bool
+        Whether nothing says how far the needle goes but an end that has come.
 
     Returns
     -------
     int or None
         0 where one will do, None where it is not seen well enough for any number.
     """
-    if near and alike and is_sound(found, _NEAR_PX, _NEAR_ALONG_PX):
+    if (near and alike and is_sound(found, _NEAR_PX, _NEAR_ALONG_PX)) or (come and has_come(found)):
         return 0
     more = 0 if alike else _MORE_UNLIKE
     if is_sound(found, SOUND_PX, SOUND_ALONG_PX):

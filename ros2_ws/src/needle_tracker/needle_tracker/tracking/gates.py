@@ -35,7 +35,8 @@ class GateSettings:
     step_margin : float
         Tolerance of the tip against where the last one and the insertion have it [m].
     free_step : float
-        Largest move per pair where the insertion is not known [m].
+        Largest move per pair where the insertion is not known [m]; an end that has come may be
+        anywhere.
     max_disagreement : float
         Largest disagreement of the views along the needle [m].
     max_miss_px : float

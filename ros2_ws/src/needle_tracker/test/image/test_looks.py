@@ -49,21 +49,31 @@ def test_a_box_may_hide_where_a_needle_enters_as_long_as_most_of_it_is_seen(
     assert any(ends) is seen
 
 
-def paper(end: int, seed: int) -> np.ndarray:
-    """Draw a needle from the left over graph paper, up to a column."""
-    image = np.full((240, 320), 150.0, np.float32)
-    for at in range(10, 320, 20):
+def drawn(end: int, seed: int, *, paper: bool) -> np.ndarray:
+    """Draw a needle from the left over graph paper, or a wide plain floor, up to a column."""
+    image = np.full((240 if paper else 1600, 320), 150.0, np.float32)
+    for at in range(10, 320, 20) if paper else ():
         cv2.line(image, (at, 0), (at, 239), 60.0, 2)
         cv2.line(image, (0, at), (319, at), 60.0, 2)
     cv2.line(image, (0, 121), (end, 121), 20.0, 5, cv2.LINE_AA)
-    image += np.random.default_rng(seed).normal(0.0, 2.0, image.shape)
+    image += np.random.default_rng(seed).normal(0.0, 2.0 if paper else 5.0, image.shape)
     return np.asarray(np.clip(image, 0.0, 255.0), np.uint8)
 
 
-@pytest.mark.parametrize(("before", "now", "come"), [(100, 200, True), (200, 100, False)])
-def test_a_needle_that_was_drawn_out_has_not_come(before: int, now: int, come: bool) -> None:
+@pytest.mark.parametrize("paper", [True, False])
+@pytest.mark.parametrize(
+    ("before", "now", "come"),
+    [(100, 200, True), (200, 100, False), (200, 200, False), (193, 200, False)],
+)
+def test_a_needle_has_come_where_there_was_none_of_it(
+    before: int, now: int, come: bool, paper: bool
+) -> None:
     look = MapLook(WIDTH_PX, 0.0)
-    look.background = Background(paper(before, 1), np.array([0.0, 121.0]), 3.0 * WIDTH_PX)
-    expected = Expected(np.array([200.0, 121.0]), np.array([1.0, 0.0]), 150.0, 6, 0.0, 0.0)
-    found = look.fit(paper(now, 2), expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
+    earlier = drawn(before, 1, paper=paper)
+    look.background = Background(earlier, np.array([0.0, 121.0]), 3.0 * WIDTH_PX)
+    point = np.array([float(now), 121.0])
+    expected = Expected(point, np.array([1.0, 0.0]), 90.0, 6, 0.0, 0.0)
+    image = drawn(now, 2, paper=paper)
+    assert (look.background.difference(image) is None) is not paper
+    found = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
     assert (found is not None and found.come) is come

@@ -54,14 +54,27 @@ def established(settings: TrackerSettings) -> Track:
 
 @pytest.mark.parametrize("state", [TrackState.TRACKING, TrackState.LOST])
 def test_what_contradicts_the_track_must_be_seen_again(state: TrackState) -> None:
-    assert sights_to_contradict(state, (GOOD, GOOD), alike=True, on_way=True) > 1
-    unlike = sights_to_contradict(state, (GOOD, GOOD), alike=False, on_way=True)
+    contradicting = functools.partial(sights_to_contradict, state, on_way=True, come=False)
+    assert contradicting((GOOD, GOOD), alike=True) > 1
+    unlike = contradicting((GOOD, GOOD), alike=False)
     assert unlike == (0 if state is TrackState.TRACKING else 3)
     long = dataclasses.replace(GOOD, sigma_along=2.5)
-    assert sights_to_contradict(state, (long, GOOD), alike=True, on_way=True) > 1
+    assert contradicting((long, GOOD), alike=True) > 1
     longer = dataclasses.replace(GOOD, sigma_along=3.5)
     for found in ((GOOD, hidden(GOOD)), (POOR, GOOD), (longer, GOOD), (GOOD, None)):
-        assert sights_to_contradict(state, found, alike=True, on_way=True) == 0
+        assert contradicting(found, alike=True) == 0
+
+
+@pytest.mark.parametrize("state", list(TrackState))
+def test_only_an_end_that_has_come_wins_in_one_sight_against_the_last_place(
+    state: TrackState,
+) -> None:
+    new = dataclasses.replace(GOOD, come=True)
+    contradicting = functools.partial(sights_to_contradict, state, alike=True, on_way=False)
+    assert contradicting((new, new), come=True) == 1
+    assert contradicting((new, new), come=False) > 1
+    for found in ((new, GOOD), (new, hidden(new)), (new, None)):
+        assert contradicting(found, come=True) != 1
 
 
 def test_how_badly_a_line_may_be_known_grows_with_what_is_allowed_it() -> None:
@@ -92,7 +105,7 @@ def test_what_has_come_is_new_in_both_views_and_seen_in_both() -> None:
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
     lost = TrackState.LOST
-    waiting = functools.partial(sights_to_confirm, possible=True, guided=False)
+    waiting = functools.partial(sights_to_confirm, possible=True, guided=False, come=False)
     assert waiting(lost, (GOOD, GOOD), alike=True, near=True) == 0
     assert waiting(lost, (GOOD, GOOD), alike=True, near=False) == 2
     assert waiting(lost, (GOOD, GOOD), alike=False, near=True) == 3
@@ -103,7 +116,7 @@ def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
 
 
 def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
-    waiting = functools.partial(sights_to_confirm, alike=False, near=True, guided=False)
+    waiting = functools.partial(sights_to_confirm, alike=False, near=True, guided=False, come=False)
     for state in (TrackState.TRACKING, TrackState.CONFIRMING):
         assert waiting(state, (GOOD, GOOD), possible=True) == 0
         assert waiting(state, (GOOD, GOOD), possible=False) == 2
@@ -166,7 +179,9 @@ def test_a_line_that_is_unlike_and_disturbed_may_be_half_another_s(plainer: floa
 
 def test_one_end_that_leads_to_the_other_is_believed_the_second_time() -> None:
     found = (GOOD, dataclasses.replace(GOOD, sigma_across=0.4, sigma_along=3.0))
-    waiting = functools.partial(sights_to_confirm, alike=True, possible=True, near=False)
+    waiting = functools.partial(
+        sights_to_confirm, alike=True, possible=True, near=False, come=False
+    )
     for state in (TrackState.TRACKING, TrackState.LOST):
         assert waiting(state, found, guided=True) == 2
         assert waiting(state, found, guided=False) != 2

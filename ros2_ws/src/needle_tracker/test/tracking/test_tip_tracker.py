@@ -66,6 +66,23 @@ def test_a_needle_that_mirrors_a_lamp_is_found_where_lines_show_none(
     assert found >= 6
 
 
+def test_without_the_insertion_a_needle_may_go_far_between_two_pairs(
+    calibration: StereoCalibration,
+    views: Views,
+    make_arc: MakeArc,
+    make_line: Callable[..., np.ndarray],
+) -> None:
+    settings = default_settings(calibration)
+    tracker = TipTracker(calibration, settings)
+    for mm in range(40, 100, 9):
+        assert settings.gates.free_step < 9e-3
+        path = make_arc(1e-3 * mm, 6.0, 0.7)
+        tip = tracker.process(*mirroring(views, make_line, path, mm), None).tip
+        if mm > 40:
+            assert tip is not None
+            assert np.linalg.norm(tip.position - path[-1]) < 0.5e-3
+
+
 def test_a_plain_needle_is_measured_by_its_lines(
     calibration: StereoCalibration,
     settings: TrackerSettings,
