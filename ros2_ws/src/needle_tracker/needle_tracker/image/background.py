@@ -78,7 +78,7 @@ class Background:
             self._image, self._difference = image, difference if smoother and not itself else None
         return self._difference
 
-    def joined(self, whole: Image, new: Image, before: Image) -> Image:
+    def joined(self, whole: Image, new: Image, before: Image, within: tuple[slice, slice]) -> Image:
         """Return a map of the needle from that of the image and that of the difference.
 
         Where the needle was before, it may hardly differ.
@@ -88,26 +88,33 @@ class Background:
         whole, new, before : ndarray of uint8, shape (height, width)
             Maps of the image, of the difference, and of the image before: that matters only where
             the difference is needle.
+        within : pair of slice
+            Rows and columns that hold all that is drawn of the first two.
         """
-        self._seam = self._begin(whole, new, before)
+        away, part = self._away[within], (whole[within], new[within])
+        self._seam = self._begin(away, *part, before[within])
         if self._seam is None:
             return whole
-        return np.where(self._away < self._seam, np.maximum(whole, new), new)
+        joined = np.zeros_like(new)
+        joined[within] = np.where(away < self._seam, np.maximum(*part), part[1])
+        return joined
 
-    def _begin(self, whole: Image, new: Image, before: Image) -> float | None:
+    def _begin(
+        self, away: NDArray[np.float32], whole: Image, new: Image, before: Image
+    ) -> float | None:
         """Return where the farthest part of the needle begins that is new; None where none is.
 
         What the difference shows and the image before showed better is a needle that has gone.
         """
         least = self._least_new or 0.0
         there = new > SURE
-        away = self._away[there].astype(np.int64)
+        distances = away[there].astype(np.int64)
         come = whole[there].astype(np.int64) - before[there]
-        occupied = np.flatnonzero(np.bincount(away))
+        occupied = np.flatnonzero(np.bincount(distances))
         runs = np.split(occupied, np.flatnonzero(np.diff(occupied) > 0.5 * least) + 1)
         for run in reversed(runs):
             if len(run) and run[-1] - run[0] >= least:
-                inside = (away >= run[0]) & (away <= run[-1])
+                inside = (distances >= run[0]) & (distances <= run[-1])
                 return float(run[0]) if come[inside].sum() > 0 else None
         return None
 
@@ -149,6 +156,11 @@ def _mean(image: Image) -> float:
 
 def _roughness(image: Image) -> float:
     """Return how much brightness varies over a few pixels [grey levels squared]."""
-    rows, columns = image[::_EVERY].astype(np.float32), image[:, ::_EVERY].astype(np.float32)
-    across, down = rows[:, _LAG:] - rows[:, :-_LAG], columns[_LAG:] - columns[:-_LAG]
-    return float(np.mean(across * across) + np.mean(down * down))
+    rows, columns = image[::_EVERY], np.ascontiguousarray(image[:, ::_EVERY])
+    return sum(
+        cv2.norm(one, other, cv2.NORM_L2SQR) / one.size
+        for one, other in (
+            (rows[:, _LAG:], rows[:, :-_LAG]),
+            (columns[_LAG:], columns[:-_LAG]),
+        )
+    )

@@ -116,11 +116,12 @@ class MapLook:
         new = self._map_of_difference.draw(difference, box, tiles)
         if background.is_empty:
             return new
-        rows, columns = np.nonzero(new > SURE)
+        within = self._map_of_difference.drawn
+        rows, columns = np.nonzero(new[within] > SURE)
         there = np.zeros(tile_counts(image), np.bool_)
-        there[rows // TILE, columns // TILE] = True
+        there[(rows + within[0].start) // TILE, (columns + within[1].start) // TILE] = True
         before = self._map_before.draw(background.before, box, there)
-        return background.joined(self._map.draw(image, box, tiles), new, before)
+        return background.joined(self._map.draw(image, box, tiles), new, before, within)
 
     def _beyond_seam(self, image: Image, point: Array) -> float:
         """Return how far a point is beyond where the map is put together [px]."""

@@ -96,6 +96,17 @@ class NeedleMap:
             self._drawn[top:bottom, left:right] = True
         return self._map
 
+    @property
+    def drawn(self) -> tuple[slice, slice]:
+        """Rows and columns of the map that hold all that is drawn of the latest image."""
+        rows, columns = (np.flatnonzero(self._drawn.any(axis=axis)) for axis in (1, 0))
+        if not len(rows):
+            return slice(0, 0), slice(0, 0)
+        return (
+            slice(int(rows[0]) * TILE, (int(rows[-1]) + 1) * TILE),
+            slice(int(columns[0]) * TILE, (int(columns[-1]) + 1) * TILE),
+        )
+
     def _look(self, image: Image, box: Box) -> Image:
         """Return the map of a box."""
         scale = self._scale

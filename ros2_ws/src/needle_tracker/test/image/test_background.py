@@ -11,6 +11,7 @@ Image = NDArray[np.uint8]
 SHAPE = (240, 320)
 ENTRY = np.array([20.0, 120.0])
 NEW = 14.0
+EVERYWHERE = (slice(None), slice(None))
 
 
 def floor(seed: int, *, lines: bool, light: float = 1.0, needle: bool = False) -> Image:
@@ -72,7 +73,7 @@ def test_beyond_what_is_new_there_is_no_needle_though_it_is_not_known_where_it_w
     background = Background(floor(1, lines=True), ENTRY, NEW)
     # To the map of the image, a line of the paper goes on from the needle's end.
     whole, before = line_map(25, 300), line_map(25, 180)
-    joined = background.joined(whole, line_map(180, 220), before)
+    joined = background.joined(whole, line_map(180, 220), before, EVERYWHERE)
     assert (joined[120, 25:220] > 128).all()
     assert not joined[:, 222:].any()
     assert background.beyond_seam(np.array([182.0, 120.0])) == pytest.approx(2.0, abs=1.0)
@@ -83,7 +84,7 @@ def test_beyond_what_is_new_there_is_no_needle_though_it_is_not_known_where_it_w
 def test_too_little_that_is_new_says_nothing() -> None:
     background = Background(floor(1, lines=True), ENTRY, NEW)
     whole = line_map(25, 300)
-    joined = background.joined(whole, line_map(180, 190), line_map(25, 180))
+    joined = background.joined(whole, line_map(180, 190), line_map(25, 180), EVERYWHERE)
     assert (joined == whole).all()
     assert background.beyond_seam(np.array([182.0, 120.0])) == -np.inf
 
@@ -91,5 +92,19 @@ def test_too_little_that_is_new_says_nothing() -> None:
 def test_where_a_needle_has_gone_nothing_is_new() -> None:
     background = Background(floor(1, lines=True), ENTRY, NEW)
     whole = line_map(25, 180)
-    joined = background.joined(whole, line_map(180, 220), line_map(25, 220))
+    joined = background.joined(whole, line_map(180, 220), line_map(25, 220), EVERYWHERE)
     assert (joined == whole).all()
+
+
+@pytest.mark.parametrize("gone", [False, True])
+def test_what_was_not_drawn_need_not_be_looked_at(*, gone: bool) -> None:
+    before = line_map(25, 220 if gone else 180)
+    whole, new = line_map(25, 180 if gone else 230), line_map(180, 220)
+    joined, seams = [], []
+    for within in (EVERYWHERE, (slice(112, 128), slice(16, 240))):
+        background = Background(floor(1, lines=True), ENTRY, NEW)
+        joined.append(background.joined(whole, new, before, within))
+        seams.append(background.beyond_seam(np.array([200.0, 120.0])))
+    assert (joined[0] == joined[1]).all()
+    assert joined[0].any()
+    assert seams[0] == seams[1]

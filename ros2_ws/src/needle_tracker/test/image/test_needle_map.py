@@ -58,6 +58,7 @@ def test_is_drawn_where_it_is_asked_for_and_as_if_all_were() -> None:
     one = NeedleMap(5.0)
     part = one.draw(image, (150, 100, 230, 150)).astype(int)
     assert not part[:, :144].any()
+    assert one.drawn == (slice(96, 160), slice(144, 240))
     assert np.abs(part - whole)[100:150, 150:230].max() < 25
     more = one.draw(image, (20, 100, 230, 150)).astype(int)
     assert np.abs(more - whole)[100:150, 20:230].max() < 25
