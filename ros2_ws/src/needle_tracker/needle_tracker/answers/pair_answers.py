@@ -160,7 +160,8 @@ class PairAnswers:
             self._queue.popleft()
             answer = self._answer(arrival, pair)
             yield answer
-            # No answer waits for a suspicion.
+            # No answer waits for a comparison or a suspicion.
+            self.tracker.catch_up()
             self._suspect(answer)
 
     def _answer(self, arrival: float, pair: Pair[Frame]) -> Answer:

@@ -34,6 +34,17 @@ _IN_A_ROW = 3
 """So often in a row maps confirm lines that did not count, or deny lines they have confirmed."""
 
 
+@dataclasses.dataclass(frozen=True)
+class _Pair:
+    """A pair whose maps are drawn: images, insertion [m], what lines show and whether of a lamp."""
+
+    left: Image
+    right: Image
+    insertion: float | None
+    lines: Measurement
+    mirrored: bool
+
+
 class TipTracker:
     """Tracks the tip through a sequence of stereo pairs.
 
@@ -88,16 +99,19 @@ class TipTracker:
         self._staged.forget()
         self._maps_count = self._have_agreed = False
         self._against = 0
+        self._put_off: _Pair | None = None
         self._pairs = self._in_vain = 0
         self._since_compared = _BOTH_EVERY
 
     def skip(self, reason: str) -> Measurement:
         """Answer a pair that cannot be looked at; it counts as one without a tip."""
+        self.catch_up()
         self._maps.skip(reason)
         return self._lines.skip(reason)
 
     def process(self, left: Image, right: Image, insertion: float | None) -> Measurement:
         """Measure the tip in a stereo pair; as `StereoTracker.process`."""
+        self.catch_up()
         lines = self._lines.process(left, right, insertion)
         behind = self._backgrounds.see((left, right), insertion)
         self._looks[0].background, self._looks[1].background = behind
@@ -114,7 +128,27 @@ class TipTracker:
         self._since_compared += 1
         if not (self._maps_count or self._maps_are_due(lines)):
             return lines
-        maps = self._maps.process(left, right, insertion)
+        pair = _Pair(left, right, insertion, lines, mirrored)
+        if self._lines_count_anyhow(lines):
+            self._put_off = pair
+            return lines
+        return self._compare(pair)
+
+    def catch_up(self) -> None:
+        """Draw the maps that the last answer did not wait for; the next pair does it otherwise."""
+        put_off, self._put_off = self._put_off, None
+        if put_off is not None:
+            self._compare(put_off)
+
+    def _lines_count_anyhow(self, lines: Measurement) -> bool:
+        """Return whether lines are the answer, whatever maps show in this pair."""
+        tried = self._have_agreed and self._against + 1 < _IN_A_ROW
+        return lines.tip is not None and tried and not self._maps_count
+
+    def _compare(self, pair: _Pair) -> Measurement:
+        """Draw a pair's maps and hold them against its lines; return what counts."""
+        lines, insertion = pair.lines, pair.insertion
+        maps = self._maps.process(pair.left, pair.right, insertion)
         if maps.tip is not None:
             tip = self._claims.widened(maps.tip, OF_MAP)
             maps = dataclasses.replace(maps, tip=self._staged.placed(tip, maps.shaft, insertion))
@@ -125,7 +159,7 @@ class TipTracker:
             self._maps_count = self._maps_count or maps.tip is not None
             return lines if maps.tip is None else maps
         self._since_compared = 0
-        self._hear(agree=not mirrored and _agree(lines.tip, maps.tip))
+        self._hear(agree=not pair.mirrored and _agree(lines.tip, maps.tip))
         return maps if self._maps_count else lines
 
     def _may_be_a_lamp(self, lines: Measurement) -> bool:

@@ -150,7 +150,9 @@ def tip_at(z: float, sigma: float) -> SpatialTip:
 
 
 def answer(tracker: TipTracker) -> SpatialTip | None:
-    return tracker.process(NOTHING, NOTHING, 0.06).tip
+    tip = tracker.process(NOTHING, NOTHING, 0.06).tip
+    tracker.catch_up()
+    return tip
 
 
 def counts(tracker: TipTracker, told: Told) -> bool:
@@ -166,6 +168,72 @@ def test_lines_count_while_maps_agree_and_are_seldom_asked(
     lines.tip, maps.tip = tip_at(0.0600, 2e-5), tip_at(0.0601, 2e-4)
     assert all(counts(tracker, lines) for _ in range(30))
     assert 3 <= maps.asked <= 4
+
+
+def test_no_answer_waits_for_maps_that_cannot_change_it(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+    lines.tip, maps.tip = tip_at(0.0600, 2e-5), tip_at(0.0601, 2e-4)
+    # Nobody has asked the maps yet: they may deny the lines.
+    tracker.process(NOTHING, NOTHING, 0.06)
+    assert maps.asked == 1
+    for _ in range(30):
+        asked = maps.asked
+        tracker.process(NOTHING, NOTHING, 0.06)
+        assert maps.asked == asked
+        tracker.catch_up()
+    assert maps.asked == 4
+
+
+class Script(Told):
+    """A tracker that says of each pair, by its insertion in mm, what is written for it."""
+
+    def __init__(self, tips: list[SpatialTip | None]) -> None:
+        super().__init__()
+        self._tips = tips
+
+    def process(self, _: Image, __: Image, insertion: float | None) -> Measurement:
+        assert insertion is not None
+        tip = self._tips[round(1e3 * insertion) - FIRST_MM]
+        return Measurement(tip, self.state, "" if tip else "no needle")
+
+
+FIRST_MM = 10
+
+
+class Waiting(TipTracker):
+    """A tracker whose every answer waits for the maps."""
+
+    def _lines_count_anyhow(self, _: Measurement) -> bool:
+        return False
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_maps_drawn_after_an_answer_change_no_answer(
+    calibration: StereoCalibration, settings: TrackerSettings, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    sayings: list[SpatialTip | None] = [tip_at(0.0600, 2e-5), tip_at(0.0590, 2e-5), None]
+    scripts: tuple[list[SpatialTip | None], ...] = ([], [])
+    for script in scripts:
+        # For a while the same, as needles are.
+        while len(script) < 400:
+            saying = sayings[rng.choice(3, p=(0.6, 0.3, 0.1))]
+            script.extend([saying] * int(rng.integers(1, 40)))
+    said: list[list[tuple[float, float] | None]] = []
+    for kind, catches_up in ((Waiting, 0.0), (TipTracker, 0.0), (TipTracker, 0.5)):
+        tracker = kind(calibration, settings)
+        tracker._lines, tracker._maps = map(Script, scripts)  # type: ignore[assignment]
+        said.append([])
+        for pair in range(400):
+            tip = tracker.process(NOTHING, NOTHING, 1e-3 * (FIRST_MM + pair)).tip
+            said[-1].append(None if tip is None else (tip.position[2], tip.covariance[2, 2]))
+            if rng.random() < catches_up:
+                tracker.catch_up()
+    assert said[1] == said[0]
+    assert said[2] == said[0]
+    assert len(set(said[0])) > 2
 
 
 def test_an_end_that_maps_deny_does_not_count(told: tuple[TipTracker, Told, Told]) -> None:
