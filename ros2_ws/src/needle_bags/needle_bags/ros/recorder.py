@@ -12,7 +12,7 @@ from typing import Any, cast
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -34,6 +34,7 @@ from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.discovery import PARAMETERS_OF
 from needle_common.ros.parameters import NodeParameters
+from needle_common.ros.wait_list import WaitListExecutor
 from needle_common.ros.whole_node import WholeNode
 
 HELP = """
@@ -278,7 +279,7 @@ def _read_calibration(path: str) -> str:
         raise UserError(f"calibration_file: cannot read {path}: {error}") from error
 
 
-def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
+def _spin_once(executor: WaitListExecutor, recorder: Recorder, timeout: float) -> None:
     """Let the executor do one thing; what others sent that it cannot do does not end the node."""
     try:
         executor.spin_once(timeout_sec=timeout)
@@ -294,7 +295,7 @@ def main(args: list[str] | None = None) -> int:
 
     def spin(node: Node, end: EndRequest) -> int:
         recorder = cast(Recorder, node)
-        executor = SingleThreadedExecutor()
+        executor = WaitListExecutor()
         executor.add_node(recorder)
         try:
             while not end.wanted:

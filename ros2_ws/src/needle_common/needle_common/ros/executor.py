@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
 from rclpy.client import Client
-from rclpy.executors import ExternalShutdownException, ShutdownException, SingleThreadedExecutor
+from rclpy.executors import ExternalShutdownException, ShutdownException
 from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.task import Task
 
 from needle_common.errors import UserError
+from needle_common.ros.wait_list import Execution, Take, WaitListExecutor
 
-_Execution = Callable[[], Coroutine[Any, Any, None]]
 # What is meant to end a node, wherever it is raised.
 _ENDS = (UserError, ExternalShutdownException, ShutdownException)
 
 
-class NodeExecutor(SingleThreadedExecutor):
+class NodeExecutor(WaitListExecutor):
     """Runs the callbacks of one node; a message or request that one fails on is refused by name.
 
     What a timer raises ends the node, as ever: it came from within. So does a `UserError`.
@@ -46,15 +46,13 @@ class NodeExecutor(SingleThreadedExecutor):
         self._on_failure = on_failure
         self.add_node(node)
 
-    def _make_handler(
-        self, entity: Any, node: Node, take_from_wait_list: Callable[[Any], _Execution | None]
-    ) -> Task[Any]:
+    def _make_handler(self, entity: Any, node: Node, take_from_wait_list: Take) -> Task[Any]:
         take = take_from_wait_list
         if isinstance(entity, Subscription | Service | Client):
             take = partial(self._careful, take_from_wait_list)
         return super()._make_handler(entity, node, take)
 
-    def _careful(self, take: Callable[[Any], _Execution | None], entity: Any) -> _Execution | None:
+    def _careful(self, take: Take, entity: Any) -> Execution | None:
         try:
             execute = take(entity)
         except Exception as error:  # noqa: BLE001 - rclpy has types of its own
