@@ -13,6 +13,7 @@ from functools import partial
 import numpy as np
 
 import drive_benchmark
+import latency_benchmark
 import recording_benchmark
 import reference_loop
 import tracker_benchmark
@@ -45,6 +46,7 @@ references:
                    time of one update holds the needle's simulation, too
   rosbags Writer   the same messages into an MCAP bag; the disk alone: their bytes into one file;
                    all with what the disk needs to take them (fsync)
+  a frame          the time from one exposure to the next, 30 a second
   one at a time    the same code as the study's, in a loop over needles (few needles, scaled)
 
 exit codes: 0 measured, 2 bad input, 130 interrupted.
@@ -206,6 +208,15 @@ def recording() -> Iterator[Row]:
         yield Row("recording", what, "s", size / speeds.recorder, against, size / speed)
 
 
+def latency() -> Iterator[Row]:
+    """From both images to the set-points made from them, recorder and console running."""
+    for stage, (median, worst) in latency_benchmark.measure().items():
+        key = f"latency_{stage.replace(' ', '_').replace('-', '_')}"
+        for name, seconds in (("p50", median), ("p99", worst)):
+            frame = 1e3 * latency_benchmark.FRAME
+            yield Row(f"{key}_{name}", f"{stage}, {name}", "ms", 1e3 * seconds, "a frame", frame)
+
+
 BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "studies": studies,
     "updates": updates,
@@ -213,6 +224,7 @@ BENCHES: dict[str, Callable[[], Iterator[Row]]] = {
     "tracker": tracker,
     "recording": recording,
     "drives": drives,
+    "latency": latency,
 }
 
 

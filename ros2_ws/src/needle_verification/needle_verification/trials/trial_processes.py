@@ -19,6 +19,7 @@ from needle_bringup.simulation.simulate_options import SimulateOptions
 from needle_common.errors import UserError
 from needle_common.files.installed import find_executable
 
+_PACKAGES = {**PACKAGES, "console": "needle_console"}
 _KILL_GRACE = 5.0
 _TAKES_COMMANDS = "drive_emulator"
 
@@ -63,7 +64,7 @@ class TrialProcesses:
 
     def start(self, name: str) -> None:
         """Start a node, also again."""
-        self._run(name, [find_executable(PACKAGES[name], name)], self._file)
+        self._run(name, [find_executable(_PACKAGES[name], name)], self._file)
 
     def start_module(self, name: str, module: str, values: Mapping[str, object]) -> None:
         """Start a node that a module of this package runs, with these parameters."""

@@ -1,0 +1,156 @@
+"""From both images to the set-points made from them, in the whole graph of a rig in real time.
+
+Tracker, controller, driver, recorder and console run as on a rig; its drives are emulated, and its
+cameras show what was drawn before: no renderer shares the processor with what is measured. A first
+insertion, in one process, says how the needle goes; the second goes the same way.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+import latency_rig
+import needle_tracker
+from needle_analysis.run.stage_timing import stage_timings
+from needle_bags.reading.bag_reader import read_run
+from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG, can_adapter
+from needle_common.errors import UserError
+from needle_common.process.ros_domain import own_domain
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_sim.camera.renderer import StereoRenderer
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.rig.bench import SimulatedBench
+from needle_verification.trials.steered_needle import Hand, SteeredNeedle
+from needle_verification.trials.trial_processes import Parameters, TrialProcesses
+
+CALIBRATION = Path(needle_tracker.__file__).resolve().parents[1] / "config" / "calibration.yaml"
+FRAME = 1.0 / 30.0
+SPEED, DEPTH = 0.002, 0.030
+# Images count from here: before, the tracker believes the insertion [m].
+FIRST = 0.006
+_SPACING = 6e-5
+_OFFSET = 0.003
+_LONGEST = 120.0
+_TIP_STD = 5e-5
+_LOOPBACK = "127.0.0.1"
+STAGES = ("tracker", "controller", "driver", "image to set-point")
+
+
+def measure(depth: float = DEPTH) -> Mapping[str, tuple[float, float]]:
+    """Steer a needle so deep [m]; return by stage the median and 99 % of its time [s].
+
+    Raises
+    ------
+    UserError
+        If the graph does not get there.
+    """
+    with tempfile.TemporaryDirectory(prefix="needle_bench_") as name:
+        folder = Path(name)
+        draw(folder, depth + _OFFSET)
+        _run(folder, depth)
+        run = read_run(folder / "bag")
+        timings = {timing.name: timing for timing in stage_timings(run)}
+    figures = {}
+    for stage in STAGES:
+        timing = timings[stage]
+        seconds = timing.seconds[run.insertion_at(timing.stamps) > FIRST]
+        figures[stage] = (float(np.median(seconds)), float(np.percentile(seconds, 99)))
+    return figures
+
+
+def draw(folder: Path, depth: float) -> None:
+    """Steer a needle in this process, and leave images of it on its way in a folder."""
+    settings = SteeringSettings(
+        insertion="continuous",
+        target_offset=_OFFSET,
+        depth=depth,
+        nominal_speed=SPEED,
+        tip_covariance="configured",
+        tip_noise="normal",
+        measurement_std=_TIP_STD,
+    )
+    bench = SimulatedBench(
+        curvature=settings.curvature,
+        pitch=math.radians(2.0),
+        roll=math.radians(15.0),
+        torsion_play=0.0,
+        torsion_lag=0.0,
+        tip_noise=0.0,
+        seed=1,
+    )
+    renderer = StereoRenderer(load_stereo_rig(CALIBRATION), 1)
+    insertions: list[float] = []
+    images: list[tuple[np.ndarray, np.ndarray]] = []
+
+    def see(number: int) -> np.ndarray:
+        if not insertions or bench.insertion - insertions[-1] > _SPACING:
+            insertions.append(bench.insertion)
+            plant = bench.plant
+            images.append(renderer.render(plant.T_rig_tip, plant.centreline(1e-3), number))
+        return bench.tip
+
+    needle = SteeredNeedle(
+        settings,
+        bench,
+        lambda seconds: Hand(pressed=seconds > 0.2),
+        tip_period=FRAME,
+        latency=0.01,
+        measure=see,
+    )
+    needle.run(_LONGEST)
+    np.save(folder / latency_rig.IMAGES_FILE, np.array(images))
+    np.save(folder / latency_rig.INSERTIONS_FILE, np.array(insertions))
+
+
+def _run(folder: Path, depth: float) -> None:
+    adapter = str(can_adapter())
+    parameters: Parameters = {
+        "recorder": {"bag": str(folder / "bag")},
+        "drive_emulator": {"pty": adapter},
+        # Emulated drives are processes: on a busy machine they answer as late as others.
+        "device_driver": {
+            "channel": adapter,
+            **dict.fromkeys(("watchdog", "reply_age_limit", "hold_timeout"), REAL_TIME_WATCHDOG),
+        },
+        "stereo_tracker": {},
+        "plane_controller": {
+            "insertion": "continuous",
+            "target_offset": _OFFSET,
+            "depth": depth + _OFFSET,
+            "nominal_speed": SPEED,
+        },
+        "console": {"address": _LOOPBACK, **_free_ports()},
+    }
+    rig = [sys.executable, latency_rig.__file__, str(folder), str(CALIBRATION), str(depth)]
+    with (
+        own_domain() as domain,
+        closing(TrialProcesses(folder, domain, parameters)) as graph,
+    ):
+        done = subprocess.run(
+            rig,
+            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        graph.check()
+    if done.returncode:
+        raise UserError(f"the needle did not get there: {done.stderr.strip().splitlines()[-1]}")
+
+
+def _free_ports() -> dict[str, object]:
+    """Return two ports for the console's page and hold that nobody has now."""
+    with socket.socket() as page, socket.socket() as hold:
+        for each in (page, hold):
+            each.bind((_LOOPBACK, 0))
+        return {"port": page.getsockname()[1], "hold_port": hold.getsockname()[1]}

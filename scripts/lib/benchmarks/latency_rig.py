@@ -1,0 +1,130 @@
+"""Person and cameras of the latency's benchmark: a hold, and images of the needle where it is.
+
+A process of its own, and as little work as cameras make a computer: images were drawn before.
+"""
+
+from __future__ import annotations
+
+import random
+import sys
+import time
+from collections import deque
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rclpy
+from sensor_msgs.msg import CameraInfo, Image, JointState
+from std_srvs.srv import Trigger
+
+from needle_common.errors import UserError
+from needle_common.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds, to_stamp
+from needle_sim.camera.stereo_rig import load_stereo_rig
+from needle_sim.ros.conversions import to_camera_info, to_image
+from needle_verification.ros.drive_hand import DriveHand
+
+IMAGES_FILE, INSERTIONS_FILE = "images.npy", "insertions.npy"
+_PERIOD = 1.0 / 30.0
+# Exposures keep no step with the driver's cycles.
+_JITTER = 0.01
+# From exposure to both images in the computer, as from a USB 3 camera [s].
+_TRANSFER = 0.01
+_JOINTS = 100
+_BEFORE = 30
+_PATIENCE = 60.0
+
+
+class LatencyRig(DriveHand):
+    """Shows, and holds.
+
+    Parameters
+    ----------
+    folder : Path
+        Has images, (N, 2, height, width), and the insertion of each pair, (N,) [m].
+    calibration : Path
+        The cameras.
+    """
+
+    def __init__(self, folder: Path, calibration: Path) -> None:
+        super().__init__(steers=False)
+        self._images = np.load(folder / IMAGES_FILE)
+        self._insertions = np.load(folder / INSERTIONS_FILE)
+        rig = load_stereo_rig(calibration)
+        self._views = [
+            (
+                camera,
+                f"{side}_camera_optical",
+                self.create_publisher(Image, f"stereo/{side}/image_raw", IMAGES),
+                self.create_publisher(CameraInfo, f"stereo/{side}/camera_info", IMAGES),
+            )
+            for side, camera in (("left", rig.left), ("right", rig.right))
+        ]
+        self._start = self.create_client(Trigger, "plane_controller/start")
+        self._told: deque[tuple[int, float]] = deque([(0, 0.0)], maxlen=_JOINTS)
+        self._random = random.Random(1)
+        self._due = time.monotonic()
+        self.shown = 0
+
+    def insert(self, depth: float) -> None:
+        """Prepare the rig, then hold until the needle is so deep [m]."""
+        self.until(self.ready, "the driver")
+        self.home()
+        self.insist("enable", True)
+        self._show_until(lambda: self.shown >= _BEFORE, "images")
+        self._show_until(self._start.service_is_ready, "the controller")
+        while not self._has_started():
+            shown = self.shown
+            self._show_until(lambda least=shown: self.shown > least, "another image")
+        self.send_hold()
+        self._show_until(lambda least=self.shown: self.shown > least, "a release")
+        self.pressed = True
+        self._show_until(lambda: self._told[-1][1] >= depth, "the depth")
+        self.pressed = False
+        self.send_hold()
+
+    def _has_started(self) -> bool:
+        future = self._start.call_async(Trigger.Request())
+        self._show_until(future.done, "an answer of the controller")
+        return bool(future.result().success)
+
+    def _show_until(self, condition: Any, what: str) -> None:
+        end = time.monotonic() + _PATIENCE
+        while not condition():
+            if time.monotonic() > end:
+                raise UserError(f"waited {_PATIENCE:g} s in vain: {what}{self.state_now()}")
+            wait = self._due - time.monotonic()
+            self.look(max(wait, 0.0))
+            if time.monotonic() >= self._due:
+                self._show()
+                # A camera that is late makes up for nothing.
+                self._due = max(self._due, time.monotonic() - _PERIOD)
+                self._due += _PERIOD + self._random.uniform(-_JITTER, _JITTER)
+
+    def _show(self) -> None:
+        exposed_ns = time.time_ns() - round(_TRANSFER * NANOSECONDS)
+        times, insertions = (np.array(column) for column in zip(*self._told, strict=True))
+        insertion = np.interp(exposed_ns - times[0], times - times[0], insertions)
+        pair = self._images[int(np.argmin(np.abs(self._insertions - insertion)))]
+        stamp = to_stamp(exposed_ns)
+        for pixels, (camera, frame, image, info) in zip(pair, self._views, strict=True):
+            info.publish(to_camera_info(camera, frame, stamp))
+            image.publish(to_image(pixels, frame, stamp))
+        self.shown += 1
+
+    def _on_joints(self, message: JointState) -> None:
+        super()._on_joints(message)
+        self._told.append((to_nanoseconds(message.header.stamp), message.position[0]))
+
+
+def main() -> None:
+    """Insert as deep as the command line says."""
+    folder, calibration, depth = sys.argv[1:]
+    rclpy.init()
+    with closing(LatencyRig(Path(folder), Path(calibration))) as rig:
+        rig.insert(float(depth))
+    rclpy.try_shutdown()
+
+
+if __name__ == "__main__":
+    main()
