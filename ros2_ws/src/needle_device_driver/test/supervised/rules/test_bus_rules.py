@@ -8,6 +8,7 @@ import can
 import pytest
 
 from needle_device_driver.cia402 import drive_setup
+from needle_device_driver.cia402.pdo_setup import silence_unused
 from needle_device_driver.link.can_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.rules import Rule
@@ -324,14 +325,14 @@ def test_drive_reboot_within_its_set_up_voids_it(
 ) -> None:
     bench = drive_bench
     bench.homed()
-    silence, reboots = drive_setup.silence_unused, [True]
+    reboots = [True]
 
     def reboots_once(access: ObjectAccess) -> None:
         if reboots:
             reboots.clear()
             bench.insertion.reboot()
             bench.bus.flush()
-        silence(access)
+        silence_unused(access)
 
     monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
     bench.insertion.reboot()
