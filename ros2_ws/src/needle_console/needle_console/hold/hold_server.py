@@ -133,9 +133,9 @@ class HoldServer:
                 connection.transport.abort()
 
     async def _hand_on(self) -> None:
-        """Hand on the hold until the end: at fixed times, and when it runs out."""
+        """Hand on the hold once at least, until the end: at fixed times, and when it runs out."""
         due = time.monotonic()
-        while not self._ended.is_set():
+        while True:
             now = time.monotonic()
             if now >= due or (self._told.pressed and now > self._desk.until):
                 self._tell()
@@ -144,6 +144,7 @@ class HoldServer:
             wait = min(due, max(self._desk.until, now) + _TICK) if self._told.pressed else due
             with contextlib.suppress(asyncio.TimeoutError):
                 await asyncio.wait_for(self._ended.wait(), wait - now)
+                return
 
     def _tell(self) -> None:
         now = time.monotonic()

@@ -174,6 +174,15 @@ def test_the_end_of_the_server_releases(rig: Rig, honest: HonestPage) -> None:
     assert not rig.server.is_alive
 
 
+def test_an_end_before_the_first_word_hands_on_a_release_all_the_same() -> None:
+    states: list[HoldState] = []
+    server = HoldServer(Access("127.0.0.1", PAGE_PORT), 0, states.append, print)
+    server._ended.set()
+    server.start()
+    server.close()
+    assert states == [RELEASED]
+
+
 def test_a_port_that_is_taken_is_said(rig: Rig) -> None:
     with pytest.raises(UserError, match=rf"hold: 127.0.0.1 port {rig.server.port}: "):
         HoldServer(Access("127.0.0.1", PAGE_PORT), rig.server.port, print, print)
