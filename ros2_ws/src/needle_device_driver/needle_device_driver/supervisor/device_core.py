@@ -261,7 +261,7 @@ class DeviceCore:
                 self._axes.each(lambda axis: axis.stop())
             except AxisError as error:
                 self.notice(str(error), error.rule)
-        if self.activity is Activity.STEP and self.step_stamp_ns is not None:
+        if self.step_stamp_ns is not None:
             self.answer(self.step_stamp_ns, outcome)
         self.activity = Activity.NONE
         self._run = self.step_stamp_ns = None
