@@ -24,7 +24,9 @@ from needle_verification.soak.link_faults import LinkFault
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 _SLOWEST_CALLBACK_NS = 50_000_000
-_LATEST_NS = 1_000_000_000
+LATEST_MESSAGE = 1.0
+"""What the worst of faults delays a message by [s]."""
+_LATEST_NS = round(LATEST_MESSAGE * NANOSECONDS)
 _LATEST_FRAME_NS = 100_000_000
 _STRANGER_RATE = 20.0
 _JUMP_NS = 20 * NANOSECONDS

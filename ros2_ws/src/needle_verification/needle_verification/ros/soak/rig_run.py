@@ -13,12 +13,12 @@ from sensor_msgs.msg import Joy
 
 from needle_common.ros.conversions import values_of
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_verification.ros.soak.fault_orders import FaultOrders
+from needle_verification.ros.soak.fault_orders import LATEST_MESSAGE, FaultOrders
 from needle_verification.ros.soak.virtual_bench import Motors
 from needle_verification.ros.soak.virtual_person import OUT, Wish
 from needle_verification.ros.soak.virtual_rig import VirtualRig, virtual_rig
-from needle_verification.soak.faults import STRANGER, Fault, draw_schedule
-from needle_verification.soak.invariants import Bounds, Violation, Watch
+from needle_verification.soak.faults import STRANGER, Fault, Kind, draw_schedule
+from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 
 # Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
@@ -26,6 +26,9 @@ from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 _GO_ON, _DRAW_OUT = 60.0, 60.0
 # A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.04, 0.001
+# The way of a press to the driver.
+_HOLD_LINKS = ("/joy", "/device/hold")
+_LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller, or give it others.
 _JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_controller")
 
@@ -121,7 +124,13 @@ def _begin(rig: VirtualRig, orders: FaultOrders, fault: Fault) -> None:
 
 def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     """Return what watches over a rig from now on."""
-    watch = Watch(bounds_of_the_rig())
+    # A hold counts from its arrival: what is late on its way outlives the hand by as much.
+    late = sum(
+        fault.size * LATEST_MESSAGE
+        for fault in faults
+        if fault.part in _HOLD_LINKS and fault.kind in _LATE
+    )
+    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
     joints_spoilt = any(fault.part in _JOINTS for fault in faults)
 
     def see_motors(at: Motors) -> None:
