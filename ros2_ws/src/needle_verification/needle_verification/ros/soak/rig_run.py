@@ -137,7 +137,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         now = _seconds(at.steady_ns)
         process = rig.processes.get("device_driver")
         speaks = process is not None and process.alive and not process.stands_still
-        rig.graph.digest.update(f"{at.insertion!r} {at.rotation!r}\n".encode())
+        rig.graph.digest.update(_rounded((at.insertion, at.rotation)))
         watch.see_hand(now, holds=rig.hand.holds)
         watch.see_driver(now, speaks=speaks)
         watch.see_drives(now, blocked=rig.bench.has_blocked_motor)
@@ -150,7 +150,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         elif topic == "/needle/controller_status" and isinstance(message, DiagnosticStatus):
             watch.see_belief(now, values_of(message), joints_heard=not joints_spoilt)
         elif topic == "/device/joint_trajectory":
-            rig.graph.digest.update(repr(message).encode())
+            for point in message.points:
+                rig.graph.digest.update(_rounded(point.positions))
             watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
         elif topic == "/device/estop":
             watch.see_estop(now, pressed=message.data)
@@ -160,6 +161,11 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     rig.bench.watchers.append(see_motors)
     rig.graph.watchers.append(see)
     return watch
+
+
+def _rounded(place: Sequence[float]) -> bytes:
+    """Return a place for the digest, to 1 nm and 1 nrad: Pythons' numpy differ in last bits."""
+    return " ".join(f"{value:.9f}" for value in place).encode() + b"\n"
 
 
 def _has_left(rig: VirtualRig) -> bool:
