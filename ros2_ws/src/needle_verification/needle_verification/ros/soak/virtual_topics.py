@@ -229,7 +229,7 @@ class VirtualPublisher(Endpoint):
         fates = self.graph.faults.fates(self.topic_name, data, world)
         for fate in fates:
             arrival = world.steady_ns + self.graph.transport_ns() + fate.late_ns
-            if not fate.overtakes:
+            if not fate.overtakes or self._is_reliable(subscription):
                 # One nanosecond later at least, since ties are drawn.
                 arrival = max(arrival, self._arrivals.get(subscription, 0) + 1)
                 self._arrivals[subscription] = arrival
