@@ -13,12 +13,14 @@ from pathlib import Path
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
+from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import HOLD, values_of
+from needle_common.ros.conversions import HOLD, RELIABLE, values_of
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
+from needle_verification.ros.soak.virtual_person import OUT
 from needle_verification.soak.faults import Fault, Kind
 from needle_verification.soak.invariants import RELEASE_BOUND, Watch
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
@@ -31,8 +33,6 @@ _RELEASE_BOUND = RELEASE_BOUND - 0.1 + 0.25
 _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
-# As far as a person sees the needle to be out [m].
-_OUT = 3e-4
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
 
 
@@ -49,7 +49,12 @@ class Witness(DriveHand):
         self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
         self._begun = time.monotonic()
         super().__init__(steers=False)
+        # Whose press it is that moves the needle.
+        self._holder = PERSON
         self.create_subscription(Joy, "device/hold", self._on_hold, HOLD)
+        self.create_subscription(
+            JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
+        )
 
     @property
     def now(self) -> float:
@@ -64,8 +69,9 @@ class Witness(DriveHand):
         UserError
             If it does not come out.
         """
+        self._holder = self.get_name()
         end = self.now + _DRAW_OUT
-        while self.motors[-1].insertion > _OUT:
+        while self.motors[-1].insertion > OUT:
             state, activity = self.status.get("state"), self.status.get("activity")
             if self.now > end:
                 raise UserError(f"it is {self.motors[-1].insertion * 1e3:.2f} mm in; {self.status}")
@@ -82,8 +88,14 @@ class Witness(DriveHand):
         self.release()
 
     def _on_hold(self, message: Joy) -> None:
-        if any(message.buttons):
-            self.watch.see_other_hold(self.now)
+        if message.header.frame_id == self._holder:
+            pressed = any(message.buttons)
+            self.watch.see_hand(self.now, holds=pressed)
+            if pressed:
+                self.watch.see_hold(self.now)
+
+    def _on_command(self, message: JointTrajectory) -> None:
+        self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def _on_positions(self, message: JointState) -> None:
         super()._on_positions(message)
