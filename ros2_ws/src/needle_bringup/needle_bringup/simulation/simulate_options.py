@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from needle_common.commands.options import (
     CommandParser,
@@ -60,11 +61,6 @@ something missing, 130 interrupted.
 LEVELS = ("tip", "camera", "drive")
 CONTROLLERS = ("best", "paper", "open_loop")
 """plane_controller's presets; named here again, for to import them takes half a second."""
-OWN_PARTS = {
-    "--estimator": "an estimator",
-    "--law": "a control law",
-    "--planner": "with --target: a planner",
-}
 INSERTIONS = ("stepwise", "continuous")
 """How plane_controller lets the needle go in, likewise."""
 
@@ -169,14 +165,7 @@ def _parser() -> CommandParser:
         help="how the needle is turned: as in the paper, by the best controller known here, or not "
         f"at all (default: best); for comparison also {', '.join(CONTROLLERS[3:])}",
     )
-    for option, what in OWN_PARTS.items():
-        add(
-            option,
-            default="",
-            metavar="NAME",
-            help=f"{what} of another package in place of the controller's own, by the name of its "
-            "entry point (docs/own_controllers.md)",
-        )
+    add_own_part_options(add, "--target")
     add(
         "--insertion",
         default="stepwise",
@@ -303,3 +292,19 @@ def _readable(name: str, text: str | None) -> Path | None:
     if not path.is_file():
         raise UserError(f"{name} {text}: no such file")
     return path
+
+
+def add_own_part_options(add: Callable[..., Any], points: str) -> None:
+    """Add `--estimator`, `--law` and `--planner`; `points` is the option that planners go with."""
+    for option, what in (
+        ("--estimator", "an estimator"),
+        ("--law", "a control law"),
+        ("--planner", f"with {points}: a planner"),
+    ):
+        add(
+            option,
+            default="",
+            metavar="NAME",
+            help=f"{what} of another package in place of the controller's own, by the name of its "
+            "entry point (docs/own_controllers.md)",
+        )

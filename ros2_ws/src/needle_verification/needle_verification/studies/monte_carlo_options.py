@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from needle_bringup.simulation.simulate_options import add_own_part_options
 from needle_common.commands.options import (
     CommandParser,
     join_start,
@@ -192,18 +193,7 @@ def _parser() -> CommandParser:
         help="best, paper or open_loop; with --targets best, or the published sliding_mode or rrt "
         "with best's estimator (default: best)",
     )
-    for option, what in (
-        ("--estimator", "an estimator"),
-        ("--law", "a control law"),
-        ("--planner", "with --targets: a planner"),
-    ):
-        add(
-            option,
-            default="",
-            metavar="NAME",
-            help=f"{what} of another package in place of the controller's own, by the name of its "
-            "entry point (docs/own_controllers.md)",
-        )
+    add_own_part_options(add, "--targets")
     add(
         "--grid",
         default="endpoint",
