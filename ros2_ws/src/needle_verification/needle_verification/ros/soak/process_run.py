@@ -76,6 +76,7 @@ class Witness(DriveHand):
             if self.now > end:
                 raise UserError(f"it is {self.motors[-1].insertion * 1e3:.2f} mm in; {self.status}")
             if state in ("FAULT", "ESTOPPED"):
+                self.pressed = False
                 self.call("reset")
             elif state == "DISABLED":
                 self.call("enable", True)
