@@ -58,6 +58,9 @@ class AxisSnapshot:
     answered : bool
         Whether the axis has answered to all that it was asked: until then, where it is is not known
         well enough to send it on.
+    let_go : bool
+        Whether a stopped axis is switched off until the next order to move, since it was blocked
+        short of where its controller wants it.
     origin : int
         Changes whenever `position` begins to count from elsewhere.
     """
@@ -75,6 +78,7 @@ class AxisSnapshot:
     fault_rule: Rule = Rule.ONE_FAULT_STOPS_BOTH
     ready: bool = True
     answered: bool = True
+    let_go: bool = False
     origin: int = 0
 
 

@@ -36,6 +36,12 @@ class PairSnapshot:
         """Tell whether both axes have answered to all that they were asked."""
         return self.insertion.answered and self.rotation.answered
 
+    @property
+    def let_go(self) -> str:
+        """Names of the axes that are switched off while stopped; empty: none."""
+        axes = {"insertion": self.insertion, "rotation": self.rotation}
+        return " and ".join(name for name, at in axes.items() if at.let_go)
+
     def age(self, now: float) -> float:
         """Return the age of the older reply [s]."""
         return now - min(self.insertion.time, self.rotation.time)

@@ -138,7 +138,8 @@ class Cia402Axis(Axis):
             write_homing(self._access, self._settings, speed)
         self._machine.mode = Mode.HOMING
         self._homing = HomingRun(
-            here=self._settings.homing_method in HERE, tolerance_counts=self._rest_counts
+            here=self._settings.homing_method in HERE,
+            tolerance_counts=self._settings.magnitude(self._settings.tolerance),
         )
 
     def start_move(self, target: float, speed: float) -> None:
@@ -213,6 +214,7 @@ class Cia402Axis(Axis):
             fault_rule=Rule.ONE_FAULT_STOPS_BOTH if fault is None else fault[0],
             ready=not self.actuated or machine.ready,
             answered=self.monitor.answered(),
+            let_go=machine.let_go,
             origin=self._origin,
         )
 
@@ -311,10 +313,6 @@ class Cia402Axis(Axis):
     @property
     def _access(self) -> ObjectAccess:
         return ObjectAccess(self._link, self._settings.node_id)
-
-    @property
-    def _rest_counts(self) -> int:
-        return self._settings.magnitude(self._settings.tolerance)
 
     @property
     def _fault(self) -> Fault | None:

@@ -43,7 +43,7 @@ class DriveMachine:
         self._watch = TransitionWatch()
         self._goal = Goal.OFF
         self._cycles = 0
-        self._recovering = False
+        self._via_off = False
         self._stopping = False
         self._still = 0
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -72,7 +72,12 @@ class DriveMachine:
         """Tell whether the drive is on by the present order, stopped or not."""
         # One that is still on from before, on its way off or to another mode, is not.
         on = self.state in POWERED and self.at.mode == self.mode
-        return self._goal is not Goal.OFF and (on or self._recovering)
+        return self._goal is not Goal.OFF and (on or self._via_off)
+
+    @property
+    def let_go(self) -> bool:
+        """Tell whether the drive is switched off while stopped, as the axis was blocked."""
+        return self._goal is Goal.STOPPED and self._via_off
 
     @property
     def switching(self) -> bool:
@@ -86,9 +91,10 @@ class DriveMachine:
     def want(self, goal: Goal) -> None:
         """Set the goal."""
         if goal is not self._goal:
+            # An axis that was let go of is on its way, it has not lost its power.
+            self._via_off = self.let_go and goal is Goal.ON
             self._goal = goal
             self._cycles = 0
-            self._recovering = False
 
     def stop(self) -> None:
         """Want a stop; until the drive has said that it took it, nothing else is ordered."""
@@ -137,7 +143,7 @@ class DriveMachine:
         homing = self.mode is Mode.HOMING and self.at.mode == Mode.HOMING
         if self.ready or (homing and state is DriveState.OPERATION_ENABLED):
             self._cycles = 0
-            self._recovering = False
+            self._via_off = False
             return
         if (
             self._goal is Goal.ON
@@ -146,7 +152,14 @@ class DriveMachine:
             and self._still > _REST
         ):
             # Transition 16 is optional: where it is lacking, through SWITCH ON DISABLED.
-            self._recovering = True
+            self._via_off = True
+        if (
+            self._goal is Goal.STOPPED
+            and self._still >= _REST
+            and abs(self.at.following_error) > self._rest_counts
+        ):
+            # It was blocked, and its drive would pull it on when it comes free.
+            self._via_off = True
         if self.switching and state not in FAULTS and self._cycles > _LONGEST_SWITCHING:
             self._complain(
                 f"is not {self._goal.value} after {_LONGEST_SWITCHING * self._period:g} s: "
@@ -158,12 +171,12 @@ class DriveMachine:
         state = self.state
         if self._stopping:
             return DriveCommand.QUICK_STOP
+        if self.let_go or (self._via_off and state is DriveState.QUICK_STOP_ACTIVE):
+            return DriveCommand.DISABLE_VOLTAGE
         if self._goal is not Goal.ON:
             at_rest = self._still >= _REST or self._cycles > LONGEST_REST
             return next_command(self._goal, state, at_rest=at_rest)
         at_rest = self._still >= _REST
-        if state is DriveState.QUICK_STOP_ACTIVE and self._recovering:
-            return DriveCommand.DISABLE_VOLTAGE
         if self.at.mode != self.mode:
             if state in POWERED:
                 return next_command(Goal.OFF, state, at_rest=at_rest)

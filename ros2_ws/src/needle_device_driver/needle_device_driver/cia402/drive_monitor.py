@@ -14,6 +14,7 @@ from needle_device_driver.link.objects import (
     NMT_BOOT_UP,
     NMT_OPERATIONAL,
     POSITION,
+    POSITION_ALONE,
     STATUS,
     STATUS_WITHOUT_INPUTS,
 )
@@ -24,6 +25,7 @@ _MAY_LACK = 1
 _FORGIVEN_AFTER = 25
 
 _LENGTH_WITHOUT_INPUTS = len(STATUS_WITHOUT_INPUTS.pack(0, 0))
+_LENGTH_ALONE = len(POSITION_ALONE.pack(0))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,6 +40,9 @@ class Feedback:
         As sent.
     position : int
         Position actual value [counts].
+    following_error : int
+        How far the axis is short of where its drive wants it [counts]; 0 of a drive that does not
+        tell.
     """
 
     number: int
@@ -45,6 +50,7 @@ class Feedback:
     mode: int
     inputs: int
     position: int
+    following_error: int
 
 
 class DriveMonitor:
@@ -71,6 +77,7 @@ class DriveMonitor:
         self._lock = link.arrival
         self._number = 0
         self._statusword = self._mode = self._inputs = self._position = 0
+        self._following_error = 0
         self._answers: set[int] = set()
         self._syncs = 0
         self._received = dict.fromkeys(_ANSWER, 0)
@@ -95,7 +102,12 @@ class DriveMonitor:
         """The newest process data."""
         with self._lock:
             return Feedback(
-                self._number, self._statusword, self._mode, self._inputs, self._position
+                self._number,
+                self._statusword,
+                self._mode,
+                self._inputs,
+                self._position,
+                self._following_error,
             )
 
     @property
@@ -166,7 +178,7 @@ class DriveMonitor:
         """
         with self._lock:
             self._statusword, self._mode, self._inputs = statusword, mode, inputs
-            self._position = position
+            self._position, self._following_error = position, 0
             self._answers = set(_ANSWER)
             self._count_anew()
             self._number += 1
@@ -223,7 +235,10 @@ class DriveMonitor:
         self._answer(STATUS.function_code, time)
 
     def _on_position(self, data: bytes, time: float) -> None:
-        (self._position,) = POSITION.unpack(data)
+        if len(data) == _LENGTH_ALONE:
+            (self._position,) = POSITION_ALONE.unpack(data)
+        else:
+            self._position, self._following_error = POSITION.unpack(data)
         self._answer(POSITION.function_code, time)
 
     def _on_heartbeat(self, data: bytes, time: float) -> None:

@@ -26,6 +26,10 @@ _SWITCH_OFF_WAIT = 1.0
 _LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
 _KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
 _NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
+_NO_FOLLOWING_ERROR = (
+    "has no following error to map: an axis that is stopped while it is blocked is pulled on by up "
+    "to the following error window when it comes free"
+)
 
 
 class _Need(enum.Enum):
@@ -84,8 +88,11 @@ def set_up(
         write_limits(access, settings, homed=homed)
         map_pdo(access, node, od.COMMAND)
         map_pdo(access, node, od.SET_POINT)
-    missing += _map_status(access, node)
-    map_pdo(access, node, od.POSITION)
+    missing += _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, _NO_INPUTS)
+    if settings.actuated:
+        missing += _map_full(access, node, od.POSITION, od.POSITION_ALONE, _NO_FOLLOWING_ERROR)
+    else:
+        map_pdo(access, node, od.POSITION_ALONE)
     silence_unused(access)
     access.offer(od.CYCLE_PERIOD, round(period * 1e6))
     access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
@@ -205,14 +212,16 @@ def _write_homing_method(access: ObjectAccess, method: int) -> None:
                 access.write(od.HOMING_METHOD, other)
 
 
-def _map_status(access: ObjectAccess, node: int) -> list[str]:
-    if access.has(od.DIGITAL_INPUTS):
-        try:
-            map_pdo(access, node, od.STATUS)
-        except DriveRefusalError:
-            # Either they cannot be mapped, or the next attempt tells what else it is.
-            pass
-        else:
+def _map_full(
+    access: ObjectAccess, node: int, full: od.Pdo, without: od.Pdo, missing: str
+) -> list[str]:
+    """Map a PDO with its last entry where the drive can; return what it lacks."""
+    try:
+        if access.has(full.entries[-1]):
+            map_pdo(access, node, full)
             return []
-    map_pdo(access, node, od.STATUS_WITHOUT_INPUTS)
-    return [_NO_INPUTS]
+    except DriveRefusalError:
+        # Either the entry cannot be read or mapped, or the next attempt tells what else it is.
+        pass
+    map_pdo(access, node, without)
+    return [missing]

@@ -66,6 +66,7 @@ class DeviceCore:
         self._homing_time = 0.0
         self._seen_powered = False
         self._pushed_too_fast = False
+        self._let_go = ""
         self._events: list[Event] = []
         self.state = State.UNCONFIGURED
         self.activity = Activity.NONE
@@ -337,6 +338,13 @@ class DeviceCore:
             self.explain(text)
             self.notice(text, Rule.MAX_ROTATION_RATE)
 
+    def _watch_letting_go(self, at: PairSnapshot) -> None:
+        told, self._let_go = self._let_go, at.let_go
+        if at.let_go and not told:
+            text = f"{at.let_go}: blocked when it was stopped; switched off until the next motion"
+            self.explain(text)
+            self.notice(text, Rule.FOLLOWING_ERROR)
+
     def poll(self, now: float) -> PairSnapshot:
         """Read the axes."""
         self.snapshot = self._axes.poll(now)
@@ -358,6 +366,7 @@ class DeviceCore:
             homed_wanted=self.activity is Activity.STEP,
         )
         self._seen_powered = on and (self._seen_powered or at.powered)
+        self._watch_letting_go(at)
         if problem is not None:
             self.watchdog_trips += problem[0] is Rule.REPLY_AGE
             self.fail(problem[1], problem[0])

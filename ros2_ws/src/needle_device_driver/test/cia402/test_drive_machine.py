@@ -14,8 +14,8 @@ DISABLED, READY, ON, ENABLED, QUICK_STOP, FAULT = 0x0250, 0x0231, 0x0233, 0x0237
 NUMBERS = itertools.count(1)
 
 
-def said(statusword: int, position: int = 0, mode: int = 8) -> Feedback:
-    return Feedback(next(NUMBERS), statusword, mode, 0, position)
+def said(statusword: int, position: int = 0, mode: int = 8, behind: int = 0) -> Feedback:
+    return Feedback(next(NUMBERS), statusword, mode, 0, position, behind)
 
 
 @pytest.fixture
@@ -88,6 +88,32 @@ def test_a_stop_holds_until_the_drive_has_said_that_it_took_it(machine: DriveMac
         assert machine.next_order()[0] is DriveCommand.QUICK_STOP
         machine.update(said(ENABLED))
         assert not machine.ready
+
+
+@pytest.mark.parametrize("behind", [3, -3])
+def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
+    machine: DriveMachine, behind: int
+) -> None:
+    enabled(machine)
+    machine.stop()
+    machine.next_order()
+    for position in (400, 500, 500, 500, 500):
+        assert not machine.let_go
+        machine.update(said(QUICK_STOP, position, behind=2))
+        assert machine.next_order()[0] is DriveCommand.QUICK_STOP
+    machine.update(said(QUICK_STOP, 500, behind=behind))
+    assert machine.let_go
+    assert machine.powered, "it is stopped, it has not lost its power"
+    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+    machine.update(said(DISABLED, 500))
+    assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+    assert machine.trouble == ""
+    machine.want(Goal.ON)
+    for statusword in (DISABLED, READY, ON, ENABLED):
+        machine.next_order()
+        machine.update(said(statusword, 500))
+    assert machine.ready
+    assert not machine.let_go
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:

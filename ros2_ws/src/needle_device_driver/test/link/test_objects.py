@@ -48,7 +48,8 @@ def test_pdos_are_packed_little_endian_in_their_order() -> None:
     assert od.COMMAND.pack(0x0F, 8) == b"\x0f\x00\x08"
     assert od.SET_POINT.pack(-2) == b"\xfe\xff\xff\xff"
     assert od.STATUS.unpack(b"\x37\x02\x08\x01\x00\x00\x00") == (0x0237, 8, 1)
-    assert od.POSITION.unpack(b"\xff\xff\xff\xff") == (-1,)
+    assert od.POSITION.unpack(b"\xff\xff\xff\xff\x02\x00\x00\x00") == (-1, 2)
+    assert od.POSITION_ALONE.unpack(b"\xff\xff\xff\xff") == (-1,)
 
 
 @pytest.mark.parametrize("data", [b"", b"\x37\x02\x08", bytes(8)])

@@ -52,6 +52,7 @@ class ScriptedDrive:
         self.mode = 0
         self.inputs = 0
         self.status_size = 7
+        self.place_size = 8
         self.position = 0
         self.target = 0
         self.next_target = 0
@@ -109,10 +110,9 @@ class ScriptedDrive:
     def sync(self) -> None:
         status = self.statusword.to_bytes(2, "little") + bytes([self.mode])
         status += self.inputs.to_bytes(4, "little")
-        now = [
-            (0x180, status[: self.status_size]),
-            (0x280, self.position.to_bytes(4, "little", signed=True)),
-        ]
+        place = self.position.to_bytes(4, "little", signed=True)
+        place += (self.demand - self.position).to_bytes(4, "little", signed=True)
+        now = [(0x180, status[: self.status_size]), (0x280, place[: self.place_size])]
         if self.loses:
             self.loses -= 1
         else:
@@ -187,6 +187,7 @@ class ScriptedDrive:
                 (0x6041, 0): self.statusword.to_bytes(2, "little"),
                 (0x6061, 0): bytes([self.mode]),
                 (0x6064, 0): self.position.to_bytes(4, "little", signed=True),
+                (0x60F4, 0): (self.demand - self.position).to_bytes(4, "little", signed=True),
                 (0x60FD, 0): self.inputs.to_bytes(4, "little"),
             }
             value = live.get((index, sub)) or self.objects.get((index, sub))

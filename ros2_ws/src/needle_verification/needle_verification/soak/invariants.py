@@ -10,6 +10,9 @@ from collections.abc import Mapping, Sequence
 _SPEED_TICKS = 20
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
+# So near its set-point an axis has arrived [m], [rad] (config/drives.yaml); blocked there and freed
+# after a stop, it goes the rest of it.
+_ARRIVED_INSERTION, _ARRIVED_ROTATION = 5e-6, 1e-3
 # From a release, or a loss, to the last motion [s]: a joystick that falls silent (0.1), an operator
 # that stops (0.1), their looks and the driver's cycle (0.02 each), a driver that stops (0.02), the
 # ramp (0.03); and what each of them is late by itself.
@@ -109,6 +112,7 @@ class Watch:
         self._zero = 0.0
         self._commands: deque[tuple[tuple[float, float], ...]] = deque(maxlen=_COMMANDS)
         self._moving_since: float | None = None
+        self._rest = (0.0, 0.0)
         self._track: deque[tuple[float, float, float]] = deque(maxlen=_SPEED_TICKS + 1)
 
     def violate(self, invariant: str, at: float, text: str) -> None:
@@ -187,7 +191,14 @@ class Watch:
         along, around = insertion - before[1], rotation - before[2]
         self._judge_limits(at, insertion, rotation)
         moves = abs(along) > _REST_INSERTION or abs(around) > _REST_ROTATION
+        if self._moving_since is None:
+            moves = moves and (
+                abs(insertion - self._rest[0]) > _ARRIVED_INSERTION
+                or abs(rotation - self._rest[1]) > _ARRIVED_ROTATION
+            )
         if not moves:
+            if self._moving_since is not None:
+                self._rest = insertion, rotation
             self._moving_since = None
             return
         begins, self._moving_since = self._moving_since is None, self._moving_since or at

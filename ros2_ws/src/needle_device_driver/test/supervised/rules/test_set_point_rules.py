@@ -170,6 +170,45 @@ def test_following_error_of_a_blocked_motor(drive_bench: DriveBench) -> None:
     recovers(bench)
 
 
+def blocked_when_the_hold_is_let_go(bench: DriveBench) -> None:
+    bench.moving()
+    bench.insertion.blocked = True
+    bench.cycle(3, holding=True)
+    assert bench.insertion.demand > bench.insertion.position
+    bench.hold(False)
+    bench.cycle(8)
+    assert bench.state is State.HOLDING
+
+
+def test_following_error_of_a_motor_that_comes_free_after_the_stop(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    blocked_when_the_hold_is_let_go(bench)
+    assert bench.insertion.state == "disabled"
+    assert "insertion: blocked when it was stopped" in bench.status.reason
+    at = bench.positions
+    bench.insertion.blocked = False
+    bench.cycle(10)
+    assert bench.positions == at, "nobody holds"
+    assert [n.rule for n in bench.notices if n.rule is Rule.FOLLOWING_ERROR] != []
+    bench.hold()
+    bench.step()
+    bench.cycle(40, holding=True)
+    assert bench.outcomes[-1] == "succeeded"
+
+
+def test_following_error_that_a_drive_does_not_tell_is_told_at_the_set_up(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.insertion.missing_objects = {0x60F4}
+    bench.insertion.place_size = 4
+    blocked_when_the_hold_is_let_go(bench)
+    assert bench.insertion.state == "quick stop", "it is where it was left, for all one knows"
+    assert "no following error to map" in bench.drives.missing_optional_objects[0]
+
+
 def test_following_error_that_a_drive_reports(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
