@@ -107,7 +107,7 @@ class Watch:
         self._status_at = 0.0
         self._homing_until = -1.0
         self._silent_since: float | None = None
-        self._catches_up_until = -1.0
+        self._catches_up_until = self._ends_until = -1.0
         self._estop_since: float | None = None
         self._zero = 0.0
         self._commands: deque[tuple[tuple[float, float], ...]] = deque(maxlen=_COMMANDS)
@@ -181,6 +181,10 @@ class Watch:
         """Take whether a motor is blocked: freed, it catches up as fast as it can."""
         if blocked:
             self._catches_up_until = at + CATCH_UP_BOUND
+
+    def see_drives_go_on(self, at: float) -> None:
+        """Take that the drives' own time stood still until now: what was under way ends by it."""
+        self._ends_until = at + WATCHDOG_BOUND
 
     def see_motors(self, at: float, insertion: float, rotation: float) -> None:
         """Take where the motors really are."""
@@ -260,7 +264,7 @@ class Watch:
             )
         # The hand's hold lasts as long as it presses and its node says so.
         idle = at - max(min(self._pressed_until, self._told_until), self._other_until)
-        if idle > self._release_bound:
+        if idle > self._release_bound and at > self._ends_until:
             self.violate(
                 "no_motion_without_hold",
                 at,

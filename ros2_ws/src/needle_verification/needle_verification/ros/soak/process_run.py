@@ -34,6 +34,8 @@ _MOST = 3
 _LATEST, _SHORTEST, _LONGEST = 3.0, 0.05, 3.0
 _DEEP_ENOUGH = 0.002
 _START, _DRAW_OUT, _STILL = 120.0, 60.0, 1.0
+# The emulated drives move on with each SYNC, and say so: without a driver they stand still [s].
+_WITHOUT_SYNC = 0.1
 
 
 class Witness(DriveHand):
@@ -48,6 +50,7 @@ class Witness(DriveHand):
     def __init__(self) -> None:
         self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
         self._begun = time.monotonic()
+        self._moved_at = 0.0
         super().__init__(steers=False)
         # Whose press it is that moves the needle.
         self._holder = PERSON
@@ -100,8 +103,11 @@ class Witness(DriveHand):
 
     def _on_positions(self, message: JointState) -> None:
         super()._on_positions(message)
+        before, self._moved_at = self._moved_at, self.now
+        if self._moved_at - before > _WITHOUT_SYNC:
+            self.watch.see_drives_go_on(self._moved_at)
         at = self.motors[-1]
-        self.watch.see_motors(self.now, at.insertion, at.rotation)
+        self.watch.see_motors(self._moved_at, at.insertion, at.rotation)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         super()._on_status(message)
