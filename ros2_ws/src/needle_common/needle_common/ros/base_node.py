@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import weakref
 from collections import Counter
 from collections.abc import Callable
 from typing import ClassVar
@@ -51,12 +50,11 @@ class DiagnosticsPublisher:
         The node whose health it is.
     """
 
-    _of: ClassVar[weakref.WeakKeyDictionary[Node, DiagnosticsPublisher]] = (
-        weakref.WeakKeyDictionary()
-    )
+    _OF_NODE: ClassVar[str] = "_needle_diagnostics"
 
     def __init__(self, node: Node) -> None:
-        self._of[node] = self
+        # Kept by the node itself: what keeps a node from outside keeps it for ever.
+        vars(node)[self._OF_NODE] = self
         self._node = node
         self._refused: Counter[str] = Counter()
         self._complaints: set[tuple[str, str]] = set()
@@ -68,7 +66,8 @@ class DiagnosticsPublisher:
     @classmethod
     def of(cls, node: Node) -> DiagnosticsPublisher:
         """Return the node's own, made where it has none."""
-        return cls._of.get(node) or cls(node)
+        known: DiagnosticsPublisher | None = vars(node).get(cls._OF_NODE)
+        return known or cls(node)
 
     def set(self, part: str, diagnostic: Diagnostic) -> None:
         """Take the health of one part; published at once where level or message changed."""

@@ -164,7 +164,9 @@ class Watch:
         """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
         if self._before is not None:
             _, insertion, rotation = self._before
-            self._commands.append(((insertion, rotation - self._zero), *points))
+            # What comes late is taken up from where the needle is, on to the next point ahead.
+            ahead = [point for point in points if point[0] > insertion] or points[-1:]
+            self._commands.append(((insertion, rotation - self._zero), *ahead))
 
     def see_driver(self, at: float, *, speaks: bool) -> None:
         """Take whether the driver runs and hears its drives: else it cannot know better."""

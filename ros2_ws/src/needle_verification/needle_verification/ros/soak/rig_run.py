@@ -25,7 +25,7 @@ from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 # out. A killed node counts for 8 s more, and a driver looks for its drives again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
 # A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
-UNDISTURBED_DEPTH, _CONVERGED = 0.04, 0.001
+UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 # The way of a press to the driver.
 _HOLD_LINKS = ("/joy", "/device/hold")
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
