@@ -1,4 +1,4 @@
-"""Common part of both launch files, the one module that needs `launch`: PyPI does not have it."""
+"""Common part of the launch files, the one module that needs `launch`: PyPI does not have it."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from needle_bringup.simulation.launch_nodes import refuse_misspelt
-from needle_bringup.simulation.rig_configuration import PACKAGES
+from needle_bringup.simulation.launch_nodes import LAUNCHED_PACKAGES, refuse_misspelt
 from needle_bringup.simulation.simulate import RECORDER_GRACE
 from needle_common.settings.parameter_files import Parameters
 
@@ -21,6 +20,7 @@ def describe(
     arguments: Mapping[str, tuple[str, str]],
     nodes: Callable[[Mapping[str, str]], Parameters],
     choices: Mapping[str, Sequence[str]] = {},
+    words: Callable[[Mapping[str, str]], Mapping[str, Sequence[str]]] = lambda _: {},
 ) -> LaunchDescription:
     """Return a graph that ends as soon as one of its nodes does.
 
@@ -34,14 +34,20 @@ def describe(
         launch before a node is started.
     choices : mapping
         Argument to all that it may be, where not anything.
+    words : callable
+        Takes launch argument -> text, returns node -> what else is on its command line.
     """
     every = {**arguments, "namespace": ("", "namespace of all nodes")}
 
     def start(context: Any) -> list[Node]:
         refuse_misspelt(context.launch_configurations, list(every))
         given = {name: LaunchConfiguration(name).perform(context) for name in every}
+        more = words(given)
         namespace = given.pop("namespace")
-        return [_node(name, values, namespace) for name, values in nodes(given).items()]
+        return [
+            _node(name, values, namespace, more.get(name, ()))
+            for name, values in nodes(given).items()
+        ]
 
     declared = [
         DeclareLaunchArgument(
@@ -52,7 +58,7 @@ def describe(
     return LaunchDescription([*declared, OpaqueFunction(function=start)])
 
 
-def _node(name: str, values: Mapping[str, Any], namespace: str) -> Node:
+def _node(name: str, values: Mapping[str, Any], namespace: str, words: Sequence[str]) -> Node:
     # One by one: a parameter file would have to name the node with its namespace, and what is
     # named otherwise runs on its defaults.
     ros_arguments = []
@@ -61,9 +67,10 @@ def _node(name: str, values: Mapping[str, Any], namespace: str) -> Node:
     # The recorder writes out what it still holds.
     patience = {"sigterm_timeout": str(RECORDER_GRACE)} if name == "recorder" else {}
     return Node(
-        package=PACKAGES[name],
+        package=LAUNCHED_PACKAGES[name],
         executable=name,
         namespace=namespace,
+        arguments=list(words),
         ros_arguments=ros_arguments,
         output="screen",
         on_exit=Shutdown(reason=f"{name} has ended"),

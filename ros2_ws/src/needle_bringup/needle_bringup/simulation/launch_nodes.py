@@ -8,10 +8,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from needle_bags.format.bag_writer import refuse_existing_bag
-from needle_bringup.simulation.rig_configuration import NODES, command_line_parameters, merge
+from needle_bringup.simulation.rig_configuration import (
+    NODES,
+    PACKAGES,
+    command_line_parameters,
+    merge,
+)
 from needle_bringup.simulation.simulate_options import parse
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import Parameters, read_parameters
+
+LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_analysis"}
+"""Package of each node that a launch file starts."""
+# What the live view wants and the player sends under /replay only: a rig would obey it.
+_NOT_FOR_RIGS = ("target_plane", "target_point")
 
 # Parameter that no file may set -> the launch argument that does.
 _OF_SIMULATION = {
@@ -122,6 +132,49 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
             raise UserError(f"drives:={arguments['drives']}: wants one section, device_driver")
         parameters.update(driver)
     return _with_file(parameters, arguments["params"], _OF_RIG)
+
+
+def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
+    """Return the nodes of replay.launch.py.
+
+    Parameters
+    ----------
+    arguments : mapping
+        Launch argument -> text: bag.
+
+    Returns
+    -------
+    dict
+        Node -> parameter -> value: none.
+
+    Raises
+    ------
+    UserError
+        If no bag is named, or it is not there.
+    """
+    if not arguments["bag"]:
+        raise UserError("bag:= is missing: the folder of the bag to play")
+    if not (Path(arguments["bag"]).expanduser() / "metadata.yaml").is_file():
+        raise UserError(f"bag:={arguments['bag']}: no bag there (no metadata.yaml)")
+    return {"player": {}, "live_view": {}}
+
+
+def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
+    """Return what is on the command lines of the nodes of replay.launch.py.
+
+    Parameters
+    ----------
+    arguments : mapping
+        Launch argument -> text: bag, rate, start, loop and namespace.
+    """
+    player = [str(Path(arguments["bag"]).expanduser().absolute())]
+    for name in ("rate", "start"):
+        player += [f"--{name}", arguments[name]]
+    if arguments["loop"] == "true":
+        player.append("--loop")
+    played = "/".join(["/replay", *filter(None, arguments["namespace"].split("/"))])
+    remapped = (["-r", f"{name}:={played}/{name}"] for name in _NOT_FOR_RIGS)
+    return {"player": player, "live_view": ["--ros-args", *(w for ws in remapped for w in ws)]}
 
 
 def _with_file(parameters: Parameters, file: str, reserved: Mapping[str, str]) -> Parameters:

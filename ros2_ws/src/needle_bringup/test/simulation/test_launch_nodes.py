@@ -11,6 +11,8 @@ import yaml
 from needle_bringup.simulation.launch_nodes import (
     nodes_beside_rig,
     refuse_misspelt,
+    replay_words,
+    replayed_nodes,
     simulated_nodes,
 )
 from needle_common.errors import UserError
@@ -104,6 +106,23 @@ def test_what_an_argument_says_no_file_says(tmp_path: Path) -> None:
     good = file_of(tmp_path, {"plane_controller": {"ros__parameters": {"depth": 0.05}}})
     assert simulated(params=good)["plane_controller"]["depth"] == 0.05
     assert beside_rig(params=good)["plane_controller"] == {"depth": 0.05}
+
+
+def test_a_bag_is_played_for_viewers(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").touch()
+    arguments = {"bag": str(tmp_path), "rate": "0.5", "start": "2.0", "loop": "true"}
+    assert replayed_nodes(arguments) == {"player": {}, "live_view": {}}
+    words = replay_words({**arguments, "namespace": "/first"})
+    assert words["player"] == [str(tmp_path), "--rate", "0.5", "--start", "2.0", "--loop"]
+    # What a rig would obey is played under /replay only.
+    assert "target_plane:=/replay/first/target_plane" in words["live_view"]
+
+
+def test_a_bag_that_is_not_there_is_not_played(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="bag:= is missing"):
+        replayed_nodes({"bag": ""})
+    with pytest.raises(UserError, match="no bag there"):
+        replayed_nodes({"bag": str(tmp_path)})
 
 
 def test_images_that_are_sent_best_effort_are_heard() -> None:
