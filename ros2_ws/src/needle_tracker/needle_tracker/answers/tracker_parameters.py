@@ -151,8 +151,8 @@ class StereoTrackerParameters:
     confirm_pairs: int = fixed_parameter(
         3,
         "-",
-        "Pairs in a row that must agree, where the insertion is not known and nothing shows that "
-        "the needle has come since the first pair.",
+        "Pairs in a row that must agree, and between them the needle move, where the insertion is "
+        "not known and nothing shows that the needle has come since the first pair.",
         1,
         100,
     )

@@ -27,6 +27,7 @@ from needle_tracker.optics.calibration import SIDES
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
+    has_come,
     is_half_sound,
     is_sound,
     look_alike,
@@ -39,7 +40,8 @@ from needle_tracker.tracking.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUN
 from needle_tracker.tracking.guided_search import guided_pairs, leads, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement, judged
 from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.track import Anchor, Track, TrackState
+from needle_tracker.tracking.tip_prediction import Anchor
+from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
@@ -266,7 +268,8 @@ class Acquisition:
         tip = measured.tip or measured.contested
         if not wanted or tip is None:
             return measured
-        if self._track.contest(tip, insertion, wanted):
+        come = has_come(measured.image_tips)
+        if self._track.contest(tip, insertion, wanted, come=come):
             return dataclasses.replace(measured, tip=tip, contested=tip, reason="")
         return dataclasses.replace(measured, tip=None, reason=measured.reason or NoTip.UNCLEAR)
 

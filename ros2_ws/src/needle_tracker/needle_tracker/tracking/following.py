@@ -18,8 +18,7 @@ from needle_tracker.image.looks import LINE_LOOKS, Look
 from needle_tracker.image.tip_fit import Expected, ImageTip, hidden
 from needle_tracker.optics.compiled_projection import point_jacobian, project_point
 from needle_tracker.optics.refraction import RefractedCamera
-from needle_tracker.tracking.tip_prediction import TipMotion
-from needle_tracker.tracking.track import Anchor
+from needle_tracker.tracking.tip_prediction import Anchor, TipMotion
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,7 @@ from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.tracking.following import SOUND_PX, Follower, shows_end
 from needle_tracker.tracking.gates import tip_at_entry
 from needle_tracker.tracking.single_view import Seen, taken_in
-from needle_tracker.tracking.tip_prediction import TipMotion
-from needle_tracker.tracking.track import Anchor
+from needle_tracker.tracking.tip_prediction import Anchor, TipMotion
 
 _SPACING = 1e-3  # of the places along the line of sight: about half a needle apart in the image [m]
 # The needle's way, and where the other view's end is found, say better than a view how far it goes.

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.image.tip_fit import Expected, ImageTip
 from needle_tracker.optics.refraction import RefractedCamera
+from needle_tracker.tracking.evidence import has_come
 from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.triangulation import SpatialTip, triangulate
@@ -71,6 +72,8 @@ def judged(
     if tip is None:
         return Measurement(None, track.state, NoTip.NO_COMMON_POINT, found)
     refused = track.judge(tip, insertion)
+    if refused is None and insertion is None and track.stands(tip) and not has_come(found):
+        refused = NoTip.STANDS
     if refused is None:
         return Measurement(tip, track.state, "", found)
     return Measurement(None, track.state, refused, found, tip)

@@ -26,4 +26,6 @@ class NoTip(str, enum.Enum):
     TOO_FAR = "too far from the last tip"
     SURPRISING = "too far from the prediction"
     UNCLEAR = "not clear enough to begin with"
+    UNCONFIRMED = "not confirmed yet"
+    STANDS = "not moved yet"
     HIDDEN = "the end is hidden in both images"

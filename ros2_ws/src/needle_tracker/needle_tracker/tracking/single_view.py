@@ -18,8 +18,7 @@ from needle_tracker.optics.compiled_projection import point_jacobian, project_po
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.following import SLACK, Follower, is_sound, misfit
-from needle_tracker.tracking.tip_prediction import TipMotion, across
-from needle_tracker.tracking.track import Anchor
+from needle_tracker.tracking.tip_prediction import Anchor, TipMotion, across
 from needle_tracker.tracking.triangulation import SpatialTip
 
 # Standard deviations: what is farther from the prediction is something else. A prediction that is

@@ -23,6 +23,7 @@ _LEAN_SIGMA = 0.12  # between the visible end and the heading (pre-bend) [rad]
 # What spoils a view spoils the next one's too: the gain is not all believed.
 _ALIKE = 1.0
 _NO_SURPRISE = 6.0  # squared, over its covariance
+_ON_WAY, _MOVED = 9.0, 9.0  # likewise, across the way and along it
 _APART = 0.25  # variance of what lies between two places, over their squared distance
 
 
@@ -88,6 +89,27 @@ class TipMotion:
         off = tip.position - self.position
         return float(off @ np.linalg.solve(self.covariance[:3, :3] + tip.covariance, off))
 
+    def gone_to(self, tip: SpatialTip, curvature: float) -> float | None:
+        """Return how far a needle that was here has gone along its axis to a measured tip.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            As measured.
+        curvature : float
+            The largest [1/m].
+
+        Returns
+        -------
+        float or None
+            Squared, over the covariance of both along the axis; None for a tip beside its way.
+        """
+        way = float((tip.position - self.position) @ self.heading)
+        if self.advanced(way, curvature).surprise(tip) > _ON_WAY:
+            return None
+        along = self.heading @ (self.covariance[:3, :3] + tip.covariance) @ self.heading
+        return way * way / float(along)
+
     def direction_surprise(self, tip: SpatialTip) -> float:
         """Return the squared angle of a tip's direction to the heading, over all that is unknown.
 
@@ -147,6 +169,62 @@ class TipMotion:
             heading / np.linalg.norm(heading),
             0.5 * (left + left.T),
         )
+
+
+@dataclasses.dataclass(frozen=True)
+class Anchor:
+    """The last believed tip, or where it should be now.
+
+    Attributes
+    ----------
+    motion : TipMotion
+        Position and heading.
+    insertion : float or None
+        Of that moment [m].
+    ahead : float
+        How far this is ahead of what was seen last [m].
+    known : bool
+        Whether that follows from the insertion.
+    unseen : float
+        How far the needle went since both views showed it [m].
+    """
+
+    motion: TipMotion
+    insertion: float | None
+    ahead: float = 0.0
+    known: bool = False
+    unseen: float = 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class Sights:
+    """Sights in a row of what may be a needle.
+
+    Attributes
+    ----------
+    begin : TipMotion or None
+        Where it was seen first; None where a needle was believed last.
+    last : Anchor
+        Where it was seen last.
+    count : int
+        Pairs.
+    """
+
+    begin: TipMotion | None
+    last: Anchor
+    count: int = 1
+
+    def one_more(self, seen: Anchor) -> Sights:
+        """Return these and another."""
+        return Sights(self.begin, seen, self.count + 1)
+
+    def lead_to(self, tip: SpatialTip, curvature: float) -> bool:
+        """Return whether a tip is where it stood or has gone to along its axis."""
+        return self.begin is None or self.begin.gone_to(tip, curvature) is not None
+
+    def has_moved(self, tip: SpatialTip, curvature: float) -> bool:
+        """Return whether it has gone to a tip since it was seen first; what was believed has."""
+        return self.begin is None or (self.begin.gone_to(tip, curvature) or 0.0) > _MOVED
 
 
 def across(unit: Array) -> Array:

@@ -17,6 +17,7 @@ from needle_tracker.image.looks import CLEAR_WIDTHS, MapLook
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, StagedEnd
 from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.refusals import NoTip
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -152,7 +153,8 @@ class TipTracker:
         if maps.tip is not None:
             tip = self._claims.widened(maps.tip, OF_MAP)
             maps = dataclasses.replace(maps, tip=self._staged.placed(tip, maps.shaft, insertion))
-        shown = maps.tip is not None or maps.state is TrackState.CONFIRMING
+        stands = maps.reason == NoTip.STANDS
+        shown = maps.tip is not None or (maps.state is TrackState.CONFIRMING and not stands)
         self._in_vain = 0 if shown else self._in_vain + 1
         if lines.tip is None or maps.tip is None:
             self._against = 0

@@ -6,7 +6,6 @@ data.
 
 from __future__ import annotations
 
-import dataclasses
 import enum
 import math
 
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 
 from needle_tracker.tracking.gates import GateSettings, refusal
 from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.tip_prediction import TipMotion
+from needle_tracker.tracking.tip_prediction import Anchor, Sights, TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
@@ -48,31 +47,6 @@ class TrackState(enum.Enum):
     ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
 
 
-@dataclasses.dataclass(frozen=True)
-class Anchor:
-    """The last believed tip, or where it should be now.
-
-    Attributes
-    ----------
-    motion : TipMotion
-        Position and heading.
-    insertion : float or None
-        Of that moment [m].
-    ahead : float
-        How far this is ahead of what was seen last [m].
-    known : bool
-        Whether that follows from the insertion.
-    unseen : float
-        How far the needle went since both views showed it [m].
-    """
-
-    motion: TipMotion
-    insertion: float | None
-    ahead: float = 0.0
-    known: bool = False
-    unseen: float = 0.0
-
-
 class Track:
     """State of the track, advanced once per image pair.
 
@@ -84,6 +58,7 @@ class Track:
 
     def __init__(self, settings: GateSettings) -> None:
         self._settings = settings
+        self._curvature = settings.reach.curvature
         self.reset()
 
     def reset(self) -> None:
@@ -92,10 +67,9 @@ class Track:
         self.anchor: Anchor | None = None
         self._misses = 0
         self._hidden = 0
-        self._rival: Anchor | None = None
-        self._next_rival: Anchor | None = None
-        self._rivals = self._next_rivals = 0
-        self._agreeing = 0
+        self._rival: Sights | None = None
+        self._next_rival: Sights | None = None
+        self._agreeing: Sights | None = None
         self._sights = 0
         self._is_sure = False
         self._passed: list[tuple[float, Array]] = []
@@ -124,7 +98,7 @@ class Track:
         ahead, known = 0.0, False
         if insertion is not None and anchor.insertion is not None:
             ahead, known = insertion - anchor.insertion, True
-        motion = anchor.motion.advanced(ahead, self._settings.reach.curvature, anchor.unseen)
+        motion = anchor.motion.advanced(ahead, self._curvature, anchor.unseen)
         return Anchor(motion, insertion, ahead, known, anchor.unseen + abs(ahead))
 
     def update_from_single_view(self, predicted: Anchor, motion: TipMotion) -> None:
@@ -154,8 +128,12 @@ class Track:
             merged, reason = tip, NoTip.SURPRISING
         if predicted is None or reason not in (None, NoTip.SURPRISING):
             return reason
-        miss = float(np.linalg.norm(merged.position - predicted.motion.position))
-        if miss > self.tolerance(predicted):
+        off = merged.position - predicted.motion.position
+        way = float(off @ predicted.motion.heading)
+        beside = float(np.linalg.norm(off - way * predicted.motion.heading))
+        # Without the insertion nobody knows how far it goes, but it goes its heading's way.
+        astray = not predicted.known and beside > self._room(way)
+        if astray or float(np.linalg.norm(off)) > self.tolerance(predicted):
             return NoTip.TOO_FAR
         if following and predicted.motion.surprise(tip) > _LARGEST_SURPRISE:
             return NoTip.SURPRISING
@@ -197,15 +175,15 @@ class Track:
         """
         predicted = self.predict(insertion)
         if self.state is not TrackState.TRACKING:
-            agreed = self._agreeing if self.state is TrackState.CONFIRMING else 0
-            # What has won has been seen in agreement with itself before.
-            self._agreeing = max(agreed, self._next_rivals - 1 if anew else 0) + 1
+            agreeing = self._seen_again(tip, insertion, self._next_rival if anew else None)
             wanted = 1 if come else self._settings.confirm_pairs
             if insertion is not None:
                 wanted = 1 if certain or self.state is TrackState.LOST else _CONFIRM_KNOWN
-            confirmed = self._agreeing >= wanted
+            told = insertion is not None or come or agreeing.has_moved(tip, self._curvature)
+            confirmed = told and agreeing.count >= wanted
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
-        self._misses = self._hidden = self._rivals = self._next_rivals = 0
+            self._agreeing = agreeing
+        self._misses = self._hidden = 0
         self._rival = self._next_rival = None
         if anew and (predicted is None or not self._is_on_way(tip, predicted)):
             self._sights, self._is_sure, self._passed = 0, False, []
@@ -220,6 +198,33 @@ class Track:
             self._passed = [p for p in self._passed if p[0] < insertion - _PITCH]
             self._passed.append((insertion, motion.position))
         return tip if self.state is TrackState.TRACKING else None
+
+    def _seen_again(self, tip: SpatialTip, insertion: float | None, rival: Sights | None) -> Sights:
+        """Return the sights that agree, with one more."""
+        agreeing = self._first_sight(tip, insertion)
+        before = self._agreeing if self.state is TrackState.CONFIRMING else None
+        if before and (insertion is not None or before.lead_to(tip, self._curvature)):
+            agreeing = before.one_more(agreeing.last)
+        # What has won has been seen in agreement with itself before.
+        return agreeing if rival is None or rival.count < agreeing.count else rival
+
+    def _first_sight(self, tip: SpatialTip, insertion: float | None) -> Sights:
+        last = self.anchor if self.has_begun else None
+        stands = last is not None and last.motion.surprise(tip) < _NO_SURPRISE
+        seen = Anchor(TipMotion.start(tip), insertion)
+        return Sights(None if stands else seen.motion, seen)
+
+    def stands(self, tip: SpatialTip) -> bool:
+        """Return whether a tip is that of a thing that was seen often enough and has not moved.
+
+        Without the insertion nothing tells it from an old track, a scratch or a screw.
+        """
+        agreeing = self._agreeing
+        if self.state is not TrackState.CONFIRMING or agreeing is None:
+            return False
+        often = agreeing.count >= self._settings.confirm_pairs
+        same = agreeing.lead_to(tip, self._curvature)
+        return often and same and not agreeing.has_moved(tip, self._curvature)
 
     def _is_on_way(self, tip: SpatialTip, predicted: Anchor) -> bool:
         miss = float(np.linalg.norm(tip.position - predicted.motion.position))
@@ -301,7 +306,9 @@ class Track:
         miss = float(np.linalg.norm(tip.position - predicted.motion.position))
         return miss > _FAR and predicted.motion.surprise(tip) > _NO_SURPRISE
 
-    def contest(self, tip: SpatialTip, insertion: float | None, wanted: int) -> bool:
+    def contest(
+        self, tip: SpatialTip, insertion: float | None, wanted: int, *, come: bool = False
+    ) -> bool:
         """Note a tip that the track does not bear out; return whether it has won.
 
         Parameters
@@ -312,45 +319,45 @@ class Track:
             Length of needle in the phantom at the exposure [m].
         wanted : int
             How many in a row win.
+        come : bool
+            Whether both views show an end where nothing was before.
 
         Returns
         -------
         bool
             Whether enough such tips in a row agree: then the track was wrong.
         """
-        rival = self._rival
-        agrees = False
-        if rival is not None:
+        sights = self._first_sight(tip, insertion)
+        if (rival := self._rival) is not None:
             ahead, allowed = 0.0, self._settings.free_step
-            if insertion is not None and rival.insertion is not None:
-                ahead = insertion - rival.insertion
+            if insertion is not None and rival.last.insertion is not None:
+                ahead = insertion - rival.last.insertion
                 allowed = self._settings.step_margin + _HEADING_TOLERANCE * abs(ahead)
-            motion = rival.motion.advanced(ahead, self._settings.reach.curvature)
-            agrees = float(np.linalg.norm(tip.position - motion.position)) <= allowed
+            motion = rival.last.motion.advanced(ahead, self._curvature)
+            if float(np.linalg.norm(tip.position - motion.position)) <= allowed:
+                sights = rival.one_more(sights.last)
         # Of what one pair shows several may agree with the pair before: that is one sight of it.
-        count = self._rivals + 1 if agrees else 1
-        if count > self._next_rivals:
-            self._next_rival = Anchor(TipMotion.start(tip), insertion)
-            self._next_rivals = count
-        return count >= wanted
+        if self._next_rival is None or sights.count > self._next_rival.count:
+            self._next_rival = sights
+        told = insertion is not None or come or sights.has_moved(tip, self._curvature)
+        return told and sights.count >= wanted
 
-    def _pass_rival_on(self) -> None:
+    def pass_on(self) -> None:
         """Keep this pair's rival for the next: rivals win in a row, or not at all."""
-        self._rival, self._rivals = self._next_rival, self._next_rivals
-        self._next_rival, self._next_rivals = None, 0
+        self._rival, self._next_rival = self._next_rival, None
 
     def miss(self) -> None:
         """Note a pair without a believed tip."""
         settings = self._settings
-        self._pass_rival_on()
+        self.pass_on()
         self._misses += 1
         if self.state is TrackState.TRACKING:
             if self._misses >= settings.lost_after:
                 self.state = TrackState.LOST
         elif self.state is not TrackState.LOST and not self._may_confirm_yet():
-            rival = self._rival, self._rivals
+            rival = self._rival
             self.reset()
-            self._rival, self._rivals = rival
+            self._rival = rival
         patience = _PATIENCE if self.is_established else 1
         if self.state is TrackState.LOST and self._misses >= patience * settings.forget_after:
             self.reset()
@@ -364,7 +371,7 @@ class Track:
     def hide(self) -> None:
         """Note a pair that shows the shaft where it should be, but its end in neither view."""
         self._hidden += 1
-        self._pass_rival_on()
+        self.pass_on()
         if self._hidden > _HIDDEN_PER_LOST * self._settings.lost_after:
             self.miss()
 
@@ -374,12 +381,13 @@ class Track:
         The needle goes the stage's way, bending at most by its largest curvature, and its heading
         is known to a few degrees.
         """
-        settings = self._settings
         if not predicted.known:
-            return settings.free_step * (self._misses + self._hidden + 1)
-        way = predicted.unseen
-        bend = 0.5 * settings.reach.curvature * way * way
-        return settings.step_margin + _HEADING_TOLERANCE * way + bend
+            return self._settings.free_step * (self._misses + self._hidden + 1)
+        return self._room(predicted.unseen)
+
+    def _room(self, way: float) -> float:
+        bend = 0.5 * self._curvature * way * way
+        return self._settings.step_margin + _HEADING_TOLERANCE * abs(way) + bend
 
 
 def _is_about(tip: SpatialTip, predicted: Anchor | None, miss: float, surprise: float) -> bool:

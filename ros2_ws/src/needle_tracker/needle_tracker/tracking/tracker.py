@@ -174,8 +174,10 @@ class StereoTracker:
             )
             return Measurement(tip, self.track.state, "")
         measured = self._follow(images, insertion)
-        if measured is None:
-            measured = self._acquisition.look(images, insertion, self._last)
+        if measured is None or measured.reason == NoTip.STANDS:
+            # Beside what stands still, the needle may come.
+            searched = self._acquisition.look(images, insertion, self._last)
+            measured = searched if measured is None or searched.tip is not None else measured
         if measured.tip is None:
             return self._missed(measured, images, insertion)
         return self._taken(measured, measured.tip, insertion)
@@ -187,6 +189,8 @@ class StereoTracker:
         alone = self._update_from_single_view(images, insertion)
         if measured.reason in (NoTip.HIDDEN, NoTip.UNCERTAIN):
             self.track.hide()
+        elif measured.reason == NoTip.STANDS:
+            self.track.pass_on()
         else:
             self.track.miss()
         if self.track.anchor is None:
@@ -249,7 +253,7 @@ class StereoTracker:
             if sound:
                 self._sound_at = insertion
                 self._usual.see((left_tip, right_tip))
-        reason = "not confirmed yet" if believed is None else ""
+        reason = NoTip.UNCONFIRMED if believed is None else ""
         return dataclasses.replace(measured, tip=believed, state=self.track.state, reason=reason)
 
     def _steadied(self, left: ImageTip, right: ImageTip) -> tuple[ImageTip, ImageTip]:
@@ -312,7 +316,8 @@ class StereoTracker:
             measured = judged(self.views, self.track, found, insertion)
             sound = is_sound(found, SOUND_PX, SOUND_ALONG_PX)
             uncertain = measured.reason == NoTip.UNCERTAIN and self.track.is_unbroken
-            if measured.tip is None and (sound or not uncertain):
+            stands = measured.reason == NoTip.STANDS
+            if measured.tip is None and not stands and (sound or not uncertain):
                 return None
         return dataclasses.replace(measured, regions=regions)
 

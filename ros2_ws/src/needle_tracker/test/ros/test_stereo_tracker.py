@@ -236,12 +236,17 @@ def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None
     bench.until(lambda: bench.health["track"][1].startswith("TRACKING: no"))
 
 
-def test_without_joint_states_the_images_alone_count(context: Context, images: Images) -> None:
+def test_without_joint_states_the_images_alone_count(
+    context: Context, images: Images, draw_pair: Drawer, make_arc: Callable[..., np.ndarray]
+) -> None:
     bench = Bench(context, joint_timeout=0.05, confirm_pairs=2)
+    farther = draw_pair(make_arc(INSERTION + 1e-3, 5.0, 1.0))
     try:
-        for number, wanted in ((1, False), (2, True)):
-            bench.image("left", number * 1_000_000, images[0])
-            bench.image("right", number * 1_000_000, images[1])
+        for number, (pair, wanted) in enumerate(
+            ((images, False), (images, False), (farther, True), (farther, True))
+        ):
+            bench.image("left", number * 1_000_000, pair[0])
+            bench.image("right", number * 1_000_000, pair[1])
             assert found(bench.answer()) is wanted
         bench.until(lambda: bench.health["joints"][0] == 1)
     finally:

@@ -23,8 +23,8 @@ from needle_tracker.tracking.following import Follower
 from needle_tracker.tracking.guided_search import guided_pairs, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.tip_prediction import TipMotion
-from needle_tracker.tracking.track import Anchor, TrackState
+from needle_tracker.tracking.tip_prediction import Anchor, TipMotion
+from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 

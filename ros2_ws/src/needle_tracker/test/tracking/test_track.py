@@ -104,7 +104,8 @@ def test_with_the_insertion_known_one_tip_confirms(gates: GateSettings) -> None:
 
 def test_without_it_several_must_agree(gates: GateSettings) -> None:
     track = Track(gates)
-    assert [track.accept(tip(), None) is not None for _ in range(3)] == [False, False, True]
+    moving = [tip(z=0.05 + 1e-3 * i) for i in range(3)]
+    assert [track.accept(each, None) is not None for each in moving] == [False, False, True]
     track.reset()
     assert track.accept(tip(), None) is None
     states = [track.state]
@@ -112,6 +113,62 @@ def test_without_it_several_must_agree(gates: GateSettings) -> None:
     states.append(track.state)
     assert states == [TrackState.CONFIRMING, TrackState.SEARCHING]
     assert track.anchor is None
+
+
+def test_what_stands_still_is_not_believed_without_the_insertion(gates: GateSettings) -> None:
+    track = Track(gates)
+    along = 3.0 * math.sqrt(2e-9)  # 3 standard deviations of two such tips
+    for i in range(9):
+        assert not track.stands(tip()) or i >= 3
+        assert track.accept(tip(z=0.05 + 0.4 * along * (-1) ** i), None) is None
+    assert track.stands(tip())
+    assert not track.stands(tip(z=0.051))
+    assert track.accept(tip(z=0.051), None) is not None
+    assert not track.stands(tip(z=0.051))
+
+
+def test_another_thing_beside_what_stands_still_has_not_moved_there(gates: GateSettings) -> None:
+    track = Track(gates)
+    for _ in range(3):
+        track.accept(tip(), None)
+    # Where it is seen first counts for it alone: two more sights, and a way of its own.
+    beside = [tip(x=1e-3, z=0.05 + 1e-3 * i) for i in range(3)]
+    assert [track.accept(each, None) is not None for each in beside] == [False, False, True]
+
+
+def test_a_lost_needle_may_stand_where_it_was_believed_and_nowhere_else(
+    gates: GateSettings,
+) -> None:
+    for z, believed in ((0.052, True), (0.0525, False)):
+        track = Track(gates)
+        for i in range(3):
+            track.accept(tip(z=0.05 + 1e-3 * i), None)
+        for _ in range(3):
+            track.miss()
+        assert track.state is TrackState.LOST
+        seen = [track.accept(tip(z=z), None) is not None for _ in range(6)]
+        assert seen == [False, False, *[believed] * 4]
+
+
+def test_a_rival_that_stands_still_wins_only_with_the_insertion(gates: GateSettings) -> None:
+    for insertion, wins in ((0.05, True), (None, False)):
+        track = Track(gates)
+        track.accept(tip(), insertion, come=True)
+        won = []
+        for _ in range(4):
+            won.append(track.contest(tip(x=2e-3, z=0.06), insertion, 2))
+            track.miss()
+        assert any(won) is wins
+    assert track.contest(tip(x=2e-3, z=0.061), None, 2)
+    assert track.contest(tip(x=-2e-3), None, 1, come=True)
+
+
+def test_without_the_insertion_it_still_goes_its_headings_way(gates: GateSettings) -> None:
+    track = Track(gates)
+    track.accept(tip(), None, come=True)
+    assert track.judge(tip(z=0.054), None) is None
+    assert track.judge(tip(x=1.9e-3, z=0.054), None) is None
+    assert track.judge(tip(x=2.3e-3, z=0.054), None) == NoTip.TOO_FAR
 
 
 def test_what_has_come_is_confirmed_by_one_sight_without_the_insertion(gates: GateSettings) -> None:

@@ -204,6 +204,20 @@ def test_without_an_encoder_a_needle_that_went_on_unseen_is_found_again(
     assert np.linalg.norm(answer.tip.position - path[-1]) < 1e-4
 
 
+def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
+    tracker: StereoTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    old, reasons = make_arc(0.045, 5.0, 0.5), []
+    for mm in [40] * 4 + list(range(42, 50, 2)):
+        path = make_arc(1e-3 * mm, 6.0, 2.6)
+        (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
+        answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
+        reasons.append(str(answer.reason))
+        if answer.tip is not None:
+            assert np.linalg.norm(answer.tip.position - path[-1]) < 1e-4
+    assert reasons == ["not confirmed yet"] * 3 + ["not moved yet", "not confirmed yet", "", "", ""]
+
+
 def test_images_of_two_exposures_are_refused(
     tracker: StereoTracker, draw_pair: Drawer, make_arc: MakeArc
 ) -> None:
