@@ -105,10 +105,13 @@ def write_run(
     namespace: str = "/",
     bad_tip: int | None = None,
     image_height: int | None = None,
+    command: str | None = None,
 ) -> Path:
     """A needle that goes from r1 = -3 mm to FINAL_R1 on a cosine, measured TIP_ERROR off."""
     out = SyntheticBag(directory, namespace)
     info = {"level": "tip", "controller": "paper", "seed": 7}
+    if command is not None:
+        info["command"] = command
     out.bag.set_custom_data("run_info", json.dumps(info))
     out.bag.set_custom_data("commit", "0123abc")
     out.bag.set_custom_data("versions", json.dumps({"python": "3.11"}))
@@ -155,7 +158,7 @@ def write_run(
                     encoding="mono8",
                     is_bigendian=0,
                     step=4,
-                    data=np.zeros(12, np.uint8),
+                    data=np.full(12, number, np.uint8),
                 )
                 out.put(f"stereo/{side}/image_raw", "sensor_msgs/msg/Image", image)
         if truth:

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_analysis.live.shaft_trail import ShaftTrail
+from needle_analysis.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane, offset_plane
 
 Array = NDArray[np.float64]

@@ -8,14 +8,27 @@ from typing import Any, BinaryIO
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-TRUTH = "#1b1b1b"
-MEASURED = "#d1701b"
-ESTIMATE = "#1668b0"
-GOAL_BAND = "#2e9d55"
+# Apart from each other also for who sees no red, green or blue, and from the ground in both modes.
+INK = "#1b1b1b"
+TRUTH = "#8d9299"
+MEASURED = "#cf6a00"
+ESTIMATE = "#0067b1"
+GOAL_BAND = "#207a30"
+PLUM, TEAL, RED = "#7a1050", "#2099c0", "#b3140c"
+# Only for what may stand back: zero lines, and shadows.
+GREY = "#9aa0a8"
+BROAD: dict[str, Any] = {"color": TRUTH, "lw": 3.6, "solid_capstyle": "round"}
+"""The truth: so broad that a thin line on it hides nothing."""
+THIN: dict[str, Any] = {"color": ESTIMATE, "lw": 1.3}
+DASHED, DOTTED = (0, (4, 2)), (0, (1, 1.4))
+AXES: dict[str, dict[str, Any]] = {
+    "x (out of the plane)": {"color": MEASURED, "lw": 1.1},
+    "y (beside)": {"color": PLUM, "lw": 1.1, "ls": DASHED},
+    "z (along)": {"color": TEAL, "lw": 1.3, "ls": DOTTED},
+}
 MM = 1e3
-VIOLET, TEAL, GREY, RED = "#7a5ab5", "#3f8f8b", "#9aa0a8", "#b3261e"
 # Narrow, so that the text can still be read on a phone [inch].
-WIDTH = 6.6
+WIDTH = 5.6
 # Room for five digits and a label; an axis with its label; a title [inch].
 _MARGINS = {"left": 0.75, "right": 0.12, "bottom": 0.5, "top": 0.3}
 STYLE: dict[Any, Any] = {
@@ -38,7 +51,12 @@ STYLE: dict[Any, Any] = {
 def save(figure: Figure, target: Path | BinaryIO) -> None:
     """Write a figure as PNG."""
     FigureCanvasAgg(figure)
-    figure.savefig(target, dpi=130, facecolor="white", metadata={"Software": ""})
+    figure.savefig(target, dpi=150, facecolor="white", metadata={"Software": ""})
+
+
+def png_size(png: bytes) -> tuple[int, int]:
+    """Return a PNG file's width and height [px]."""
+    return int.from_bytes(png[16:20], "big"), int.from_bytes(png[20:24], "big")
 
 
 def place(figure: Figure, rows: int, *, gap: float = 0.34, **margins: float) -> None:

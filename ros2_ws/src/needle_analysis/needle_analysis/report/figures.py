@@ -11,15 +11,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from needle_analysis.report.figure_style import (
-    ESTIMATE,
+    AXES,
+    BROAD,
+    DASHED,
+    DOTTED,
     GOAL_BAND,
     GREY,
+    INK,
     MEASURED,
     MM,
+    PLUM,
     STYLE,
     TEAL,
-    TRUTH,
-    VIOLET,
+    THIN,
     WIDTH,
     place,
 )
@@ -50,7 +54,7 @@ _MEASURED_DOTS: dict[str, Any] = {
 def states_figure(run: Run) -> Figure:
     """Return [KC09] figure 3's four rows: r1, r2, r3 and the accumulated rotation."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 8.8))
+        figure = Figure(figsize=(WIDTH, 7.6))
         place(figure, 4)
         r1, r2, r3, rotation = figure.subplots(4, 1, sharex=True)
         _goal_band(r1)
@@ -59,8 +63,8 @@ def states_figure(run: Run) -> Figure:
         truth, estimate = reduced_states(run.truth, offset), run.reduced_state
         for axes, column, factor in ((r1, 0, MM), (r2, 1, None), (r3, 2, None)):
             for series, values, style in (
-                (run.truth, truth, {"color": TRUTH, "lw": 1.7, "label": "truth"}),
-                (estimate, estimate.values, {"color": ESTIMATE, "lw": 1.4, "label": "estimate"}),
+                (run.truth, truth, {**BROAD, "label": "truth"}),
+                (estimate, estimate.values, {**THIN, "label": "estimate"}),
             ):
                 shown = values[:, column] if len(series) else np.empty(0)
                 scaled = shown * factor if factor else np.degrees(np.unwrap(shown))
@@ -73,8 +77,7 @@ def states_figure(run: Run) -> Figure:
             rotation.plot(
                 run.joints.values[:, 0] * MM,
                 np.degrees(run.joints.values[:, 1]),
-                color=TRUTH,
-                lw=1.5,
+                **BROAD,
                 label="base of the needle, measured",
             )
         if rerun_of(run):
@@ -83,9 +86,7 @@ def states_figure(run: Run) -> Figure:
             rotation.plot(
                 _insertion_mm(run, run.control_input),
                 np.degrees(run.control_input.values[:, 2]),
-                color=ESTIMATE,
-                lw=1.2,
-                ls=(0, (4, 2)),
+                **THIN,
                 label="commanded",
             )
         rotation.set(title="Accumulated rotation", ylabel="deg", xlabel="insertion [mm]")
@@ -104,8 +105,7 @@ def _draw_not_steered(axes: Any, run: Run) -> None:
     axes.plot(
         np.stack([insertion, step, gap], axis=1).ravel() * MM,
         np.degrees(np.stack([begin, end, gap], axis=1).ravel()),
-        color=ESTIMATE,
-        lw=1.2,
+        **THIN,
         label=f"{run.parameter('plane_controller', 'preset')} would have turned it, step by step",
     )
 
@@ -113,7 +113,7 @@ def _draw_not_steered(axes: Any, run: Run) -> None:
 def path_figure(run: Run) -> Figure:
     """Return the needle's path: from the side against the plane, from above, and in space."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 7.0))
+        figure = Figure(figsize=(WIDTH, 6.0))
         place(figure, 2, gap=0.85)
         grid = figure.add_gridspec(2, 2, height_ratios=[1.0, 1.5])
         side = figure.add_subplot(grid[0, :])
@@ -125,16 +125,16 @@ def path_figure(run: Run) -> Figure:
         plane = target_offset(run) * MM
         side.axhspan(plane - GOAL * MM, plane + GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
         side.axhline(plane, color=GOAL_BAND, lw=1.3, label="wanted plane, ±1 mm")
+        side.plot(truth[:, 2], truth[:, 0], **BROAD, label="needle (truth)")
         side.plot(tips[:, 2], tips[:, 0], **_MEASURED_DOTS, label="measured tip")
-        side.plot(truth[:, 2], truth[:, 0], color=TRUTH, lw=1.7, label="needle (truth)")
         side.set(
             title="Seen from the side: the wanted plane is the green line",
             xlabel="z, insertion direction [mm]",
             ylabel="x, up [mm]",
         )
         side.legend(loc="best", ncols=3)
+        above.plot(truth[:, 2], truth[:, 1], **BROAD)
         above.plot(tips[:, 2], tips[:, 1], **_MEASURED_DOTS)
-        above.plot(truth[:, 2], truth[:, 1], color=TRUTH, lw=1.7)
         above.set(title="Seen from above", xlabel="z [mm]", ylabel="y [mm]")
         above.set_aspect("equal", adjustable="datalim")
         _draw_space(space, truth if len(truth) else tips, plane)
@@ -144,30 +144,32 @@ def path_figure(run: Run) -> Figure:
 def error_figure(run: Run) -> Figure:
     """Return the measurement's and the estimate's error against the truth."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 5.6))
+        figure = Figure(figsize=(WIDTH, 5.0))
         place(figure, 2, right=0.7)
         tip, difference = figure.subplots(2, 1, sharex=True)
         error = tip_error(run) * MM
         tips = finite_tips(run)
         here, _ = tips.at(run.truth.stamps)
         insertion = run.insertion_at(tips.stamps[here]) * MM
-        for column, (name, color) in enumerate(
-            (("x (depth)", MEASURED), ("y", VIOLET), ("z", TEAL))
-        ):
-            tip.plot(insertion, error[:, column], color=color, lw=1.0, label=name)
         norm = np.linalg.norm(error, axis=1)
-        tip.plot(insertion, norm, color=TRUTH, lw=1.6, label="3D distance")
+        tip.plot(insertion, norm, **BROAD, label="3D distance")
+        for column, (name, style) in enumerate(AXES.items()):
+            tip.plot(insertion, error[:, column], **style, label=name)
         tip.set(title="Measured tip minus truth", ylabel="mm")
-        tip.legend(loc="best", ncols=4)
+        tip.legend(loc="best", ncols=2)
         stamps, off = estimate_error(run, run.reduced_state)
         insertion = run.insertion_at(stamps) * MM
         angles = difference.twinx()
         angles.grid(visible=False)
         angles.spines["right"].set_visible(True)
-        lines = difference.plot(insertion, off[:, 0] * MM, color=ESTIMATE, lw=1.6, label="r1 [mm]")
+        lines = difference.plot(insertion, off[:, 0] * MM, **THIN, label="r1 [mm]")
         turned = np.degrees(off)
-        lines += angles.plot(insertion, turned[:, 1], color=VIOLET, lw=1.1, label="r2 [deg]")
-        lines += angles.plot(insertion, turned[:, 2], color=TEAL, lw=1.1, label="r3 [deg]")
+        lines += angles.plot(
+            insertion, turned[:, 1], color=PLUM, lw=1.1, ls=DASHED, label="r2 [deg]"
+        )
+        lines += angles.plot(
+            insertion, turned[:, 2], color=TEAL, lw=1.1, ls=DOTTED, label="r3 [deg]"
+        )
         difference.set(title="Estimate minus truth", ylabel="mm", xlabel="insertion [mm]")
         angles.set_ylabel("deg")
         difference.legend(lines, [str(line.get_label()) for line in lines], loc="best", ncols=3)
@@ -193,7 +195,7 @@ def _draw_space(axes: Any, path: Floats, plane: float) -> None:
     middle = float(low[1] + high[1]) / 2
     z, y = np.meshgrid([float(low[2]), float(high[2])], [middle - reach, middle + reach])
     axes.plot_surface(z, y, np.full_like(z, plane), color=GOAL_BAND, alpha=0.22, linewidth=0)
-    axes.plot(path[:, 2], path[:, 1], path[:, 0], color=TRUTH, lw=1.9)
+    axes.plot(path[:, 2], path[:, 1], path[:, 0], color=INK, lw=1.9)
     axes.plot(path[:, 2], path[:, 1], np.full(len(path), plane), color=GREY, lw=0.9)
     axes.set_xlabel("z [mm]", labelpad=9)
     axes.set_ylabel("y [mm]", labelpad=5)

@@ -68,7 +68,7 @@ def _needles(runs: tuple[Run, Run]) -> list[tuple[str, str, Run]]:
 
 
 def _states(runs: tuple[Run, Run]) -> Figure:
-    """Draw figure 3's rows: truth drawn through, estimate dashed; and what was commanded."""
+    """Draw figure 3's rows: truth broad, estimate thin; and what was commanded."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(WIDTH, 10.4))
         place(figure, 5, bottom=1.0)
@@ -76,13 +76,14 @@ def _states(runs: tuple[Run, Run]) -> Figure:
         rows[0].axhspan(-GOAL * MM, GOAL * MM, color=GOAL_BAND, alpha=0.16, lw=0)
         for letter, color, run in _needles(runs):
             truth = reduced_states(run.truth, target_offset(run))
-            _draw_states(rows, run, truth, run.truth.stamps, color=color, label=f"{letter}, truth")
+            style = {"color": color, "lw": 3.6, "alpha": 0.45, "label": f"{letter}, truth"}
+            _draw_states(rows, run, truth, run.truth.stamps, **style)
             if len(run.joints):
                 insertion, rotation = run.joints.values.T
                 rows[3].plot(insertion * MM, np.degrees(rotation), color=color, lw=1.4)
         for letter, color, run in zip(LETTERS, _COLORS, runs, strict=True):
             estimate = run.reduced_state
-            style = {"color": color, "ls": (0, (3, 2)), "lw": 1.1, "label": f"{letter}, estimate"}
+            style = {"color": color, "lw": 1.2, "label": f"{letter}, estimate"}
             _draw_states(rows, run, estimate.values, estimate.stamps, **style)
             insertion, begin, end = commanded_rotation(run).T
             words = "would have commanded" if rerun_of(run) else "commanded"
@@ -107,10 +108,10 @@ def _draw_states(rows: Any, run: Run, states: Floats, stamps: Any, **style: Any)
     if not len(stamps):
         return
     insertion = run.insertion_at(stamps) * MM
-    rows[0].plot(insertion, states[:, 0] * MM, **{"lw": 1.6, **style})
+    rows[0].plot(insertion, states[:, 0] * MM, **style)
     for column in (1, 2):
         angles = np.degrees(np.unwrap(states[:, column]))
-        rows[column].plot(insertion, angles, **{"lw": 1.6, **style})
+        rows[column].plot(insertion, angles, **style)
 
 
 def _path(runs: tuple[Run, Run]) -> Figure:

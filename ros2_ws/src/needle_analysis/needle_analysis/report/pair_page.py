@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Iterator, Mapping
 from typing import Any
 
 from needle_analysis.report import html_page
+from needle_analysis.report.glossary import Glossary
 from needle_analysis.report.pair_figures import is_same_needle
-from needle_analysis.report.report_page import TILES, verdict_text
+from needle_analysis.report.report_page import TILE_NOTE, TILES, verdict_text
 from needle_bags.reading.bag_reader import Run
 from needle_common.commands.cli import JsonValue
 
@@ -16,18 +16,20 @@ Summary = Mapping[str, JsonValue]
 
 _SAME_NEEDLE = (
     "State over insertion",
-    "Black: the needle, as it was steered once; dashed: the estimates of A (blue) and B (orange). "
-    "The last row is what each controller commands for the next step: a rerun only would have.",
+    "Broad grey: the needle, as it was steered once ([truth]); thin: the [estimates|estimate] of A "
+    "(blue) and B (orange) of [r1], [pitch] and [roll]. The last row is what each controller "
+    "commands for the next [step]: a [rerun] only would have.",
 )
 _CAPTIONS = {
     "pair_states": (
         "State over insertion",
-        "A blue, B orange. Drawn through: the truth; dashed: the estimate.",
+        "A blue, B orange. Broad and pale: the [truth]; thin: the [estimate] of [r1], [pitch] and "
+        "[roll].",
     ),
     "pair_path": ("Path of the needle", "Vertical axes are stretched."),
     "pair_errors": (
         "How good was the measurement, how good the estimate",
-        "Each against its own truth, at equal times of exposure.",
+        "Each against its own [truth], at equal times of [exposure].",
     ),
 }
 
@@ -52,16 +54,22 @@ def build_pair_page(
     names = [run.path.absolute().name for run in runs]
     same = is_same_needle(runs)
     captions = {**_CAPTIONS, "pair_states": _SAME_NEEDLE} if same else _CAPTIONS
-    note = "Of one insertion: what the needle did is the same in both." if same else ""
+    note = "Of one insertion: what the needle did is the same in both. " if same else ""
+    glossary = Glossary()
     return html_page.page(
         f"{names[0]} and {names[1]}",
+        _verdict(names, summaries),
         [
-            _verdict(names, summaries),
-            "<h2>Figures</h2>" + (html_page.note(note) if note else ""),
-            html_page.table(("", "A", "B", "B - A"), _figures(summaries)),
+            html_page.Section(
+                "Both runs in figures",
+                html_page.table(("", "A", "B", "B - A"), _figures(summaries))
+                + glossary.explain(note + TILE_NOTE),
+            ),
             *(
-                html_page.figure(*caption, images[name])
-                for name, caption in captions.items()
+                html_page.Section(
+                    title, glossary.explain(text) + html_page.figure(title, images[name])
+                )
+                for name, (title, text) in captions.items()
                 if name in images
             ),
             _differences("How they were made", runs[0].run_info, runs[1].run_info),
@@ -106,7 +114,7 @@ def _figures(summaries: tuple[Summary, Summary]) -> Iterator[tuple[str, ...]]:
         yield name, html_page.number(a, form), html_page.number(b, form), difference
 
 
-def _parameters(runs: tuple[Run, Run]) -> Iterator[str]:
+def _parameters(runs: tuple[Run, Run]) -> Iterator[html_page.Section]:
     """Yield a part for each node; the recorder's place of the bag is no difference."""
     for node in sorted(runs[0].parameters.keys() | runs[1].parameters.keys()):
         if node.endswith("/recorder"):
@@ -116,24 +124,26 @@ def _parameters(runs: tuple[Run, Run]) -> Iterator[str]:
             yield _differences(f"Parameters of {node}", there[0], there[1])
         else:
             letter = "B" if there[0] is None else "A"
-            yield f"<h2>{html.escape(node)}</h2>" + html_page.note(f"Ran in {letter} only.")
+            note = html_page.note(f"Ran in {letter} only.")
+            yield html_page.Section(f"Parameters of {node}", note)
 
 
 def _versions(run: Run) -> dict[str, str]:
     return {"commit": run.commit.replace(run.commit[12:40], "") or "unknown", **run.versions}
 
 
-def _differences(title: str, first: Mapping[str, Any], second: Mapping[str, Any]) -> str:
+def _differences(
+    title: str, first: Mapping[str, Any], second: Mapping[str, Any]
+) -> html_page.Section:
     """Return a table of what differs; a line that says so where nothing does."""
-    heading = f"<h2>{html.escape(title)}</h2>"
     rows = [
         (str(key), html_page.as_text(first.get(key)), html_page.as_text(second.get(key)))
         for key in dict.fromkeys((*first, *second))
         if first.get(key) != second.get(key)
     ]
     if not rows:
-        return heading + html_page.note("The same in both.")
-    return heading + html_page.table(("", "A", "B"), rows)
+        return html_page.Section(title, html_page.note("The same in both."))
+    return html_page.Section(title, html_page.table(("", "A", "B"), rows))
 
 
 def _is_number(value: JsonValue) -> bool:

@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from needle_analysis.report.event_figure import event_figure
 from needle_analysis.report.figure_style import save
 from needle_analysis.report.figures import error_figure, path_figure, states_figure
-from needle_analysis.report.image_figure import images_figure
+from needle_analysis.report.film import film_of
+from needle_analysis.report.film_views import camera_views, plan_views
+from needle_analysis.report.image_figure import frames_shown, images_figure
 from needle_analysis.report.pair_figures import pair_figures
 from needle_analysis.report.pair_page import build_pair_page, pair_values
 from needle_analysis.report.report_page import build_page, verdict_text
@@ -34,9 +36,10 @@ Shows how a recorded run went: did the tip reach the wanted plane, how far off w
 what did the cameras see, how long did each stage take, what went wrong when. Everything comes from
 the bag.
 
-Writes into the bag's directory (or --output): report.html, one file with all figures in it that
-opens in any browser and prints; and the figures as PNG files. With two bags: one page that compares
-them, compared_with_<A>.html, into the second bag's directory (or --output).
+Writes into the bag's directory (or --output): report.html, one file of 6 MB at most with a film of
+the insertion and all figures, which opens in any browser without a network, and prints; and the
+figures as PNG files. With two bags: one page that compares them, compared_with_<A>.html, into the
+second bag's directory (or --output).
 """
 _EXAMPLES = """
 examples:
@@ -71,9 +74,13 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
         If a file cannot be written or the bag's images cannot be read.
     """
     timings = stage_timings(run)
-    data = {name: _png(figure) for name, figure in figures_of(run, timings).items()}
+    frames = film_of(run)
+    cameras, images = camera_views(run, frames, frames_shown(run, frames))
+    figures = {**figures_of(run, timings), "images": images_figure(run, frames, images)}
+    data = {name: _png(figure) for name, figure in figures.items() if figure is not None}
     files = {f"{name}.png": png for name, png in data.items()}
-    files[PAGE] = build_page(run, summary, data, timings).encode()
+    film = (frames, [*cameras, *plan_views(run, frames)])
+    files[PAGE] = build_page(run, summary, data, timings, film).encode()
     return _write(run.path if directory is None else directory, files)
 
 
@@ -126,8 +133,8 @@ def _png(figure: Figure) -> bytes:
     return buffer.getvalue()
 
 
-def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure]:
-    """Return the figures of a run by their file's name, without those with nothing in them.
+def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure | None]:
+    """Return a run's figures but its images by their file's name, None where nothing is in one.
 
     Parameters
     ----------
@@ -137,16 +144,14 @@ def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure]:
         Its stages (`stage_timing.stage_timings`).
     """
     found = innovations(run)
-    figures = {
+    return {
         "states": states_figure(run),
         "path": path_figure(run),
         "errors": error_figure(run) if len(tip_error(run)) else None,
         "innovation": None if found is None else innovation_figure(run, found),
-        "images": images_figure(run),
         "timing": timing_figure(run, timings) if timings else None,
         "events": event_figure(run),
     }
-    return {name: figure for name, figure in figures.items() if figure is not None}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

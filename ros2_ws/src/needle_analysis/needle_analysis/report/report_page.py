@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import html
+import shlex
 from collections.abc import Mapping, Sequence
 
 from needle_analysis.report import html_page
 from needle_analysis.report.event_figure import level_name
+from needle_analysis.report.film import Frame
+from needle_analysis.report.film_page import film_html
+from needle_analysis.report.film_views import View
+from needle_analysis.report.glossary import Glossary
 from needle_analysis.report.step_figures import timing_rows
 from needle_analysis.run.run_events import troubles
+from needle_analysis.run.run_summary import rerun_of
 from needle_analysis.run.stage_timing import StageTiming
 from needle_bags.reading.bag_reader import Run
 from needle_common.commands.cli import JsonValue
@@ -17,8 +22,9 @@ _MOST_EVENTS = 60
 CAPTIONS = {
     "states": (
         "State over insertion",
-        "Orange circles: measured by the tracker. Black: the truth. Blue: the observer's estimate."
-        " Steering works when the black line in the first row ends inside the green band.",
+        "Orange circles: [measured] by the tracker. Broad grey line: the [truth]. Thin blue line: "
+        "the controller's [estimate]. Steering works when the grey line of [r1] ends inside the "
+        "green band. To get there it changes the [pitch], by choosing the [roll] of the [bevel].",
     ),
     "path": (
         "Path of the needle",
@@ -26,28 +32,43 @@ CAPTIONS = {
     ),
     "errors": (
         "How good was the measurement, how good the estimate",
-        "Both against the simulation's truth, at equal times of exposure.",
+        "Both against the simulation's [truth], at equal times of [exposure].",
     ),
     "innovation": (
         "Innovation and gate",
-        "How far each tip was from where estimate, joints and an arc of the configured curvature"
-        " had it, and how near it came to being refused.",
+        "The [innovation] is how far each tip was from where estimate, joints and an arc of the "
+        "configured curvature had it; it should stay within 2 [sigma]. The [gate] shows how near "
+        "each tip came to being refused.",
     ),
     "images": (
         "What the cameras saw",
-        "Cut out around the tip. Orange circle: the measured tip, projected back into the image;"
-        " green cross: the truth.",
+        "Cut out around the tip. Orange circle: the [measured] tip, projected back into the image; "
+        "blue cross: the [truth].",
     ),
     "timing": (
         "Timing of each stage",
-        "By when the messages were sent. In lock-step simulation the device's part is computing.",
+        "By when the messages were sent. In [lock step] the device's part is computing.",
     ),
     "events": (
         "States, hold and faults",
-        "The same wall time for all rows. Only parts that were not well have a row of their own.",
+        "The same wall time for all rows. The needle moves with the [hold] alone. Only parts that "
+        "were not well have a row of their own.",
     ),
 }
 _AFTER = ("timing", "events")
+FILM = (
+    "Film of the insertion",
+    "Blue: the needle; orange: its tip. {over}The dotted line is the whole way of the tip; "
+    "vertical axes are stretched. {count} of the bag's [exposures|exposure], equally far apart by "
+    "how far the needle was moved. What the controller believes is [doubtful] or trusted; ± is the "
+    "interval that holds [r1] with 95 %. The [pitch] and the [roll] are the tip's.",
+)
+_TRUE = "Both are the [truth]. "
+_MEASURED = "Both as [measured]. "
+_BOTH = (
+    "In the cameras' pictures as [measured]: where its tip was seen on its way in; in the drawings "
+    "the [truth], where the bag has it. "
+)
 TILES = (
     ("r1 at the start", "r1_initial_mm", "{:+.2f}", "mm"),
     ("r1 at the end (true)", "r1_final_mm", "{:+.2f}", "mm"),
@@ -63,7 +84,11 @@ TILES = (
     ("Watchdog trips", "watchdog_trips", "{:d}", ""),
     ("Wall time", "wall_s", "{:.1f}", "s"),
 )
-"""Label, key, format and unit of the figures at the top."""
+"""Label, key, format and unit of the run's figures."""
+TILE_NOTE = (
+    "[r1], its [RMS], and errors of [95 %] of the tips: measured beside the [truth]. A [step] that "
+    "was aborted, or a [watchdog] that tripped, is told below."
+)
 _SUMMARY_KEYS = ("level", "controller", "seed")
 
 
@@ -72,6 +97,7 @@ def build_page(
     summary: Mapping[str, JsonValue],
     images: Mapping[str, bytes],
     timings: Sequence[StageTiming],
+    film: tuple[Sequence[Frame], Sequence[View]],
 ) -> str:
     """Return the page.
 
@@ -85,23 +111,39 @@ def build_page(
         Figure name to PNG data; the names that have captions are shown, in their order.
     timings : sequence of StageTiming
         How long each stage took.
+    film : pair
+        Its frames, and what is shown of them.
 
     Returns
     -------
     str
         HTML without references to other files.
     """
+    glossary = Glossary()
+
+    def shown(name: str) -> str:
+        text = CAPTIONS[name][1]
+        picture = images.get(name)
+        if picture is None:
+            return ""
+        kind = {"photo": name == "images"}
+        return glossary.explain(text) + html_page.figure(CAPTIONS[name][0], picture, **kind)
+
+    def section(name: str, more: str = "") -> html_page.Section:
+        return html_page.Section(CAPTIONS[name][0], shown(name) + more)
+
     return html_page.page(
         f"Needle steering run {run.path.absolute().name}",
+        _verdict(run, summary),
         [
-            _verdict(run, summary),
-            _tiles(summary),
-            *(_figure(name, images) for name in CAPTIONS if name not in _AFTER),
-            _figure("timing", images),
-            _timing(timings),
-            _figure("events", images),
-            _health(run),
-            _provenance(run, summary),
+            html_page.Section(FILM[0], _film(run, film, glossary)),
+            html_page.Section("The run in figures", _tiles(summary, glossary)),
+            *(section(name) for name in CAPTIONS if name not in _AFTER),
+            section("timing", _timing(timings)),
+            section("events"),
+            html_page.Section("Warnings and faults", _health(run, glossary)),
+            html_page.Section("Repeat it", _repeat(run)),
+            html_page.Section("What was run", _provenance(run, summary)),
         ],
     )
 
@@ -142,16 +184,23 @@ def _verdict(run: Run, summary: Mapping[str, JsonValue]) -> str:
     return html_page.banner(words, sentence, " · ".join(about), good=good)
 
 
-def _tiles(summary: Mapping[str, JsonValue]) -> str:
-    return html_page.tiles(
-        (label, html_page.number(summary[key], form), unit)
-        for label, key, form, unit in TILES
-        if summary[key] is not None
+def _tiles(summary: Mapping[str, JsonValue], glossary: Glossary) -> str:
+    """Return the figures, and what their words mean."""
+    known = [tile for tile in TILES if summary[tile[1]] is not None]
+    boxes = html_page.tiles(
+        (label, html_page.number(summary[key], form), unit) for label, key, form, unit in known
     )
+    return boxes + glossary.explain(TILE_NOTE)
 
 
-def _figure(name: str, images: Mapping[str, bytes]) -> str:
-    return html_page.figure(*CAPTIONS[name], images[name]) if name in images else ""
+def _film(run: Run, film: tuple[Sequence[Frame], Sequence[View]], glossary: Glossary) -> str:
+    frames, views = film
+    if not frames:
+        return ""
+    alone = _TRUE if len(run.truth) else _MEASURED
+    over = alone if all(view.is_chart for view in views) else _BOTH
+    text = FILM[1].format(over=over, count=len(frames))
+    return film_html(frames, views) + glossary.explain(text)
 
 
 def _timing(timings: Sequence[StageTiming]) -> str:
@@ -162,11 +211,10 @@ def _timing(timings: Sequence[StageTiming]) -> str:
     return html_page.table(head, timing_rows(timings))
 
 
-def _health(run: Run) -> str:
-    title = "<h2>Warnings and faults</h2>"
+def _health(run: Run, glossary: Glossary) -> str:
     events = troubles(run)
     if not events:
-        return title + html_page.note("None were reported.")
+        return html_page.note("None were reported.")
     start = run.first_command or events[0].log_time
     rows = [
         (
@@ -181,25 +229,40 @@ def _health(run: Run) -> str:
     more = len(rows) - _MOST_EVENTS
     rest = html_page.note(f"{more} more are in the bag, on /diagnostics.") if more > 0 else ""
     words = (
-        "Seconds of wall time after the first step's command. What was over before it, while nodes "
-        "waited for each other, is left out."
+        "Seconds of wall time after the first [step]'s command. What was over before it, while "
+        "nodes waited for each other, is left out."
     )
-    return title + html_page.note(words) + shown + rest
+    return glossary.explain(words) + shown + rest
+
+
+def _repeat(run: Run) -> str:
+    """Return the command that made the bag, where it tells, and those that read it."""
+    command = run.run_info.get("command")
+    if isinstance(command, str):
+        commit = f", of commit {run.commit[:12]}" if run.commit else ""
+        told = html_page.note(f"The run, with the sources it was made with{commit}:")
+        told += html_page.code(command)
+    elif rerun_of(run) is not None:
+        told = html_page.note(f"A rerun of {rerun_of(run)}.")
+    else:
+        told = html_page.note("The bag does not say which command it was recorded by.")
+    bag = shlex.quote(str(run.path))
+    words = "What was recorded, through today's code; and this page:"
+    again = f"ros2 run needle_analysis rerun {bag}\nros2 run needle_analysis report {bag}"
+    return told + html_page.note(words) + html_page.code(again)
 
 
 def _provenance(run: Run, summary: Mapping[str, JsonValue]) -> str:
     versions = {"commit": run.commit or "unknown", **run.versions}
-    parts = ["<h2>What was run</h2>"]
-    if run.run_info:
-        parts.append(html_page.pairs(run.run_info))
+    info = {key: value for key, value in run.run_info.items() if key != "command"}
+    parts = [html_page.details("Told to the recorder", html_page.pairs(info))] if info else []
     if run.recording:
-        parts.append("<h2>The recording</h2>" + html_page.pairs(run.recording))
+        parts.append(html_page.note("The recording:") + html_page.pairs(run.recording))
     parts.append(html_page.details("All figures (summary.json)", html_page.pairs(summary)))
     for node, values in sorted(run.parameters.items()):
         parts.append(html_page.details(f"Parameters of {node}", html_page.pairs(values)))
     if run.calibration:
-        text = f"<pre>{html.escape(run.calibration)}</pre>"
-        parts.append(html_page.details("Calibration", text))
+        parts.append(html_page.details("Calibration", html_page.code(run.calibration)))
     parts.append(html_page.details("Recorded topics", html_page.pairs(run.topics)))
     parts.append(html_page.details("Versions", html_page.pairs(versions), opened=True))
     return "\n".join(parts)

@@ -12,15 +12,17 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
 from needle_analysis.report.figure_style import (
+    AXES,
+    DOTTED,
     ESTIMATE,
     GREY,
+    INK,
     MEASURED,
     MM,
+    PLUM,
     RED,
     STYLE,
     TEAL,
-    TRUTH,
-    VIOLET,
     WIDTH,
     place,
 )
@@ -34,27 +36,25 @@ from needle_analysis.run.innovation import (
 from needle_analysis.run.stage_timing import StageTiming
 from needle_bags.reading.bag_reader import Run, Stamps
 
-_AXES = (("x, out of the plane", MEASURED), ("y", VIOLET), ("z, along", TEAL))
-
 
 def innovation_figure(run: Run, found: Innovations) -> Figure:
     """Return innovation, its size beside what is expected, and the room left to the gate."""
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 7.6))
+        figure = Figure(figsize=(WIDTH, 6.6))
         place(figure, 3)
         parts, size, gate = figure.subplots(3, 1, sharex=True)
         insertion = run.insertion_at(found.stamps) * MM
         band = 2.0 * found.sigmas[:, 0] * MM
         label = "±2 sigma expected in x"
         parts.fill_between(insertion, -band, band, color=MEASURED, alpha=0.14, lw=0, label=label)
-        for column, (name, color) in enumerate(_AXES):
-            parts.plot(insertion, found.values[:, column] * MM, color=color, lw=1.1, label=name)
+        for column, (name, style) in enumerate(AXES.items()):
+            parts.plot(insertion, found.values[:, column] * MM, **style, label=name)
         parts.axhline(0.0, color=GREY, lw=0.8)
         # The first tips are known so badly that their band would hide all the others.
         top = 1.25 * max(np.abs(found.values).max() * MM, float(np.median(band)))
         parts.set(title="Innovation: measured minus expected tip", ylabel="mm", ylim=(-top, top))
         parts.legend(loc="best", ncols=2)
-        size.plot(insertion, np.maximum(found.squared, 1e-3), ".", color=TRUTH, ms=4)
+        size.plot(insertion, np.maximum(found.squared, 1e-3), ".", color=INK, ms=4)
         size.axhline(QUANTILE_95, color=RED, lw=1.1, label="95 % of tips should be below")
         size.axhline(3.0, color=GREY, lw=0.9, ls=(0, (4, 2)), label="average where all fits: 3")
         size.set(title="Innovation squared, normalised by its covariance", yscale="log")
@@ -68,7 +68,14 @@ def _draw_gate(axes: Any, run: Run) -> None:
     room = gate_room(run)
     insertion = run.insertion_at(room.stamps) * MM
     axes.plot(insertion, room.jump * MM, color=ESTIMATE, lw=1.1, label="jump beyond the insertion")
-    axes.plot(insertion, room.reach * MM, color=TEAL, lw=1.1, label="distance beyond the insertion")
+    axes.plot(
+        insertion,
+        room.reach * MM,
+        color=TEAL,
+        lw=1.3,
+        ls=DOTTED,
+        label="distance beyond the insertion",
+    )
     top = 1.0
     if room.margin is not None:
         top = room.margin * MM
@@ -88,15 +95,16 @@ def _draw_gate(axes: Any, run: Run) -> None:
 
 def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
     """Return the wall time of each stage of every step."""
-    colors = (ESTIMATE, MEASURED, VIOLET, RED, GREY, TEAL)
+    marks = ("o", "^", "s", "x", "+", "v")
+    colors = (ESTIMATE, MEASURED, PLUM, RED, INK, TEAL)
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH, 3.4))
-        place(figure, 1, bottom=0.75)
+        figure = Figure(figsize=(WIDTH, 3.6))
+        place(figure, 1, bottom=1.0)
         axes = figure.subplots()
-        for timing, color in zip(timings, colors, strict=False):
+        for timing, color, mark in zip(timings, colors, marks, strict=False):
             insertion = run.insertion_at(timing.stamps) * MM
             milliseconds = np.maximum(timing.seconds * 1e3, 1e-2)
-            axes.plot(insertion, milliseconds, ".", ms=4, color=color, label=timing.name)
+            axes.plot(insertion, milliseconds, mark, ms=3, color=color, label=timing.name)
         axes.set(yscale="log", ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
         axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         figure.legend(loc="lower center", ncols=3)

@@ -94,6 +94,8 @@ def _changed(
     document = {name: {"ros__parameters": values} for name, values in every.items()}
     presets = {v["preset"] for v in parameters.values() if "preset" in v}
     info = {**run.run_info, "rerun_of": run.path.absolute().name}
+    # That of the run, in which the needle went in.
+    info.pop("command", None)
     if steered_by(run) is not None:
         info["steered_by"] = steered_by(run)
     if presets:

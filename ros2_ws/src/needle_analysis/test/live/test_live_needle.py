@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from needle_analysis.live.latest_images import LatestImages
 from needle_analysis.live.live_needle import Belief, LiveNeedle, SeenTip
 from needle_analysis.live.marked_image import marked_image
-from needle_analysis.live.shaft_trail import ShaftTrail
 from needle_analysis.live.spread import SIGMAS, ellipsoid
+from needle_analysis.run.shaft_trail import ShaftTrail
 from needle_controller.model.target_plane import TargetPlane
 
 Array = NDArray[np.float64]

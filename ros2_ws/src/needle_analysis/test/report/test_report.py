@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import html
 import json
 import re
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import pytest
 
 from needle_analysis.report import report
 from needle_analysis.report.event_figure import lanes_of
+from needle_analysis.report.glossary import TERMS, Glossary
 from needle_analysis.report.pair_figures import is_same_needle, pair_figures
 from needle_analysis.report.report_page import verdict_text
 from needle_analysis.rerun.rerun_bag import write_rerun
@@ -25,13 +27,21 @@ MakeRun = Callable[..., Path]
 REGRESSION = Path(__file__).resolve().parents[5] / "bags" / "regression"
 
 
+def assert_leads_nowhere_else(page: str) -> None:
+    """No reference to another file or place, and each within the page to something there."""
+    assert not re.search(r"(src|href)=.(?!data:|#)", page)
+    assert not re.search(r"url\(|@import|//[\w-]+\.\w", re.sub(r"base64,[\w+/=]+", "", page))
+    names = re.findall(r' id="([^"]+)"', page)
+    assert len(names) == len(set(names))
+    assert set(re.findall(r'href="#([^"]+)"', page)) <= set(names)
+
+
 def test_report_is_one_file_with_its_figures(make_run: MakeRun) -> None:
     bag = make_run()
     assert report.main([str(bag)]) == 0
     page = (bag / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 5
-    assert not re.search(r"(src|href)=.(?!data:)", page)
-    assert "<script" not in page
+    assert page.count("data:image/png;base64,") == 5 + 2
+    assert_leads_nowhere_else(page)
     assert "Converged" in page
     for name in ("states", "path", "errors", "timing", "events"):
         assert (bag / f"{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -53,7 +63,7 @@ def test_report_without_truth(make_run: MakeRun) -> None:
     assert report.main([str(bag)]) == 0
     page = (bag / "report.html").read_text()
     assert "No ground truth" in page
-    assert page.count("data:image/png;base64,") == 4
+    assert page.count("data:image/png;base64,") == 4 + 2
 
 
 def test_a_tip_that_is_not_a_number_spoils_no_figure(make_run: MakeRun) -> None:
@@ -80,7 +90,7 @@ def test_two_bags_are_compared(make_run: MakeRun, tmp_path: Path) -> None:
     assert report.main([str(first), str(second), "--json", str(figures)]) == 0
     page = (second / "compared_with_first.html").read_text()
     assert page.count("data:image/png;base64,") == 3
-    assert not re.search(r"(src|href)=.(?!data:)", page)
+    assert_leads_nowhere_else(page)
     assert "Converged / Not finished" in page
     values = json.loads(figures.read_text())
     assert values["a_steps"] == 120
@@ -213,7 +223,9 @@ def test_a_run_to_a_point_is_judged_by_the_point(make_run: MakeRun) -> None:
 def test_texts_from_the_bag_cannot_be_markup(make_run: MakeRun) -> None:
     bag = make_run(calibration="<script>alert(1)</script>")
     assert report.main([str(bag)]) == 0
-    assert "<script" not in (bag / "report.html").read_text()
+    page = (bag / "report.html").read_text()
+    assert "&lt;script&gt;alert(1)" in page
+    assert "<script>alert" not in page
 
 
 def test_a_missing_bag_is_exit_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,3 +240,47 @@ def test_help_teaches(capsys: pytest.CaptureFixture[str]) -> None:
         report.main(["--help"])
     assert ended.value.code == 0
     assert "exit codes" in capsys.readouterr().out
+
+
+def test_contents_lead_to_every_section(make_run: MakeRun) -> None:
+    bag = make_run()
+    assert report.main([str(bag)]) == 0
+    page = (bag / "report.html").read_text()
+    contents = re.findall(r'<li><a href="#([^"]+)">([^<]+)</a>', page)
+    headings = re.findall(r'<section id="([^"]+)"><h2>([^<]+)</h2>', page)
+    assert len(contents) > 8
+    assert contents == headings
+
+
+def test_the_command_that_repeats_the_run_is_the_recorded_one(make_run: MakeRun) -> None:
+    command = "scripts/simulate --level=tip --params='a <file>.yaml'"
+    bag = make_run(command=command)
+    assert report.main([str(bag)]) == 0
+    section = (bag / "report.html").read_text().partition('<section id="repeat-it">')[2]
+    assert html.unescape(section.partition("<pre>")[2].partition("</pre>")[0]) == command
+    assert f"needle_analysis rerun {bag}\n" in section
+    by_hand = make_run("by_hand")
+    assert report.main([str(by_hand)]) == 0
+    assert "does not say which command" in (by_hand / "report.html").read_text()
+    again = bag.parent / "again"
+    write_rerun(read_run(bag), again, [], {}, "")
+    assert "command" not in read_run(again).run_info
+
+
+def test_a_term_is_explained_once_where_it_stands_first() -> None:
+    glossary = Glossary()
+    first = glossary.explain("The [roll] is < [turned|roll] by the [hold].")
+    assert first.count('id="term-roll"') == 1
+    assert first.count('href="#term-roll"') == 2
+    assert "&lt;" in first
+    again = glossary.explain("[roll] and [95 %]")
+    assert 'id="term-roll"' not in again
+    assert 'id="term-95"' in again
+    with pytest.raises(KeyError):
+        glossary.explain("[what nobody knows]")
+
+
+def test_every_term_of_the_glossary_is_used(tmp_path: Path) -> None:
+    text = "".join(path.read_text() for path in Path(report.__file__).parent.glob("*_page.py"))
+    used = {b or a for a, b in re.findall(r"\[([^\]|\[\n\"]+)(?:\|([^\]\n\"]+))?\]", text)}
+    assert set(TERMS) <= used

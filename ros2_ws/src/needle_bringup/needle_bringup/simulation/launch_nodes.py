@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
@@ -84,7 +85,9 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     for name in ("level", "seed", "real_time_factor", "controller"):
         words += [f"--{name.replace('_', '-')}", arguments[name]]
     bag = _new_bag(arguments["bag"])
-    parameters = command_line_parameters(parse(words), bag or Path())
+    given = [f"{name}:={value}" for name, value in arguments.items() if value and name != "bag"]
+    command = shlex.join(["ros2", "launch", "needle_bringup", "simulation.launch.py", *given])
+    parameters = command_line_parameters(parse(words), bag or Path(), f"{command} bag:=NEW")
     for name, parameter in (("drive_emulator", "pty"), ("device_driver", "channel")):
         if name in parameters:
             parameters[name][parameter] = arguments["can"]

@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 
 from needle_bringup.simulation.needle_options import needle_parameters
-from needle_bringup.simulation.simulate_options import SimulateOptions
+from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import Parameters
 
@@ -98,7 +98,9 @@ def nodes_of(options: SimulateOptions) -> tuple[str, ...]:
     return tuple(node for node in NODES if options.level in _LEVELS.get(node, (options.level,)))
 
 
-def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
+def command_line_parameters(
+    options: SimulateOptions, bag: Path, command: str | None = None
+) -> Parameters:
     """Return what the command line sets in the nodes that the run needs.
 
     Parameters
@@ -107,6 +109,8 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
         The command line.
     bag : Path
         The bag's folder.
+    command : str, optional
+        What repeats the run; `simulate` with these options by default.
     """
     sim_rig: dict[str, Any] = {
         "level": options.level,
@@ -130,8 +134,9 @@ def command_line_parameters(options: SimulateOptions, bag: Path) -> Parameters:
     driver["watchdog"] = driver["reply_age_limit"] = (
         PATIENT_WATCHDOG if driver["lock_step"] else REAL_TIME_WATCHDOG
     )
+    information = {**run_info(options), "command": command or command_of(options)}
     parameters: Parameters = {
-        "recorder": {"bag": str(bag), "run_info": json.dumps(run_info(options))},
+        "recorder": {"bag": str(bag), "run_info": json.dumps(information)},
         "sim_rig": sim_rig,
         # Motors that move by a SYNC period with every SYNC repeat a run to the count.
         "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},

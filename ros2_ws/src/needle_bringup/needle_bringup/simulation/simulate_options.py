@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -66,6 +67,11 @@ INSERTIONS = ("stepwise", "continuous")
 
 
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
+# Options that a repeated run has anew, and such as are written otherwise than they are named.
+_SAID_APART = (
+    *("bag", "json", "level", "controller", "seed", "target_mm"),
+    *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,6 +151,38 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         params=_readable("--params", given.params),
         json=output_file("--json", given.json),
     )
+
+
+def command_of(options: SimulateOptions) -> str:
+    """Return the command that runs the same again, into a bag of its own.
+
+    Level, controller and seed always stand in it; of the rest, what is not the default.
+
+    Parameters
+    ----------
+    options : SimulateOptions
+        What was run.
+    """
+    plain = SimulateOptions(
+        noise_mm=1.0 if options.level == "tip" else None,
+        depth_mm=float(DEPTH_MM) if options.target_mm is None else LARGEST_DEPTH_MM,
+    )
+    start_mm_deg = (options.initial_x_mm, options.initial_pitch_deg, options.initial_roll_deg)
+    words = [f"--level={options.level}", f"--controller={options.controller}"]
+    words.append(f"--seed={options.seed}")
+    if start_mm_deg != (plain.initial_x_mm, plain.initial_pitch_deg, plain.initial_roll_deg):
+        words.append(f"--initial={_joined(start_mm_deg)}")
+    if options.target_mm is not None:
+        words.append(f"--target={_joined(options.target_mm)}")
+    for field in dataclasses.fields(options):
+        value = getattr(options, field.name)
+        if field.name not in _SAID_APART and value != getattr(plain, field.name):
+            words.append(f"--{field.name.replace('_', '-')}={value}")
+    return shlex.join(["scripts/simulate", *words])
+
+
+def _joined(numbers: Sequence[float]) -> str:
+    return ",".join(map(str, numbers))
 
 
 def _parser() -> CommandParser:

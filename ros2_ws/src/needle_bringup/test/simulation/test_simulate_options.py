@@ -1,8 +1,15 @@
+import dataclasses
+import shlex
 from pathlib import Path
 
 import pytest
 
-from needle_bringup.simulation.simulate_options import CONTROLLERS, SimulateOptions, parse
+from needle_bringup.simulation.simulate_options import (
+    CONTROLLERS,
+    SimulateOptions,
+    command_of,
+    parse,
+)
 from needle_common.errors import UserError
 from needle_controller.presets.steering_settings import PRESETS
 
@@ -85,3 +92,27 @@ def test_an_existing_bag_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="exists already"):
         parse(["--bag", str(tmp_path)])
     assert parse(["--bag", str(tmp_path / "new")]).bag == tmp_path / "new"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "",
+        "--level tip --seed 7",
+        "--level tip --noise-mm 0 --controller open_loop",
+        "--initial=-1.5,-4,30 --depth-mm 80.25 --play-deg 3 --lag-mm 2 --insertion continuous",
+        "--target=-8,5,90 --curvature 4 --diameter-mm 1 --pre-bend-deg 6",
+        "--target=0,0,90 --depth-mm 120 --planner mine --estimator its --law theirs",
+        "--level drive --real-time-factor 1 --params 'a file.yaml' --bag new --json out.json",
+        "--target=0,0,90 --obstacles 'a file.yaml'",
+    ],
+)
+def test_the_command_that_is_recorded_runs_the_same_again(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a file.yaml").touch()
+    options = parse(shlex.split(line))
+    program, *words = shlex.split(command_of(options))
+    assert program == "scripts/simulate"
+    assert parse(words) == dataclasses.replace(options, bag=None, json=None)
