@@ -46,6 +46,11 @@ class HoldDesk:
         self._held_at = -math.inf
 
     @property
+    def has_pages(self) -> bool:
+        """Whether anybody is there who could press."""
+        return bool(self._pages)
+
+    @property
     def until(self) -> float:
         """When the hold ends unless more comes [s]; minus infinity without one."""
         return -math.inf if self._owner is None else self._pages[self._owner].session.until

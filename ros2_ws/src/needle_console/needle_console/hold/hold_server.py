@@ -29,6 +29,9 @@ from needle_console.hold.refusals import Refusal, Refusals
 PERIOD = 0.02
 """Nonces go to every page, and the hold's state to its taker, so often [s]."""
 
+ALONE_PERIOD = 0.08
+"""Without a page nobody can press: the release is only repeated, above 10 times a second [s]."""
+
 PATH = "/hold"
 _MOST_CONNECTIONS = 32
 # From TCP's first packet to a request, and from there to a token [s].
@@ -50,8 +53,8 @@ class HoldServer:
     port : int
         Port to listen on; 0 takes any that is free.
     on_state : callable
-        Takes the hold every `PERIOD`, and at once when it changes; called by the hold's thread,
-        which must not be kept waiting.
+        Takes the hold every `PERIOD`, without a page every `ALONE_PERIOD`, and at once when it
+        changes; called by the hold's thread, which must not be kept waiting.
     on_notice : callable
         Takes a line that is worth a warning; called by the hold's thread.
 
@@ -77,7 +80,8 @@ class HoldServer:
         self._connections = 0
         self._socket = _listen(access.address, port)
         self._loop = asyncio.new_event_loop()
-        self._ended = asyncio.Event()
+        self._called = asyncio.Event()
+        self._is_ended = False
         self._thread = threading.Thread(
             target=lambda: self._loop.run_until_complete(self._serve()), name="hold", daemon=True
         )
@@ -99,7 +103,7 @@ class HoldServer:
     def close(self) -> None:
         """Release the hold and end; the release is the last that is handed on."""
         if self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._ended.set)
+            self._loop.call_soon_threadsafe(self._end)
             self._thread.join()
         self._loop.close()
         self._socket.close()
@@ -132,18 +136,29 @@ class HoldServer:
             for connection in serving.connections:
                 connection.transport.abort()
 
+    def _end(self) -> None:
+        self._is_ended = True
+        self._called.set()
+
     async def _hand_on(self) -> None:
         """Hand on the hold once at least, until the end: at fixed times, and when it runs out."""
         due = time.monotonic()
         while True:
+            self._called.clear()
             now = time.monotonic()
+            period = PERIOD if self._desk.has_pages else ALONE_PERIOD
+            # Sooner than was meant where the first page has come.
+            due = min(due, now + period)
             if now >= due or (self._told.pressed and now > self._desk.until):
                 self._tell()
                 while due <= now:
-                    due += PERIOD
+                    due += period
             wait = min(due, max(self._desk.until, now) + _TICK) if self._told.pressed else due
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._ended.wait(), wait - now)
+            # Its own timer, and no task for each wait: that was half of what an idle console cost.
+            timer = self._loop.call_later(wait - now, self._called.set)
+            await self._called.wait()
+            timer.cancel()
+            if self._is_ended:
                 return
 
     def _tell(self) -> None:
@@ -214,6 +229,7 @@ class HoldServer:
         if page is None:
             await self._close(connection, Refusal.PAGES)
             return
+        self._called.set()
         sending = asyncio.ensure_future(self._send_nonces(connection, page))
         try:
             await self._hear(connection, page)

@@ -7,9 +7,11 @@ import sys
 
 from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
 from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import LOOK_PERIOD, executor_of, run_node
+from needle_common.ros.base_node import executor_of, run_node
 from needle_console.ros.console_parameters import ConsoleParameters
 
+# What cannot wait has threads of its own: a signal is seen so late at most [s].
+_LOOK_PERIOD = 0.2
 HELP = """\
 console: serves a page that shows what the rig sees and believes, with a hold to steer it by.
 
@@ -32,7 +34,7 @@ def main() -> int:
     def spin(node: ConsoleNode, end: EndRequest) -> int:
         with executor_of(node) as executor:
             while not end.wanted:
-                executor.spin_once(timeout_sec=LOOK_PERIOD)
+                executor.spin_once(timeout_sec=_LOOK_PERIOD)
             node.close()
         return EXIT_DONE
 

@@ -37,7 +37,7 @@ from needle_console.view.snapshot import Array
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 
-_LOOK_PERIOD = 0.1
+_LOOK_PERIOD = 0.2
 _HEALTH_PERIOD = 1.0
 
 

@@ -22,6 +22,7 @@ pytest.importorskip("websockets", reason="the console's lock is not installed: s
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
+from needle_console.hold import hold_server
 from needle_console.hold.hold_server import HoldServer
 
 PAGE_PORT = 8080
@@ -177,10 +178,33 @@ def test_the_end_of_the_server_releases(rig: Rig, honest: HonestPage) -> None:
 def test_an_end_before_the_first_word_hands_on_a_release_all_the_same() -> None:
     states: list[HoldState] = []
     server = HoldServer(Access("127.0.0.1", PAGE_PORT), 0, states.append, print)
-    server._ended.set()
+    server._end()
     server.start()
     server.close()
     assert states == [RELEASED]
+
+
+def test_without_a_page_the_release_is_only_repeated_and_the_first_page_wakes_the_server(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(hold_server, "ALONE_PERIOD", 3600.0)
+    rig = Rig()
+    try:
+        # Who says no token is no page; to find that out takes the time of 50 words.
+        rig.connect()
+        until(lambda: rig.count("no token in time"), "refused")
+        assert rig.states == [RELEASED]
+        page = HonestPage(rig.open())
+        try:
+            until(lambda: page.told, "a word of the server")
+            press(rig, page)
+            enough = len(rig.states) + 5
+            until(lambda: len(rig.states) >= enough, "states")
+        finally:
+            page.close()
+        until(lambda: not rig.pressed, "released")
+    finally:
+        rig.close()
 
 
 def test_a_port_that_is_taken_is_said(rig: Rig) -> None:
