@@ -17,6 +17,7 @@ from needle_common.errors import UserError
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.checks import (
     check_bags,
+    check_computers,
     check_console_hold,
     check_continuous,
     check_control,
@@ -36,6 +37,7 @@ STEPS: Mapping[str, tuple[Check, ...]] = {
     "D": check_driver.CHECKS,
     "E": check_bags.CHECKS,
     "I": (*check_continuous.CHECKS, *check_hold_sources.CHECKS, *check_console_hold.CHECKS),
+    "K": check_computers.CHECKS,
 }
 
 DESCRIPTION = """\

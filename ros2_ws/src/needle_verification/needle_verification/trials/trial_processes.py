@@ -39,6 +39,8 @@ class TrialProcesses:
         Node -> parameter -> value.
     started : iterable of str, optional
         Nodes that are started at once; all of them by default.
+    before : mapping, optional
+        Node -> words before its command.
 
     Attributes
     ----------
@@ -53,8 +55,10 @@ class TrialProcesses:
         parameters: Parameters,
         *,
         started: Iterable[str] | None = None,
+        before: Mapping[str, Sequence[str]] | None = None,
     ) -> None:
         self._folder = folder
+        self._before = before or {}
         self._environment = {**os.environ, "ROS_DOMAIN_ID": str(domain), "PYTHONUNBUFFERED": "1"}
         self._file = folder / "parameters.yaml"
         write_parameters(self._file, parameters)
@@ -76,6 +80,7 @@ class TrialProcesses:
         self.processes[name] = NodeProcess(
             name,
             [
+                *self._before.get(name, ()),
                 *command,
                 *("--ros-args", "--disable-external-lib-logs", "--params-file", str(file)),
             ],

@@ -96,7 +96,7 @@ def hold_trials(
 
 def _lose(hand: _Hand, witness: HoldWitness, rng: random.Random) -> dict[str, Any]:
     """Hold, lose the source at a random moment, get it back as it was, and watch."""
-    _hold(hand, witness)
+    hold_anew(hand, witness)
     witness.pause(rng.uniform(0.0, _LATEST))
     lost = time.time()
     hand.lose()
@@ -113,8 +113,15 @@ def _lose(hand: _Hand, witness: HoldWitness, rng: random.Random) -> dict[str, An
     }
 
 
-def _hold(hand: _Hand, witness: HoldWitness) -> None:
+def hold_anew(hand: Presser, witness: HoldWitness) -> None:
     """Press anew until the needle moves: what was lost must be there and neutral first.
+
+    Parameters
+    ----------
+    hand : Presser
+        Who presses.
+    witness : HoldWitness
+        Sees the needle.
 
     Raises
     ------
@@ -135,12 +142,18 @@ def _hold(hand: _Hand, witness: HoldWitness) -> None:
     raise UserError(f"the held needle does not move{witness.state_now()}")
 
 
-class _Hand(Protocol):
+class Presser(Protocol):
+    """A hand or a foot."""
+
+    def press(self) -> None:
+        """Press."""
+
+    def release(self) -> None:
+        """Let go."""
+
+
+class _Hand(Presser, Protocol):
     """What a trial does to a source."""
-
-    def press(self) -> None: ...
-
-    def release(self) -> None: ...
 
     def lose(self) -> None: ...
 

@@ -38,14 +38,20 @@ class Place:
 
 
 class HoldWitness(ListeningNode):
-    """Hears the joints and the statuses; calls what prepares a rig."""
+    """Hears the joints and the statuses; calls what prepares a rig.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    places_from : str, optional
+        Topic (sensor_msgs/JointState) that says where the needle is.
+    """
+
+    def __init__(self, places_from: str = "joint_states") -> None:
         super().__init__("hold_witness")
         self.places: list[Place] = []
         self.device: dict[str, str] = {}
         self.controller: dict[str, str] = {}
-        self.create_subscription(JointState, "joint_states", self._on_joints, JOINT_STATES)
+        self.create_subscription(JointState, places_from, self._on_joints, JOINT_STATES)
         self.create_subscription(
             DiagnosticStatus,
             "device/status",
