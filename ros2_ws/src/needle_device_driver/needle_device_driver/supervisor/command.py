@@ -79,8 +79,8 @@ class CommandContext:
         Whether both axes are homed.
     not_new : str
         Why the command's stamp is no new one; empty: it is.
-    tip_age : float or None
-        Steady age of the command's stamp [s]; None: from the future.
+    tip_age : float
+        Steady age of the command's stamp [s]; negative: from the future.
     publishers : int
         How many publish commands.
     """
@@ -89,7 +89,7 @@ class CommandContext:
     rotation: float
     homed: bool
     not_new: str
-    tip_age: float | None
+    tip_age: float
     publishers: int
 
 
@@ -173,14 +173,21 @@ def _check_times(command: Command) -> Refusal | None:
 def _check_time(command: Command, context: CommandContext, limits: SafetyLimits) -> Refusal | None:
     if context.not_new:
         return Refusal(Rule.COMMAND_NEWER, context.not_new)
-    if context.tip_age is None:
-        return Refusal(Rule.TIP_AGE, f"stamp {command.stamp_ns} ns is from the future")
+    if context.tip_age < 0.0:
+        return Refusal(
+            Rule.TIP_AGE, f"the tip is from the future: {clocks_differ(context.tip_age)}"
+        )
     if context.tip_age > limits.tip_age_limit:
         return Refusal(
             Rule.TIP_AGE,
             f"the tip is {context.tip_age:.3f} s old, limit {limits.tip_age_limit:g} s",
         )
     return None
+
+
+def clocks_differ(tip_age: float) -> str:
+    """Say what a tip from the future means."""
+    return f"its stamp is {-tip_age:.3f} s ahead of this computer's clock"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,6 +12,7 @@ from needle_device_driver.supervisor.command import (
     Refusal,
     check_command,
     check_form,
+    clocks_differ,
 )
 from needle_device_driver.supervisor.command_stamps import CommandStamps
 from needle_device_driver.supervisor.device_core import DeviceCore
@@ -117,9 +118,11 @@ class CommandDesk:
         if not self._on_path or stamp_ns is None:
             return
         age, limit = self._stamps.age(stamp_ns, now), self._limits.tip_age_limit
-        if age is not None and age > limit:
+        # One from the future was taken when it was none: time was set back, and it would not age.
+        if not 0.0 <= age <= limit:
             self._core.count_watchdog_trip()
-            text = f"the tip behind the path is {age:.3f} s old, limit {limit:g} s"
+            old = f"{age:.3f} s old, limit {limit:g} s"
+            text = f"the tip behind the path is {clocks_differ(age) if age < 0.0 else old}"
             self._core.notice(text, Rule.TIP_AGE)
             self._core.abort(text)
 

@@ -37,7 +37,7 @@ class CommandStamps:
         """Note that ROS time is `ros_ns` [ns] at steady time `now` [s]."""
         self._ages.note(ros_ns, ros_ns * 1e-9 if self._lock_step else now)
 
-    def age(self, stamp_ns: int, now: float) -> float | None:
+    def age(self, stamp_ns: int, now: float) -> float:
         """Return the age of a stamp as `StampAges.age` does [s]."""
         if self._lock_step and (newest := self._ages.newest_ns) is not None:
             now = newest * 1e-9

@@ -48,16 +48,16 @@ class StampAges:
             del self._ros_ns[: old - 1]
             del self._last_seen[: old - 1]
 
-    def age(self, stamp_ns: int, now: float) -> float | None:
+    def age(self, stamp_ns: int, now: float) -> float:
         """Return how long ago `stamp_ns` was the ROS time, at most [s].
 
         Returns
         -------
-        float or None
-            Infinite for a stamp not newer than the first note; None for one from the future.
+        float
+            Infinite for a stamp not newer than the first note; negative for one from the future.
         """
-        if not self._ros_ns or stamp_ns > self._ros_ns[-1] + AHEAD_NS:
-            return None
+        if self._ros_ns and stamp_ns > self._ros_ns[-1] + AHEAD_NS:
+            return (self._ros_ns[-1] - stamp_ns) * 1e-9
         after = bisect.bisect_left(self._ros_ns, stamp_ns)
         # The stamp became current at the earliest when the note before it was last seen.
         return now - self._last_seen[after - 1] if after > 0 else math.inf

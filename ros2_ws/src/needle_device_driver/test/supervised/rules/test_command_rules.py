@@ -204,6 +204,13 @@ def test_tip_age_unknown_or_from_the_future(bench: Bench, offset_ns: int) -> Non
     refused(bench, Rule.TIP_AGE)
 
 
+def test_tip_age_tells_how_far_a_clock_is_ahead(bench: Bench) -> None:
+    bench.ready()
+    bench.command(stamp_ns=bench.ros_ns + 200_000_000)
+    why = refused(bench, Rule.TIP_AGE)
+    assert "the tip is from the future: its stamp is 0.200 s ahead of this computer's clock" in why
+
+
 def test_homed_first(bench: Bench) -> None:
     bench.supervisor.configure(bench.now)
     bench.supervisor.enable(True, bench.now)

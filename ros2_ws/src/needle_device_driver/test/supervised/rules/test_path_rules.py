@@ -161,6 +161,24 @@ def test_tip_age_a_slow_path_ends_when_its_tip_is_too_old(bench: Bench) -> None:
     assert bench.positions == at
 
 
+@pytest.mark.parametrize("back", [0.3, 3600.0])
+def test_tip_age_a_path_ends_when_time_is_set_back(bench: Bench, back: float) -> None:
+    bench.ready()
+    bench.cycle(20)
+    bench.hold(False)
+    bench.hold()
+    path(bench, (0.0, 0.0), (1.0, 0.0), (2.0, 0.0))
+    bench.cycle(5, holding=True)
+    bench.ros_ns -= round(back * 1e9)
+    bench.cycle(2, holding=True)
+    assert in_state(bench, State.HOLDING)
+    assert bench.last_rule is Rule.TIP_AGE
+    assert "ahead of this computer's clock" in bench.results[-1].outcome
+    at = bench.positions
+    bench.cycle(20, holding=True)
+    assert bench.positions == at
+
+
 def test_tip_age_a_path_goes_on_at_any_speed_while_fresh_ones_come(bench: Bench) -> None:
     bench.ready()
     for _ in range(100):
