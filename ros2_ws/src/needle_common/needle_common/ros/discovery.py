@@ -22,7 +22,7 @@ RECORDER = "recorder"
 # The part of the recorder's diagnostics that names the nodes whose parameters are in the bag.
 PARAMETERS_OF = "parameters_of"
 # A question that any node answers at once: there is no such type.
-_NO_TYPE = GetTypeDescription.Request(type_name="none/msg/None", type_hash="RIHS01_" + "0" * 64)
+NO_TYPE = GetTypeDescription.Request(type_name="none/msg/None", type_hash="RIHS01_" + "0" * 64)
 # What the graph calls a node whose endpoint has come and whose name has not.
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
 
@@ -104,6 +104,24 @@ def publishers_of(node: Node, topic: str) -> list[str]:
     ]
 
 
+def known_publishers_of(node: Node, topic: str) -> set[str]:
+    """Return the full names of the other nodes that publish a topic, as far as they are known.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks.
+    topic : str
+        Its name as the node would give it.
+    """
+    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    return {
+        full_name(info.node_namespace, info.node_name)
+        for info in infos
+        if info.node_name != _UNKNOWN
+    } - {node.get_fully_qualified_name()}
+
+
 def one_too_many(node: Node, subscription: Subscription[Any]) -> str:
     """Return who else publishes what only one may: a message does not say whose it is.
 
@@ -156,7 +174,7 @@ class AnsweringNodes:
                 self._questions[name] = Question(
                     self._clients[name], partial(self._take_answer, name)
                 )
-            self._questions[name].ask(_NO_TYPE)
+            self._questions[name].ask(NO_TYPE)
         return names <= self._answered
 
     def unaware_sources(self, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
@@ -170,12 +188,7 @@ class AnsweringNodes:
         """
         missing, names = [], set()
         for subscription in subscriptions:
-            infos = self._node.get_publishers_info_by_topic(subscription.topic_name)
-            known = {
-                full_name(info.node_namespace, info.node_name)
-                for info in infos
-                if info.node_name != _UNKNOWN
-            } - {self._node.get_fully_qualified_name()}
+            known = known_publishers_of(self._node, subscription.topic_name)
             if not known:
                 missing.append(f"publisher of {subscription.topic_name}")
             names |= known
