@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import rclpy
-from diagnostic_msgs.msg import DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG
@@ -33,7 +33,8 @@ from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
 from needle_common.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import LATCHED, values_of
+from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
+from needle_common.ros.partner_clocks import PART
 from needle_verification.ros.holds.hold_trials import hold_anew
 from needle_verification.ros.holds.hold_witness import HoldWitness
 from needle_verification.trials.light import Light
@@ -48,6 +49,7 @@ from needle_verification.trials.trial_processes import (
 
 DELAY, LOSS = 0.005, 0.01
 SHORTEST, LONGEST = 0.1, 5.0
+_DRIVER = "/device_driver"
 _OPERATOR, _CAMERAS = "operator", "stereo_tracker"
 _PIPED = "needle_verification.ros.holds.piped_operator"
 _TIP_CAMERA = "needle_verification.ros.computers.tip_camera"
@@ -70,10 +72,30 @@ class _DriveWitness(HoldWitness):
         # Whose hold counted, one after the other.
         self.holders: list[str] = []
         super().__init__("sim/drive_positions")
+        # What the controller says of the clocks of others.
+        self.clocks: dict[str, str] = {}
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.holders.append(values_of(message)["hold_owner"])
+
+    def _on_health(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            if status.name == f"plane_controller: {PART}":
+                self.clocks = values_of(status)
+
+    def clock_of(self, node: str) -> tuple[float, float]:
+        """Return how far a node's clock is ahead of the controller's, and within what [s].
+
+        Raises
+        ------
+        UserError
+            If the controller does not say.
+        """
+        ahead, within = f"{node} ahead_s", f"{node} within_s"
+        self.until(lambda: bool(self.clocks.get(ahead)), f"the clock of {node}")
+        return float(self.clocks[ahead]), float(self.clocks[within])
 
     def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
         super()._on_joints(message, info)
@@ -155,6 +177,7 @@ def _rig(held: ExitStack, folder: Path, domain: int, persons: Computer, cable: C
     graph.start_module(_OPERATOR, _PIPED, values)
     witness.prepare(_READY)
     hold_anew(pedal, witness)
+    witness.clock_of(_DRIVER)
     return _Rig(witness, graph, pedal, cable)
 
 
@@ -166,6 +189,7 @@ def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
     if witness.way(time.time() - _RECENT, math.inf) == 0.0:
         # A busy machine lets a path run out, or a hold.
         hold_anew(rig.pedal, witness)
+    ahead, within = witness.clock_of(_DRIVER)
     del witness.holders[:]
     cut = time.time()
     rig.cable.cut()
@@ -175,6 +199,8 @@ def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
     witness.pause(_BACK)
     last = witness.last_motion(cut, back)
     outcome = {
+        "clock_ahead_s": ahead,
+        "clock_within_s": within,
         "length_s": length,
         "moving": witness.way(cut - _RECENT, cut) > 0.0,
         # A hold that went on counting was not lost.
