@@ -123,13 +123,11 @@ class _AskedClock(Waitable):
                 qos_profile_services_default.get_c_qos_profile(),
             )
         node.add_waitable(self)
-        node._wake_executor()
 
     def close(self) -> None:
         """Ask no more."""
         self._node.remove_waitable(self)
         self._client.destroy_when_not_in_use()
-        self._node._wake_executor()
 
     def ask(self) -> None:
         """Ask for the time, where the node is there."""

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 
 from needle_verification.checking import Check, Finding, Workbench, trial_outcomes
 
-CUTS = 50
+TRIALS = "needle_verification.ros.computers.cable_trials"
+CUTS, WRONG_CUTS = 50, 5
+WRONG = 0.2  # [s]
 # A hold lives for 100 ms; then come a cycle and a quick stop. Beside it, how late the last hold
 # before the cut came, and how often the drives say where they are [ms].
 LIFETIME, STOP, DELAY, SAMPLING = 100.0, 30.0, 5.0, 20.0
@@ -18,7 +20,7 @@ BOUND = LIFETIME + STOP + DELAY + SAMPLING
 
 def two_computers(_: Workbench, cuts: int = CUTS) -> Iterator[Finding]:
     """End every motion soon after the cable is cut, go on only when a person presses anew."""
-    outcomes = trial_outcomes("needle_verification.ros.computers.cable_trials", cuts)
+    outcomes = trial_outcomes(TRIALS, cuts)
     # A cut that is shorter than the hold's life need not end it.
     lost = [outcome for outcome in outcomes if outcome["lost"]]
     kept = [outcome for outcome in outcomes if not outcome["lost"]]
@@ -63,4 +65,19 @@ def two_computers(_: Workbench, cuts: int = CUTS) -> Iterator[Finding]:
     )
 
 
-CHECKS: tuple[Check, ...] = (two_computers,)
+def clocks_differ(_: Workbench, cuts: int = WRONG_CUTS) -> Iterator[Finding]:
+    """End every motion as soon where the cameras stamp by another clock."""
+    for ahead in (-WRONG, WRONG):
+        outcomes = trial_outcomes(TRIALS, cuts, "--clock-ahead", ahead)
+        latest = max((float(outcome["last_motion_ms"]) for outcome in outcomes), default=0.0)
+        resumed = sum(float(outcome["resumed_mm"]) > 0.0 for outcome in outcomes)
+        yield Finding(
+            f"clock_{'ahead' if ahead > 0.0 else 'behind'}",
+            f"the same, {cuts} cuts, the cameras' clock {ahead:+g} s off",
+            f"last motion at most {BOUND:g} ms after the cut; none by itself",
+            f"at most {latest:.0f} ms after {len(outcomes)} cuts; {resumed}",
+            latest <= BOUND and resumed == 0 and len(outcomes) == cuts,
+        )
+
+
+CHECKS: tuple[Check, ...] = (two_computers, clocks_differ)

@@ -61,3 +61,16 @@ def test_a_trial_that_is_missing_is_a_miss(monkeypatch: pytest.MonkeyPatch, tmp_
     findings = list(check_computers.two_computers(Workbench([], tmp_path), 2))
     assert not findings[0].passed
     assert not findings[2].passed
+
+
+@pytest.mark.parametrize(
+    ("change", "passed"),
+    [({}, True), ({"last_motion_ms": 155.1}, False), ({"resumed_mm": 1e-6}, False)],
+)
+def test_a_clock_that_changes_what_a_cut_does_is_a_miss(
+    change: dict[str, float], passed: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    good = {"last_motion_ms": 120.0, "resumed_mm": 0.0}
+    monkeypatch.setattr(check_computers, "trial_outcomes", lambda *_: [good, {**good, **change}])
+    findings = list(check_computers.clocks_differ(Workbench([], tmp_path), 2))
+    assert [finding.passed for finding in findings] == [passed, passed]

@@ -5,7 +5,8 @@
 Controller, cameras and the person who holds are on one computer, the driver and its drives on the
 other; each is a network namespace of this machine, with shared memory of its own. All that goes
 between them takes 5 ms, 1 % of it is lost, and in each trial the cable is cut at a random moment
-for 0.1 to 5 s, while the person goes on holding.
+for 0.1 to 5 s, while the person goes on holding. With `--clock-ahead` the cameras stamp by a clock
+that is so far ahead of the driver's.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,8 @@ _READY = 60.0
 _LATEST, _BACK = 0.4, 2.0
 # A needle that moved so shortly before moves now [s].
 _RECENT = 0.05
+# After so long without motion the next one is another [s].
+_REST = 0.1
 
 
 class _DriveWitness(HoldWitness):
@@ -97,6 +100,15 @@ class _DriveWitness(HoldWitness):
         self.until(lambda: bool(self.clocks.get(ahead)), f"the clock of {node}")
         return float(self.clocks[ahead]), float(self.clocks[within])
 
+    def end_of_motion(self, begin: float) -> tuple[float, float]:
+        """Return when the needle came to rest after a time [s], and how far it went later [m]."""
+        end = begin
+        for at, _ in self._motions(begin, math.inf):
+            if at.time - end > _REST:
+                break
+            end = at.time
+        return end, self.way(end, math.inf)
+
     def _on_joints(self, message: JointState, info: dict[str, int]) -> None:
         super()._on_joints(message, info)
         insertion, rotation = message.position
@@ -114,7 +126,7 @@ class _Rig:
 
 
 def cable_trials(
-    folder: Path, count: int, seed: int, longest: float = LONGEST
+    folder: Path, count: int, seed: int, longest: float = LONGEST, ahead: float = 0.0
 ) -> Iterator[dict[str, Any]]:
     """Yield what came of each cut; this process is on the computer of the drives from now on.
 
@@ -128,6 +140,8 @@ def cable_trials(
         Of moments, lengths and losses.
     longest : float
         The longest cut [s].
+    ahead : float
+        How far the clock that the cameras stamp by is ahead [s].
 
     Raises
     ------
@@ -135,6 +149,33 @@ def cable_trials(
         If no second computer can be made here.
     """
     rng = random.Random(seed)
+    with _computers(seed) as computers:
+        numbers = iter(range(count))
+        number = next(numbers, None)
+        while number is not None:
+            place = folder / f"from_{number}"
+            place.mkdir()
+            with ExitStack() as held:
+                rig = _rig(held, place, computers, ahead)
+                hold_anew(rig.pedal, rig.witness)
+                while number is not None and rig.witness.insertion < _DEEP:
+                    yield {"number": number, **_cut(rig, rng, longest)}
+                    rig.graph.check()
+                    number = next(numbers, None)
+
+
+@dataclasses.dataclass
+class _Computers:
+    """The person's computer, and the cable that leads to the one where this process is."""
+
+    domain: int
+    persons: Computer
+    cable: Cable
+
+
+@contextmanager
+def _computers(seed: int) -> Iterator[_Computers]:
+    """Make two computers and a bad cable; this process is on that of the drives from now on."""
     with ExitStack() as held:
         domain = held.enter_context(own_domain())
         persons, drives = (held.enter_context(closing(Computer())) for _ in range(2))
@@ -147,20 +188,10 @@ def cable_trials(
         keep_to_this_machine()
         rclpy.init(args=[], domain_id=domain)
         held.callback(rclpy.try_shutdown)
-        numbers = iter(range(count))
-        number = next(numbers, None)
-        while number is not None:
-            place = folder / f"from_{number}"
-            place.mkdir()
-            with ExitStack() as of_rig:
-                rig = _rig(of_rig, place, domain, persons, cable)
-                while number is not None and rig.witness.insertion < _DEEP:
-                    yield {"number": number, **_cut(rig, rng, longest)}
-                    rig.graph.check()
-                    number = next(numbers, None)
+        yield _Computers(domain, persons, cable)
 
 
-def _rig(held: ExitStack, folder: Path, domain: int, persons: Computer, cable: Cable) -> _Rig:
+def _rig(held: ExitStack, folder: Path, computers: _Computers, ahead: float) -> _Rig:
     """Start the nodes where they belong, and make them ready."""
     light_file, pedal_file = folder / "light", folder / "pedal"
     witness = held.enter_context(
@@ -168,17 +199,17 @@ def _rig(held: ExitStack, folder: Path, domain: int, persons: Computer, cable: C
     )
     pedal = PipedPedal(pedal_file, _KEY)
     held.callback(pedal.unplug)
-    before = dict.fromkeys((_OPERATOR, _CAMERAS, "plane_controller"), persons.inside)
+    before = dict.fromkeys((_OPERATOR, _CAMERAS, "plane_controller"), computers.persons.inside)
     graph = held.enter_context(
-        closing(TrialProcesses(folder, domain, _parameters(), before=before))
+        closing(TrialProcesses(folder, computers.domain, _parameters(), before=before))
     )
-    graph.start_module(_CAMERAS, _TIP_CAMERA, {"light": str(light_file)})
+    seen = {"light": str(light_file), "clock_ahead": ahead}
+    graph.start_module(_CAMERAS, _TIP_CAMERA, seen)
     values = {"source": "pedal", "device": str(pedal_file), "key": _KEY}
     graph.start_module(_OPERATOR, _PIPED, values)
     witness.prepare(_READY)
-    hold_anew(pedal, witness)
     witness.clock_of(_DRIVER)
-    return _Rig(witness, graph, pedal, cable)
+    return _Rig(witness, graph, pedal, computers.cable)
 
 
 def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
@@ -195,9 +226,8 @@ def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
     rig.cable.cut()
     witness.pause(length)
     rig.cable.mend()
-    back = time.time()
     witness.pause(_BACK)
-    last = witness.last_motion(cut, back)
+    end, resumed = witness.end_of_motion(cut)
     outcome = {
         "clock_ahead_s": ahead,
         "clock_within_s": within,
@@ -205,9 +235,9 @@ def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
         "moving": witness.way(cut - _RECENT, cut) > 0.0,
         # A hold that went on counting was not lost.
         "lost": set(witness.holders) != {_OPERATOR},
-        "last_motion_ms": (last - cut) * 1e3,
-        "distance_mm": witness.way(cut, back) * 1e3,
-        "resumed_mm": witness.way(back, math.inf) * 1e3,
+        "last_motion_ms": (end - cut) * 1e3,
+        "distance_mm": witness.way(cut, end) * 1e3,
+        "resumed_mm": resumed * 1e3,
     }
     begin = time.monotonic()
     hold_anew(rig.pedal, witness)
@@ -237,11 +267,14 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--longest", type=float, default=LONGEST, help="the longest cut [s]")
 
+    parser.add_argument("--clock-ahead", type=float, default=0.0, help="the cameras' clock [s]")
+
     def run() -> int:
         given = parser.parse_args()
         with tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
-            trials = cable_trials(Path(name), given.count, given.seed, given.longest)
-            for outcome in trials:
+            for outcome in cable_trials(
+                Path(name), given.count, given.seed, given.longest, given.clock_ahead
+            ):
                 print(json.dumps(outcome), flush=True)
         return EXIT_DONE
 
