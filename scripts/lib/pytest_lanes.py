@@ -69,6 +69,17 @@ def pytest_unconfigure() -> None:
     _reserved.close()
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Generator[None, object, object]:
+    """Collect without searches for garbage: what comes up is there to stay."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected."""
     places = {file: place for place, file in enumerate(LONG_FILES)}
@@ -104,11 +115,6 @@ def _take_place(file: str) -> None:
                 fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
         time.sleep(0.05)
-
-
-def pytest_collection_finish() -> None:
-    """Leave what has come up to here out of all searches for garbage: it stays, and it is much."""
-    gc.freeze()
 
 
 def in_lane(config: pytest.Config) -> bool:
