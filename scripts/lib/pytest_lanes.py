@@ -23,6 +23,7 @@ from collections.abc import Collection, Generator
 from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 from xdist.workermanage import WorkerController
 
@@ -85,9 +86,9 @@ class LaneScheduling(LoadFileScheduling):
         super()._assign_work_unit(node)
 
 
-def pytest_xdist_make_scheduler(config: pytest.Config) -> LaneScheduling:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LaneScheduling:
     """Return what hands out the files in place of xdist's own."""
-    return LaneScheduling(config)
+    return LaneScheduling(config, log)
 
 
 def file_in_front(file: str) -> bool:
