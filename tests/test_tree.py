@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 
-import pytest
-
 from code_lines import ROOT, code_lines, modules
-from pytest_lanes import LONG_FILES, next_file
+from pytest_lanes import LONG_FILES
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
-NODES = "ros2_ws/src/needle_bags/test/ros/test_recorder.py"
-MORE_NODES = "ros2_ws/src/needle_bags/test/ros/test_player.py"
-RECKONS = "ros2_ws/src/needle_tracker/test/image/test_looks.py"
-MORE = "ros2_ws/src/needle_tracker/test/image/test_tip_fit.py"
 # How many are longer today; it only ever becomes less.
 LONG_MODULES = 12
 SOURCE = '''"""A docstring.
@@ -66,21 +60,3 @@ def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
 
 def test_the_test_files_that_are_run_first_are_there() -> None:
     assert [name for name in LONG_FILES if not (ROOT / name).is_file()] == []
-
-
-@pytest.mark.parametrize(
-    ("waiting", "in_front", "next_one"),
-    [
-        # The longest first; nodes while there is room for them, what reckons otherwise.
-        ([NODES, RECKONS], 0, NODES),
-        ([RECKONS, NODES], 1, NODES),
-        ([NODES, RECKONS], 2, RECKONS),
-        ([NODES, MORE_NODES], 1, NODES),
-        ([NODES, RECKONS, MORE], 2, RECKONS),
-        # When there is nothing else, a lane waits, or reckons in front of nobody.
-        ([NODES, MORE_NODES], 2, NODES),
-        ([RECKONS, MORE], 0, RECKONS),
-    ],
-)
-def test_a_lane_gets_what_it_can_begin(waiting: list[str], in_front: int, next_one: str) -> None:
-    assert next_file(waiting, in_front) == next_one

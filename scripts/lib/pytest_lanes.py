@@ -6,8 +6,7 @@ not hear those of another.
 
 Three lanes share two cores. Files that only reckon (`IN_BACKGROUND`) take what the others leave:
 those with nodes and watchdogs wait most of their time, and are late when nobody makes way for them.
-At most two of these run at a time: the third lane gets a file that only reckons while there is one,
-so that it neither waits for a place nor leaves all reckoning to the end.
+At most two of these run at a time.
 """
 
 from __future__ import annotations
@@ -19,13 +18,10 @@ import os
 import re
 import signal
 import time
-from collections.abc import Collection, Generator
+from collections.abc import Generator
 from pathlib import Path
 
 import pytest
-from xdist.remote import Producer
-from xdist.scheduler import LoadFileScheduling
-from xdist.workermanage import WorkerController
 
 from needle_common.process.ros_domain import own_domain
 
@@ -73,43 +69,6 @@ def pytest_unconfigure() -> None:
     _reserved.close()
 
 
-class LaneScheduling(LoadFileScheduling):
-    """Hands out the files, longest first, so that no lane waits for a place in front."""
-
-    def _assign_work_unit(self, node: WorkerController) -> None:
-        in_front = sum(
-            any(file_in_front(file) and not all(done.values()) for file, done in work.items())
-            for other, work in self.assigned_work.items()
-            if other is not node
-        )
-        self.workqueue.move_to_end(next_file(self.workqueue, in_front), last=False)
-        super()._assign_work_unit(node)
-
-
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LaneScheduling:
-    """Return what hands out the files in place of xdist's own."""
-    return LaneScheduling(config, log)
-
-
-def file_in_front(file: str) -> bool:
-    """Return whether a test file needs one of the places in front."""
-    return IN_BACKGROUND.fullmatch(file) is None
-
-
-def next_file(waiting: Collection[str], in_front: int) -> str:
-    """Return the first file that can begin at once; without one, the first.
-
-    Parameters
-    ----------
-    waiting : collection of str
-        Test files that no lane has yet, at least one.
-    in_front : int
-        How many other lanes have files in front.
-    """
-    has_room = in_front < _IN_FRONT
-    return next((file for file in waiting if file_in_front(file) == has_room), next(iter(waiting)))
-
-
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Collect without searches for garbage: what comes up is there to stay."""
@@ -144,7 +103,7 @@ def pytest_runtest_protocol(
 
 
 def _take_place(file: str) -> None:
-    policy = os.SCHED_OTHER if file_in_front(file) else os.SCHED_IDLE
+    policy = os.SCHED_IDLE if IN_BACKGROUND.fullmatch(file) else os.SCHED_OTHER
     os.sched_setscheduler(0, policy, os.sched_param(0))
     if policy == os.SCHED_IDLE:
         return
