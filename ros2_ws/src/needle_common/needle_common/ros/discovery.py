@@ -25,6 +25,7 @@ PARAMETERS_OF = "parameters_of"
 NO_TYPE = GetTypeDescription.Request(type_name="none/msg/None", type_hash="RIHS01_" + "0" * 64)
 # What the graph calls a node whose endpoint has come and whose name has not.
 _UNKNOWN = "_NODE_NAME_UNKNOWN_"
+_NAMELESS = "a node of yet unknown name"
 
 
 def unrecorded(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
@@ -97,9 +98,7 @@ def publishers_of(node: Node, topic: str) -> list[str]:
     """
     infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     return [
-        "a node of yet unknown name"
-        if info.node_name == _UNKNOWN
-        else full_name(info.node_namespace, info.node_name)
+        _NAMELESS if info.node_name == _UNKNOWN else full_name(info.node_namespace, info.node_name)
         for info in infos
     ]
 
@@ -114,12 +113,7 @@ def known_publishers_of(node: Node, topic: str) -> set[str]:
     topic : str
         Its name as the node would give it.
     """
-    infos = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
-    return {
-        full_name(info.node_namespace, info.node_name)
-        for info in infos
-        if info.node_name != _UNKNOWN
-    } - {node.get_fully_qualified_name()}
+    return set(publishers_of(node, topic)) - {_NAMELESS, node.get_fully_qualified_name()}
 
 
 def one_too_many(node: Node, subscription: Subscription[Any]) -> str:

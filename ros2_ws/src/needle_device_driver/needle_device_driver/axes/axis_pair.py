@@ -39,8 +39,7 @@ class PairSnapshot:
     @property
     def let_go(self) -> str:
         """Names of the axes that are switched off while stopped; empty: none."""
-        axes = {"insertion": self.insertion, "rotation": self.rotation}
-        return " and ".join(name for name, at in axes.items() if at.let_go)
+        return " and ".join(name for name, at in self._by_name.items() if at.let_go)
 
     def age(self, now: float) -> float:
         """Return the age of the older reply [s]."""
@@ -49,14 +48,19 @@ class PairSnapshot:
     @property
     def fault(self) -> str:
         """The faults of both axes; empty: none."""
-        axes = {"insertion": self.insertion, "rotation": self.rotation}
-        return "; ".join(f"{name} axis: {at.fault}" for name, at in axes.items() if at.fault)
+        return "; ".join(
+            f"{name} axis: {at.fault}" for name, at in self._by_name.items() if at.fault
+        )
 
     @property
     def fault_rule(self) -> Rule:
         """The rule behind the first fault."""
         axis = self.insertion if self.insertion.fault else self.rotation
         return axis.fault_rule
+
+    @property
+    def _by_name(self) -> dict[str, AxisSnapshot]:
+        return {"insertion": self.insertion, "rotation": self.rotation}
 
 
 class AxisPair:

@@ -24,7 +24,7 @@ WATCHDOG_BOUND = 0.2
 CATCH_UP_BOUND = 0.3
 # Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
 # hold_new_press) [s].
-_DISCOVERED_WITHIN = 0.2
+DISCOVERED_WITHIN = 0.2
 # How long a status may be behind the motors [s].
 _STATUS_LAG = 0.15
 # Beyond the limits themselves: of set-points that a bus brings late, three of 0.02 s may come at
@@ -140,7 +140,7 @@ class Watch:
     def see_other_hold(self, at: float) -> None:
         """Take that somebody else pressed: from outside that is a hold like any other."""
         if at - self._other_until > self._release_bound:
-            self._other_since = at + _DISCOVERED_WITHIN
+            self._other_since = at + DISCOVERED_WITHIN
         self._other_until = at
 
     def see_device(self, at: float, values: Mapping[str, str]) -> None:

@@ -14,11 +14,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 
+from needle_verification.soak.invariants import DISCOVERED_WITHIN
 from needle_verification.soak.link_faults import LinkFaults
-from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
+from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
 # From an endpoint's creation until another process knows it [ns], at least and at most.
-_DISCOVERY_NS = (5_000_000, 200_000_000)
+_DISCOVERY_NS = (5_000_000, round(DISCOVERED_WITHIN * NANOSECONDS))
 # On a topic's way [ns].
 _TRANSPORT_NS = (50_000, 1_500_000)
 # From a reliable writer's sending to its sending again, where no acknowledgement came [ns].
