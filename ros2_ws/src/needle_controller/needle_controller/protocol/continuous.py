@@ -104,16 +104,21 @@ class ContinuousSteering(Steering):
     def __init__(self, settings: SteeringSettings) -> None:
         super().__init__(settings)
         self._ahead: PathAhead | None = None
+        # Stamp of the newest path that was on its way when a refusal was heard [ns].
+        self._refusal_known_ns = 0
 
     def on_start(self) -> tuple[StartReply, list[Action]]:
         """Begin steering, or say why not."""
+        self._refusal_known_ns = 0
         reply, actions = super().on_start()
         if not self.control.started:
             self._ahead = None
         return reply, actions
 
     def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:
-        """Take the driver's answer; only what became of the newest path matters.
+        """Take the driver's answer to a path; newer ones may be on their way.
+
+        Those that were sent before a refusal was heard say nothing new.
 
         Parameters
         ----------
@@ -124,11 +129,12 @@ class ContinuousSteering(Steering):
         sent_ns : int
             When the device sent it; unused.
         """
-        if stamp_ns != self.command_ns or not self._steering:
+        if not self._steering or not self._refusal_known_ns < stamp_ns <= self.command_ns:
             return []
         if text in {"succeeded", "replaced"}:
             self._failed.forget()
             return []
+        self._refusal_known_ns = self.command_ns
         actions: list[Action] = [Log("warning", f"path {text}", "abort")]
         self.reason = f"path {text}"
         why = self._failed.aborted(text, moved=self.intake.has_moved)

@@ -16,7 +16,7 @@ from needle_controller.protocol.steering_types import (
 from needle_controller.protocol.step_watch import MOST_REFUSALS
 from needle_controller.protocol.tip_gate import TipMeasurement
 
-from .rig import FREE, HELD, MOVING, Rig, logged, sent, where
+from .rig import FREE, HELD, MOVING, TICK, Rig, logged, sent, where
 
 MM = 1e-3
 
@@ -146,13 +146,48 @@ def test_without_hold_no_path_and_after_it_only_from_a_new_tip() -> None:
     assert path_in(rig.see()).stamp_ns == rig.now
 
 
-def test_an_answer_to_an_older_path_means_nothing() -> None:
+def test_an_answer_that_a_path_was_taken_asks_for_nothing() -> None:
     rig = ContinuousRig()
     first = path_in(rig.see())
     rig.go(0.2 * MM)
-    for text in ("replaced", "succeeded", "aborted: why not"):
+    for text in ("replaced", "succeeded"):
         assert rig.steering.on_result(first.stamp_ns, text) == []
     assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+
+
+@pytest.mark.parametrize("late", [1, 3])
+def test_refusals_that_come_when_newer_paths_are_sent_are_a_fault_too(late: int) -> None:
+    rig = ContinuousRig()
+    stamps = [path_in(rig.see()).stamp_ns for _ in range(late)]
+    heard = 0
+    while rig.steering.state is SteeringState.STEERING:
+        heard += 1
+        stamps.append(path_in(rig.see()).stamp_ns)
+        rig.steering.on_result(stamps[-1 - late], "aborted: no")
+        assert heard < 100
+    # Each that counts was sent when the one before was known.
+    assert heard == 1 + (MOST_REFUSALS - 1) * (late + 1)
+    assert "without motion" in rig.steering.reason
+
+
+def test_refusals_of_all_that_a_cut_cable_held_back_count_once() -> None:
+    rig = ContinuousRig()
+    stamps = [path_in(rig.see()).stamp_ns for _ in range(3 * MOST_REFUSALS)]
+    for stamp in stamps:
+        rig.steering.on_result(stamp, "aborted: nobody holds to run")
+    assert where(rig) == (SteeringState.STEERING, Awaiting.TIP)
+
+
+def test_paths_count_again_after_time_was_set_back_and_steering_started() -> None:
+    rig = ContinuousRig()
+    rig.now = 500 * TICK
+    rig.settle()
+    rig.steering.on_result(path_in(rig.see()).stamp_ns, "aborted: no")
+    rig.now = TICK
+    rig.settle()
+    assert rig.steering.state is SteeringState.IDLE
+    assert rig.steering.on_start()[0].success
+    assert "aborted" in logged(rig.steering.on_result(path_in(rig.see()).stamp_ns, "aborted: no"))
 
 
 def test_paths_that_are_refused_in_a_row_are_a_fault() -> None:
