@@ -22,8 +22,8 @@ LANES = 64
 ERROR = 9
 """Length of the error: position and rotation vector, both along the axes of `target_plane` (the
 true rotation is exp(error) R), curvature, size of the torsion, insertion scale."""
-NOISES = 4
-"""Most noise models of one shape, uniform or normal."""
+NOISES = 6
+"""Most noise models of one shape."""
 E_POSITION, E_TURN, E_KAPPA, E_SIZE, E_SCALE = 0, 3, 6, 7, 8
 """Where each begins in the error."""
 PAIRS = ERROR * (ERROR + 1) // 2
@@ -34,10 +34,12 @@ KAPPA, SCALE, PLAY, LAG, TIP_ANGLE, BEHIND_PLAY, PER_SIZE = range(P + PAIRS, P +
 [rad], lag length [m], angles of the tip and of the shaft behind the play since the start [rad],
 derivative of the tip's angle with respect to the torsion's size."""
 NOISE = PER_SIZE + 1
-"""First row of how likely each noise model is."""
-KIND, IS_UNIFORM, WEIGHT, EVIDENCE, OUTLIER = range(NOISE + NOISES, NOISE + NOISES + 5)
-"""Rows of the torsion hypothesis's number, whether noise is thought to be uniform, and the weight;
-and, of the last tip, its likelihood and how likely it was an outlier."""
+"""First row of how likely each noise model is: of all coordinates, or of the first of three."""
+REMAINDER = NOISE + 3 * NOISES
+"""First row of the last tip minus what was then estimated of it [m]."""
+KIND, SHAPE, WEIGHT, EVIDENCE, OUTLIER = range(REMAINDER + 3, REMAINDER + 8)
+"""Rows of the torsion hypothesis's number, the shape that noise is thought to have, and the
+weight; and, of the last tip, its likelihood and how likely it was an outlier."""
 ROWS = OUTLIER + 1
 _LOWER = np.tril_indices(ERROR)
 PLACE = np.zeros((ERROR, ERROR), dtype=np.int64)

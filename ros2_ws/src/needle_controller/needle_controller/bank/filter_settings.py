@@ -12,6 +12,9 @@ from needle_common.errors import UserError
 from needle_common.settings.bounds import Bounds, check_bounded_fields
 from needle_controller.bank.estimate_tiles import NOISES
 from needle_controller.bank.hypotheses import (
+    LASTING,
+    NORMAL,
+    UNIFORM,
     NoiseHypothesis,
     RollHypothesis,
     TorsionHypothesis,
@@ -37,13 +40,22 @@ ROLL_HYPOTHESES = tuple(
 )
 """Most likely as the base puts it, to some 30 deg; else anywhere. Narrow ones, for a filter that is
 linear in the roll knows less than it thinks when its roll is wide."""
-NORMAL_NOISE = (NoiseHypothesis(False, (1.0, 2.0, 4.0, 8.0), (0.7, 0.15, 0.1, 0.05), 1.0),)
-"""Where a covariance is claimed: normal, as claimed or larger."""
-BOUNDED_NOISE = (
-    NoiseHypothesis(True, (1.0, 1.3, 1.7, 2.2), (0.85, 0.05, 0.05, 0.05), 0.8),
-    NoiseHypothesis(False, (1.0, 1.6, 2.6), (0.6, 0.2, 0.2), 0.2),
+LASTING_NOISE = NoiseHypothesis(
+    LASTING, (1.0, 2.0) * 3, (1.0 / 6.0,) * 6, 0.1, (0.0, 0.0, 0.5, 0.5, 0.8, 0.8)
 )
-"""Where a bound is claimed: most likely it holds; else a larger one, or none."""
+"""Whatever is claimed: some coordinates are worse than others, or errors last for some tips."""
+NORMAL_NOISE = (
+    NoiseHypothesis(NORMAL, (1.0, 0.5, 2.0, 4.0, 8.0), (0.5, 0.2, 0.15, 0.1, 0.05), 1.0),
+    LASTING_NOISE,
+)
+"""Where a covariance is claimed: normal, smaller than claimed, as claimed or larger."""
+BOUNDED_NOISE = (
+    NoiseHypothesis(UNIFORM, (1.0, 1.3, 1.7, 2.2), (0.85, 0.05, 0.05, 0.05), 0.8),
+    NoiseHypothesis(NORMAL, (1.0, 0.5, 1.6, 2.6), (0.4, 0.2, 0.2, 0.2), 0.2),
+    LASTING_NOISE,
+)
+"""Where a bound is claimed: most likely it holds; else a larger one, or none. Were no small normal
+noise thought possible, small errors would look like errors that last."""
 
 
 class Drift(NamedTuple):
@@ -66,6 +78,7 @@ class Limits(NamedTuple):
     largest_lag: float
     smallest_weight: float
     softness: float
+    model_error: float
     mistrust: float
     outlier_share: float
     outlier_density: float
@@ -209,6 +222,7 @@ class FilterSettings:
             largest_lag=self.lag_range[1],
             smallest_weight=1.0 / self.prune_ratio,
             softness=self.softness**2,
+            model_error=self.model_error**2,
             mistrust=self.mistrust,
             outlier_share=self.outlier_share,
             outlier_density=self.outlier_reach**-3,
@@ -218,9 +232,10 @@ class FilterSettings:
         )
 
     def noises(self) -> Array:
-        """Return multiples and shares of normal and uniform noises, shape (2, 2, NOISES)."""
-        numbers = np.zeros((2, 2, NOISES))
+        """Return multiples, shares and correlations of each shape, (3, 3, NOISES)."""
+        numbers = np.zeros((3, 3, NOISES))
         for noise in self.noise_hypotheses:
             count = len(noise.shares)
-            numbers[int(noise.is_uniform), :, :count] = noise.multiples, noise.shares
+            numbers[noise.shape, :2, :count] = noise.multiples, noise.shares
+            numbers[noise.shape, 2, : len(noise.lasting)] = noise.lasting
         return numbers

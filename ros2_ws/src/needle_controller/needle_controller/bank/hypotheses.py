@@ -60,27 +60,37 @@ class RollHypothesis:
         check_bounded_fields(self)
 
 
+# Read by compiled code.
+NORMAL, UNIFORM, LASTING = range(3)
+"""Shapes of noise: normal or uniform within a bound, the same in all coordinates and new with each
+tip; or normal, of each coordinate's own size, and such that errors may last from tip to tip."""
+
+
 @dataclasses.dataclass(frozen=True)
 class NoiseHypothesis:
     """What the noise of a measured coordinate may be, against what is claimed of it.
 
     Attributes
     ----------
-    is_uniform : bool
-        Whether it is uniform within a bound; else it is normal.
+    shape : int
+        `NORMAL`, `UNIFORM` or `LASTING`.
     multiples : tuple of float
         Its bound as multiples of the claimed bound, or its standard deviation as multiples of the
-        claimed one (of a bound: bound / sqrt(3)); at most 4.
+        claimed one (of a bound: bound / sqrt(3)); at most 6.
     shares : tuple of float
         How likely each is; the sum is 1.
     weight : float
         Prior weight, relative to the others'.
+    lasting : tuple of float
+        Of `LASTING` noise, the correlation of an error with that of the tip before, for each
+        multiple, in [0, 1); empty of the others.
     """
 
-    is_uniform: bool
+    shape: int
     multiples: tuple[float, ...]
     shares: tuple[float, ...]
     weight: Annotated[float, Bounds(1e-9, 1e9, "-")]
+    lasting: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         """Check every field; raises UserError."""
@@ -90,3 +100,6 @@ class NoiseHypothesis:
             raise UserError(f"{said}: want 1 to {NOISES} of each")
         if min(self.multiples + self.shares) <= 0.0 or abs(sum(self.shares) - 1.0) > 1e-9:
             raise UserError(f"{said}: want multiples > 0, and shares > 0 whose sum is 1")
+        wanted = len(self.multiples) if self.shape == LASTING else 0
+        if len(self.lasting) != wanted or not all(0.0 <= each < 1.0 for each in self.lasting):
+            raise UserError(f"lasting = {self.lasting}, wants {wanted} numbers in [0, 1)")

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from needle_controller.bank.doubts import doubts_of
 from needle_controller.bank.estimate_tiles import (
     ERROR,
+    REMAINDER,
     P,
     R,
     X,
@@ -181,6 +182,7 @@ class HypothesisFilter:
         set_rows(tiles, X, rows(tiles, X, 3) @ turn.T + transform[:3, 3])
         rotation = turn @ rows(tiles, R, 9).reshape(-1, 3, 3)
         set_rows(tiles, R, rotation.reshape(-1, 9))
+        set_rows(tiles, REMAINDER, rows(tiles, REMAINDER, 3) @ turn.T)
         turns = np.eye(ERROR)
         turns[:3, :3] = turns[3:6, 3:6] = turn
         set_rows(tiles, P, lower_half(turns @ covariances(tiles) @ turns.T))

@@ -13,7 +13,6 @@ from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
     E_TURN,
-    IS_UNIFORM,
     KAPPA,
     KIND,
     LAG,
@@ -23,6 +22,7 @@ from needle_controller.bank.estimate_tiles import (
     PLACE,
     PLAY,
     SCALE,
+    SHAPE,
     TIP_ANGLE,
     WEIGHT,
     R,
@@ -31,6 +31,7 @@ from needle_controller.bank.estimate_tiles import (
     covariances,
     rows,
 )
+from needle_controller.bank.hypotheses import LASTING
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes, rotation_from_angles
 from needle_controller.observers.estimator import Estimate
@@ -116,7 +117,7 @@ def mixture(
     ----------
     tiles : Tiles
         The estimates.
-    noises : ndarray, shape (2, 2, NOISES)
+    noises : ndarray, shape (3, 3, NOISES)
         As in `take_tip`.
     coordinates : ndarray, shape (N, 6), written
         x, y, z [m] are the weighted mean; the heading is the mean heading, the roll the mean
@@ -186,10 +187,15 @@ def _add_estimate(tile: Array, h: int, weight: float, sums: Array) -> None:
 
 @compiled
 def _noise_size(tile: Array, h: int, noises: Array) -> float:
-    size = 0.0
-    for m in range(NOISES):
-        size += tile[NOISE + m, h] * noises[int(tile[IS_UNIFORM, h]), 0, m]
-    return size
+    """Return the size of the noisiest coordinate."""
+    largest = 0.0
+    for coordinate in range(3 if tile[SHAPE, h] == LASTING else 1):
+        size = 0.0
+        for m in range(NOISES):
+            share = tile[NOISE + coordinate * NOISES + m, h]
+            size += share * noises[int(tile[SHAPE, h]), 0, m]
+        largest = max(largest, size)
+    return largest
 
 
 @compiled

@@ -15,16 +15,15 @@ from needle_controller.bank.estimate_tiles import (
     E_SIZE,
     E_TURN,
     ERROR,
-    IS_UNIFORM,
     KAPPA,
     KIND,
     LAG,
     LANES,
-    NOISE,
-    NOISES,
     PLACE,
     PLAY,
+    REMAINDER,
     SCALE,
+    SHAPE,
     WEIGHT,
     R,
     Tiles,
@@ -63,7 +62,7 @@ def merge(tiles: Tiles, angle: float) -> None:
 @compiled
 def _same(a: Array, i: int, b: Array, j: int, cosine: float, angle: float) -> bool:
     """Return whether two hypotheses are one: rolls, pitches and sizes of the torsion are near."""
-    if a[KIND, i] != b[KIND, j] or a[IS_UNIFORM, i] != b[IS_UNIFORM, j]:
+    if a[KIND, i] != b[KIND, j] or a[SHAPE, i] != b[SHAPE, j]:
         return False
     along = a[R, i] * b[R, j] + a[R + 1, i] * b[R + 1, j] + a[R + 2, i] * b[R + 2, j]
     return bool(
@@ -100,6 +99,6 @@ def _join(a: Array, i: int, b: Array, j: int, difference: Array) -> None:
     rotate(a, i, share * difference[3], share * difference[4], share * difference[5])
     for k in range(3):
         a[X + k, i] += share * difference[k]
-    for row in range(KAPPA, NOISE + NOISES):
+    for row in range(KAPPA, REMAINDER + 3):
         a[row, i] += share * (b[row, j] - a[row, i])
     a[WEIGHT, i], b[WEIGHT, j] = weight, 0.0

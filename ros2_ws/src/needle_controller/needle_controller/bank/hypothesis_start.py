@@ -9,7 +9,6 @@ from needle_controller.bank.estimate_tiles import (
     E_SCALE,
     E_SIZE,
     E_TURN,
-    IS_UNIFORM,
     KAPPA,
     KIND,
     LAG,
@@ -19,6 +18,7 @@ from needle_controller.bank.estimate_tiles import (
     PLAY,
     ROWS,
     SCALE,
+    SHAPE,
     WEIGHT,
     R,
     X,
@@ -59,9 +59,10 @@ def start_bank(settings: FilterSettings, tip: Array, rotation: Array) -> Bank:
     weights = np.array([t.weight * roll.weight * noise.weight for _, t, roll, noise in every])
     numbers[:-1, WEIGHT] = weights[:-1] / np.max(weights[:-1])
     numbers[:, KIND] = [kind for kind, _, _, _ in every]
-    numbers[:, IS_UNIFORM] = [noise.is_uniform for _, _, _, noise in every]
+    numbers[:, SHAPE] = [noise.shape for _, _, _, noise in every]
     for m in range(NOISES):
-        numbers[:, NOISE + m] = [sum(noise.shares[m : m + 1]) for _, _, _, noise in every]
+        for row in range(NOISE + m, NOISE + 3 * NOISES, NOISES):
+            numbers[:, row] = [sum(noise.shares[m : m + 1]) for _, _, _, noise in every]
     numbers[:, KAPPA], numbers[:, SCALE] = settings.curvature, 1.0
     numbers[:, PLAY] = [torsion.play for _, torsion, _, _ in every]
     numbers[:, LAG] = [torsion.lag_length for _, torsion, _, _ in every]

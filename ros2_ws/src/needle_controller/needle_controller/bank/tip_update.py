@@ -7,8 +7,17 @@ Coordinate after coordinate the mixture of what the models say is replaced by th
 same mean and variance (assumed-density filtering; truncated normals have these in closed form). In
 the end the estimate is the mixture of that and of what it was before, by how likely the tip was an
 outlier. A correlated tip is taken along directions in which its errors are independent.
+
+Where a share c of an error is left in the next one, e' = c e + sqrt(1 - c^2) w, w of variance R,
+what a tip is off the estimate, less c times what the one before was (after its update), is
+
+    d' - c d + sqrt(1 - c^2) w
+
+with d and d' what the estimate is off the needle at both. Of the variance of d' as much as R was
+there before, for no estimate is less certain than its tip; the rest is new.
 """
 
+# ruff: noqa: PLR0917 - compiled functions take no keywords
 from __future__ import annotations
 
 import math
@@ -22,7 +31,6 @@ from needle_controller.bank.estimate_tiles import (
     E_TURN,
     ERROR,
     EVIDENCE,
-    IS_UNIFORM,
     KAPPA,
     LAG,
     NOISE,
@@ -31,13 +39,16 @@ from needle_controller.bank.estimate_tiles import (
     PER_SIZE,
     PLACE,
     PLAY,
+    REMAINDER,
     SCALE,
+    SHAPE,
     TIP_ANGLE,
     WEIGHT,
     R,
     X,
 )
 from needle_controller.bank.filter_settings import Limits
+from needle_controller.bank.hypotheses import LASTING, NORMAL, UNIFORM
 from needle_controller.bank.normal_moments import falling_exponential, truncated_moments
 from needle_controller.bank.tip_motion import rotation_factors
 from needle_controller.model.arrays import Array
@@ -46,14 +57,17 @@ FOUND, READ, ALONG, BOUND = 0, 1, 4, 13
 READING_ROWS = 16
 """Rows of a tip: 1 if there is one; its three readings [m], the directions in which they were read,
 and the noise bound claimed for each [m]."""
-CHANGE, COVARIED, NARROWING, INNOVATION, VARIANCE, DEVIATION, MASS, MEAN, SQUARE, OUTSIDE, SHARE = (
-    0, 9, 36, 39, 40, 41, 42, 43, 44, 45, 46,
-)  # fmt: skip
+CHANGE, COVARIED, NARROWING = 0, 9, 36
+INNOVATION, TAKEN, LAST, VARIANCE, DEVIATION, MASS, MEAN, SQUARE = range(39, 47)
+OUTSIDE, LIKELIHOOD, SHARE = 47, 48, 49
 SPREAD = INNOVATION
-UPDATE_ROWS = SHARE + NOISES
+SHOWN = SHARE + 3 * NOISES
+UPDATE_ROWS = SHOWN + NOISES
 """Rows of working memory: what the tip changes; each coordinate's covariances with the error, and
-by how much they narrow it; of one coordinate innovation, variance and standard deviation, and sums
-over the noise models; the density of outliers; each noise model's share.
+by how much they narrow it; of one coordinate innovation, what the coordinates before have taken of
+it, what is left of the tip before, variance and standard deviation, and sums over the noise models;
+the density of outliers; the tip's likelihood; each noise model's share of each coordinate, and what
+one shows of the noise.
 From `SPREAD` on, once the coordinates are done with: what multiplies a row of the covariances."""
 _SMALLEST_SHARE = 0.02
 _NO_MASS = 1e-30
@@ -74,28 +88,38 @@ def take_tip(tile: Array, reading: Array, noises: Array, limits: Limits, work: A
         bounds, `OUTLIER` the share of it that outliers have.
     reading : ndarray, shape (READING_ROWS, LANES)
         The tips; where there is none nothing changes.
-    noises : ndarray, shape (2, 2, NOISES)
-        For normal and for uniform noise: sqrt(3) standard deviations of each model, or its bound,
-        as a multiple of the claimed bound; and how likely it is beforehand.
+    noises : ndarray, shape (3, 3, NOISES)
+        For each shape of noise: sqrt(3) standard deviations of each model, or its bound, as a
+        multiple of the claimed bound; how likely it is beforehand; and how much of an error is
+        left at the next tip.
     limits : Limits
         What the estimates are kept to, and how many tips are outliers.
     work : ndarray, shape (UPDATE_ROWS, LANES)
         Working memory.
     """
     work[CHANGE : CHANGE + ERROR], work[OUTSIDE] = 0.0, 1.0
-    work[SHARE : SHARE + NOISES] = tile[NOISE : NOISE + NOISES]
+    work[LIKELIHOOD] = 1.0
+    work[SHARE : SHARE + 3 * NOISES] = tile[NOISE : NOISE + 3 * NOISES]
+    is_uniform, is_normal = _is_there(tile, UNIFORM), _is_there(tile, NORMAL)
+    is_lasting = _is_there(tile, LASTING)
     for coordinate in range(3):
         _look(tile, reading, coordinate, limits, work)
+        bound = reading[BOUND + coordinate]
+        if coordinate > 0:
+            _hand_on(tile, coordinate, work)
         for m in range(NOISES):
-            bound = reading[BOUND + coordinate]
-            if _is_thought(tile, m, 1.0):
-                _weigh_uniform(tile, m, bound, noises[1, 0, m], work)
-            if _is_thought(tile, m, 0.0):
-                _weigh_normal(tile, m, bound, noises[0, 0, m], work)
+            own = coordinate * NOISES + m
+            if is_uniform and _is_thought(tile, m, UNIFORM):
+                _weigh_uniform(tile, own, bound, noises[UNIFORM, 0, m], work)
+            if is_normal and _is_thought(tile, m, NORMAL):
+                _weigh_normal(tile, own, NORMAL, bound, noises[NORMAL, 0, m], 0.0, limits, work)
+            if is_lasting and _is_thought(tile, own, LASTING):
+                multiple, lasting = noises[LASTING, 0, m], noises[LASTING, 2, m]
+                _weigh_normal(tile, own, LASTING, bound, multiple, lasting, limits, work)
         _decide(coordinate, work)
     _judge(tile, reading, noises, limits, work)
     _narrow(tile, work)
-    _apply(tile, limits, work)
+    _apply(tile, reading, limits, work)
 
 
 @inlined
@@ -124,11 +148,12 @@ def _look(tile: Array, reading: Array, coordinate: int, limits: Limits, work: Ar
                 work[own + k, h] -= work[MEAN, h] * work[others + k, h]
     for h in range(lanes):
         ux, uy, uz = reading[along, h], reading[along + 1, h], reading[along + 2, h]
-        work[INNOVATION, h] = reading[READ + coordinate, h] - (
-            ux * (tile[X, h] + work[CHANGE, h])
-            + uy * (tile[X + 1, h] + work[CHANGE + 1, h])
-            + uz * (tile[X + 2, h] + work[CHANGE + 2, h])
+        work[LAST, h] = (
+            ux * tile[REMAINDER, h] + uy * tile[REMAINDER + 1, h] + uz * tile[REMAINDER + 2, h]
         )
+        work[TAKEN, h] = ux * work[CHANGE, h] + uy * work[CHANGE + 1, h] + uz * work[CHANGE + 2, h]
+        expected = ux * tile[X, h] + uy * tile[X + 1, h] + uz * tile[X + 2, h]
+        work[INNOVATION, h] = reading[READ + coordinate, h] - expected - work[TAKEN, h]
         variance = ux * work[own, h] + uy * work[own + 1, h] + uz * work[own + 2, h]
         bound = reading[BOUND + coordinate, h]
         # Where nearly nothing is known there is nothing to mistrust.
@@ -141,10 +166,28 @@ def _look(tile: Array, reading: Array, coordinate: int, limits: Limits, work: Ar
 
 
 @inlined
-def _is_thought(tile: Array, m: int, is_uniform: float) -> bool:
+def _hand_on(tile: Array, coordinate: int, work: Array) -> None:
+    """Take noise that is the same in all coordinates for what the coordinate before has shown."""
+    for m in range(coordinate * NOISES, (coordinate + 1) * NOISES):
+        for h in range(tile.shape[1]):
+            own, before = work[SHARE + m, h], work[SHARE + m - NOISES, h]
+            work[SHARE + m, h] = own if tile[SHAPE, h] == LASTING else before
+
+
+@inlined
+def _is_there(tile: Array, shape: int) -> bool:
+    """Return whether any estimate that has not ended thinks that noise has a shape."""
+    count = 0
+    for h in range(tile.shape[1]):
+        count += tile[WEIGHT, h] > 0.0 and tile[SHAPE, h] == shape
+    return count > 0
+
+
+@inlined
+def _is_thought(tile: Array, m: int, shape: int) -> bool:
     """Return whether any estimate that has not ended thinks a noise model possible."""
     for h in range(tile.shape[1]):
-        if tile[NOISE + m, h] * tile[WEIGHT, h] > 0.0 and tile[IS_UNIFORM, h] == is_uniform:
+        if tile[NOISE + m, h] * tile[WEIGHT, h] > 0.0 and tile[SHAPE, h] == shape:
             return True
     return False
 
@@ -158,28 +201,52 @@ def _weigh_uniform(tile: Array, m: int, bound: Array, multiple: float, work: Arr
         mass, mean, variance = truncated_moments(
             (innovation - limit) * per_deviation, (innovation + limit) * per_deviation
         )
-        weight = tile[IS_UNIFORM, h] * work[SHARE + m, h] * mass / multiple
-        work[SHARE + m, h] = weight if tile[IS_UNIFORM, h] > 0.0 else work[SHARE + m, h]
+        is_own = tile[SHAPE, h] == UNIFORM
+        weight = work[SHARE + m, h] * mass / multiple if is_own else 0.0
+        work[SHARE + m, h] = weight if is_own else work[SHARE + m, h]
         work[MASS, h] += weight
         work[MEAN, h] += weight * mean
         work[SQUARE, h] += weight * (variance + mean * mean)
 
 
 @inlined
-def _weigh_normal(tile: Array, m: int, bound: Array, multiple: float, work: Array) -> None:
-    """Add what a normal noise model says of a coordinate, by how likely it is."""
+def _weigh_normal(
+    tile: Array,
+    m: int,
+    shape: int,
+    bound: Array,
+    multiple: float,
+    lasting: float,
+    limits: Limits,
+    work: Array,
+) -> None:
+    """Add what a normal noise model says of a coordinate, by how likely it is.
+
+    Noise that is smaller than claimed is thought possible, but not relied upon.
+    """
     for h in range(tile.shape[1]):
-        variance, innovation = work[VARIANCE, h], work[INNOVATION, h]
         noise = multiple * bound[h]
-        per_variance = 1.0 / (variance + noise * noise / 3.0)
+        expected, measured = work[VARIANCE, h], max(noise * noise / 3.0, limits.model_error)
+        before = min(expected, measured)
+        known = expected - lasting * (2.0 - lasting) * before
+        # What the model leaves out does not last.
+        known += 2.0 * lasting * lasting * limits.model_error
+        variance = known + (1.0 - lasting * lasting) * measured
+        last = work[LAST, h] - work[TAKEN, h] * before / expected
+        innovation = work[INNOVATION, h] - lasting * last
+        per_variance = 1.0 / variance
         bell = falling_exponential(-0.5 * innovation * innovation * per_variance)
         density = _DENSITY * bound[h] * math.sqrt(per_variance) * bell
-        weight = (1.0 - tile[IS_UNIFORM, h]) * work[SHARE + m, h] * density
-        mean = work[DEVIATION, h] * innovation * per_variance
-        work[SHARE + m, h] = work[SHARE + m, h] if tile[IS_UNIFORM, h] > 0.0 else weight
+        is_own = tile[SHAPE, h] == shape
+        weight = work[SHARE + m, h] * density if is_own else 0.0
+        work[SHARE + m, h] = weight if is_own else work[SHARE + m, h]
+        relied = max(measured, bound[h] * bound[h] / 3.0)
+        variance = known + (1.0 - lasting * lasting) * relied
+        gain = (expected - lasting * before) / (work[DEVIATION, h] * variance)
+        mean = gain * innovation
         work[MASS, h] += weight
         work[MEAN, h] += weight * mean
-        work[SQUARE, h] += weight * (1.0 - variance * per_variance + mean * mean)
+        work[SQUARE, h] += weight * (1.0 - gain * gain * variance + mean * mean)
 
 
 @inlined
@@ -193,6 +260,9 @@ def _decide(coordinate: int, work: Array) -> None:
         share = min(max(share, _SMALLEST_SHARE), 1.0)
         work[MEAN, h] = mean / work[DEVIATION, h]
         work[NARROWING + coordinate, h] = (1.0 - share) / work[VARIANCE, h]
+        work[LIKELIHOOD, h] *= work[MASS, h]
+        for m in range(coordinate * NOISES, (coordinate + 1) * NOISES):
+            work[SHARE + m, h] *= per_mass
     for k in range(ERROR):
         for h in range(lanes):
             work[CHANGE + k, h] += work[own + k, h] * work[MEAN, h]
@@ -203,23 +273,24 @@ def _judge(tile: Array, reading: Array, noises: Array, limits: Limits, work: Arr
     """Say how likely the tip was, how likely an outlier, and what it shows of the noise."""
     for h in range(tile.shape[1]):
         outlier = limits.outlier_share * limits.outlier_density * work[OUTSIDE, h]
-        evidence = outlier
-        for m in range(NOISES):
-            work[SHARE + m, h] *= 1.0 - limits.outlier_share
-            evidence += work[SHARE + m, h]
+        evidence = outlier + (1.0 - limits.outlier_share) * work[LIKELIHOOD, h]
         share = outlier / evidence
-        family, kept = int(tile[IS_UNIFORM, h]), 0.0
-        for m in range(NOISES):
-            likely = work[SHARE + m, h] / evidence + share * tile[NOISE + m, h]
-            # A surprise opens the question of the noise again.
-            likely += _REOPENED * share * (noises[family, 1, m] - likely)
-            likely = likely if likely > _GIVEN_UP else 0.0
-            work[SHARE + m, h] = likely
-            kept += likely
+        shape = int(tile[SHAPE, h])
         is_found = reading[FOUND, h] > 0.0
-        for m in range(NOISES):
-            likely = work[SHARE + m, h] / kept
-            tile[NOISE + m, h] = likely if is_found else tile[NOISE + m, h]
+        for first in range(0, 3 * NOISES if shape == LASTING else NOISES, NOISES):
+            shown = first if shape == LASTING else 2 * NOISES
+            kept = 0.0
+            for m in range(NOISES):
+                likely = (1.0 - share) * work[SHARE + shown + m, h]
+                likely += share * tile[NOISE + first + m, h]
+                # A surprise opens the question of the noise again.
+                likely += _REOPENED * share * (noises[shape, 1, m] - likely)
+                work[SHOWN + m, h] = likely if likely > _GIVEN_UP else 0.0
+                kept += work[SHOWN + m, h]
+            for m in range(NOISES):
+                likely = work[SHOWN + m, h] / kept
+                row = NOISE + first + m
+                tile[row, h] = likely if is_found else tile[row, h]
         tile[EVIDENCE, h] = evidence
         tile[OUTLIER, h] = share if is_found else 1.0
 
@@ -249,11 +320,19 @@ def _narrow(tile: Array, work: Array) -> None:
 
 
 @inlined
-def _apply(tile: Array, limits: Limits, work: Array) -> None:
+def _apply(tile: Array, reading: Array, limits: Limits, work: Array) -> None:
     """Change the estimates; a torsion's size has turned the tip all along."""
     for h in range(tile.shape[1]):
         for k in range(3):
             tile[X + k, h] += work[CHANGE + k, h]
+        # What was measured: the directions of the readings are a lower triangle with ones.
+        x = reading[READ, h]
+        y = reading[READ + 1, h] - reading[ALONG + 3, h] * x
+        z = reading[READ + 2, h] - reading[ALONG + 6, h] * x - reading[ALONG + 7, h] * y
+        inside = 1.0 - tile[OUTLIER, h]
+        tile[REMAINDER, h] += inside * (x - tile[X, h] - tile[REMAINDER, h])
+        tile[REMAINDER + 1, h] += inside * (y - tile[X + 1, h] - tile[REMAINDER + 1, h])
+        tile[REMAINDER + 2, h] += inside * (z - tile[X + 2, h] - tile[REMAINDER + 2, h])
         kappa = tile[KAPPA, h] + work[CHANGE + E_KAPPA, h]
         tile[KAPPA, h] = min(max(kappa, limits.smallest_curvature), limits.largest_curvature)
         tile[SCALE, h] += work[CHANGE + E_SCALE, h]

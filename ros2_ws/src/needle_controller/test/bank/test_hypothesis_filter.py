@@ -14,6 +14,8 @@ from needle_common.errors import OutOfBoundsError, UserError
 from needle_controller.bank.estimate_tiles import PLACE, SCALE, WEIGHT, rows
 from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.bank.hypotheses import (
+    LASTING,
+    NORMAL,
     NoiseHypothesis,
     RollHypothesis,
     TorsionHypothesis,
@@ -332,7 +334,14 @@ def test_many_needles_are_each_one_alone(with_covariance: bool) -> None:
         assert rates[index] == law(alone).rotation_rate
 
 
-def test_another_plane_is_another_description_of_the_same_needle() -> None:
+@pytest.mark.parametrize(
+    "noise",
+    [
+        NoiseHypothesis(NORMAL, (1.0,), (1.0,), 1.0),
+        NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.5,)),
+    ],
+)
+def test_another_plane_is_another_description_of_the_same_needle(noise: NoiseHypothesis) -> None:
     turn = rotation_from_angles([0.2, -0.1, 0.4])
     transform = np.eye(4)
     transform[:3, :3], transform[:3, 3] = turn, [0.002, 0.001, -0.003]
@@ -340,16 +349,21 @@ def test_another_plane_is_another_description_of_the_same_needle() -> None:
     tips = noisy(path(turns))
     # One normal noise: a box, or a mixture, would turn its sides with the plane.
     settings = FilterSettings(
-        noise_hypotheses=(NoiseHypothesis(False, (1.0,), (1.0,), 1.0),),
+        noise_hypotheses=(noise,),
         outlier_share=1e-6,
         mistrust=0.0,
         softness=0.0,
     )
     old, new = HypothesisFilter(settings), HypothesisFilter(settings, turn)
-    spread = np.diag([2e-7, 3e-7, 4e-7])
-    drive(old, turns, tips, spread)
+    # Noise that lasts has a size of its own along each axis.
+    spread = np.diag([2e-7, 3e-7, 4e-7]) if noise.shape == NORMAL else np.eye(3) * 1e-6
+    drive(old, turns[:20], tips[:21], spread)
     old.change_frame(transform)
-    moved = drive(new, turns, tips @ turn.T + transform[:3, 3], turn @ spread @ turn.T)
+    seen, turned = tips @ turn.T + transform[:3, 3], turn @ spread @ turn.T
+    for d_rotation, tip in zip(turns[20:], seen[21:], strict=True):
+        old.advance(STEP, d_rotation)
+        old.correct(tip, turned)
+    moved = drive(new, turns, seen, turned)
     np.testing.assert_allclose(old.estimate().coordinates, moved.coordinates, atol=1e-7)
     scale = np.sqrt(np.diag(moved.covariance))
     np.testing.assert_allclose(
@@ -358,6 +372,38 @@ def test_another_plane_is_another_description_of_the_same_needle() -> None:
         atol=1e-4,
     )
     np.testing.assert_allclose(old.initial_rotation, new.initial_rotation)
+
+
+@pytest.mark.parametrize(
+    ("lasting", "each"),
+    [
+        (0.0, (1.0, 1.0, 1.0)),
+        (0.5, (1.0, 1.0, 1.0)),
+        (0.8, (1.0, 1.0, 1.0)),
+        (0.0, (2.0, 0.3, 0.3)),
+    ],
+)
+def test_says_how_sure_it_is_whatever_the_noise_is(
+    lasting: float, each: tuple[float, float, float]
+) -> None:
+    rng = np.random.default_rng(8)
+    needles, steps = 24, 60
+    turns = turns_for(steps)
+    poses = path(turns, np.deg2rad(5.0), np.deg2rad(10.0))
+    errors = rng.normal(size=(steps + 1, needles, 3))
+    for k in range(1, steps + 1):
+        errors[k] = lasting * errors[k - 1] + np.sqrt(1.0 - lasting**2) * errors[k]
+    tips = poses[:, None, :3, 3] + errors * each * 0.001 / np.sqrt(3.0)
+    estimator = HypothesisFilter(FilterSettings())
+    estimator.reset(tips[0], np.zeros((needles, 2)))
+    inside = []
+    for turn, tip, pose in zip(turns, tips[1:], poses[1:], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip)
+        estimate = estimator.estimate()
+        spread = np.sqrt(np.diagonal(estimate.covariance, axis1=-2, axis2=-1)[:, 0])
+        inside.append(np.abs(estimate.position[:, 0] - pose[0, 3]) < 2.0 * spread)
+    assert np.mean(inside[20:]) > 0.93
 
 
 def test_starts_as_the_base_is_turned() -> None:

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from needle_controller.bank.estimate_tiles import (
     ERROR,
-    IS_UNIFORM,
     KAPPA,
     KIND,
     NOISE,
@@ -16,6 +15,7 @@ from needle_controller.bank.estimate_tiles import (
     PLAY,
     ROWS,
     SCALE,
+    SHAPE,
     TIP_ANGLE,
     WEIGHT,
     P,
@@ -57,7 +57,7 @@ def test_only_what_is_the_same_is_joined() -> None:
     np.testing.assert_array_equal(weights, [2.0, 0.0, 1.0, 1.0, 2.0, 0.0])
 
 
-@pytest.mark.parametrize(("row", "other"), [(PLAY, ANGLE), (IS_UNIFORM, 1.0), (X, 0.02)])
+@pytest.mark.parametrize(("row", "other"), [(PLAY, ANGLE), (SHAPE, 1.0), (X, 0.02)])
 def test_what_differs_stays_apart(row: int, other: float) -> None:
     written = numbers(np.array([0.0, 0.1]))
     written[1, row] = other

@@ -2,25 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import multivariate_normal
+from scipy.stats import multivariate_normal, norm
 
 from needle_controller.bank.estimate_tiles import (
     E_KAPPA,
     E_SCALE,
     ERROR,
     EVIDENCE,
-    IS_UNIFORM,
     KAPPA,
     NOISE,
     NOISES,
     OUTLIER,
     PAIRS,
     PLAY,
+    REMAINDER,
     ROWS,
     SCALE,
+    SHAPE,
     WEIGHT,
     P,
     R,
@@ -33,6 +36,7 @@ from needle_controller.bank.estimate_tiles import (
     tiles_of,
 )
 from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypotheses import LASTING, NoiseHypothesis
 from needle_controller.bank.hypothesis_filter import readings
 from needle_controller.bank.tip_update import UPDATE_ROWS, rotate, take_tip
 from needle_controller.model.arrays import Array
@@ -43,6 +47,11 @@ BOUND = 0.001
 MIDDLE = np.array([0.01, 0.02, 0.03])
 PLAIN = FilterSettings(
     softness=0.0, mistrust=0.0, outlier_share=1e-6, curvature_range=(0.01, 100.0)
+)
+LASTS = dataclasses.replace(
+    PLAIN,
+    model_error=0.0,
+    noise_hypotheses=(NoiseHypothesis(LASTING, (1.0,), (1.0,), 1.0, (0.6,)),),
 )
 WITH_OUTLIERS = FilterSettings(softness=0.0, mistrust=0.0)
 
@@ -60,7 +69,7 @@ def estimates(covariance: Array | None = None, *, is_uniform: bool = False, seed
     numbers[:, P : P + PAIRS] = lower_half(np.broadcast_to(covariance, (COUNT, ERROR, ERROR)))
     numbers[:, KAPPA], numbers[:, SCALE], numbers[:, PLAY] = 8.0, 1.0, 0.5
     numbers[:, WEIGHT] = numbers[:, NOISE] = 1.0
-    numbers[:, IS_UNIFORM] = is_uniform
+    numbers[:, SHAPE] = is_uniform
     return tiles_of(numbers, np.array([COUNT]))
 
 
@@ -145,6 +154,70 @@ def test_normal_noise_gives_kalmans_update() -> None:
         density = multivariate_normal(expected, spread).pdf(tip)
         in_box = 1.0 / np.sqrt(12.0**3 * np.linalg.det(CORRELATED))
         assert rows(after, EVIDENCE, 1)[h, 0] == pytest.approx(density / in_box, rel=1e-4)
+
+
+def with_lasting_noise(tiles: Tiles, shares: tuple[float, ...]) -> Tiles:
+    set_rows(tiles, SHAPE, np.full((COUNT, 1), float(LASTING)))
+    each = np.zeros(NOISES)
+    each[: len(shares)] = shares
+    set_rows(tiles, NOISE, np.tile(each, (COUNT, 3)))
+    return tiles
+
+
+def test_errors_that_last_are_told_from_the_estimates_own() -> None:
+    """Against a Kalman filter whose state has the tip's error, too."""
+    known = np.array([2e-4, 4e-4, 5e-4]) ** 2
+    before = with_lasting_noise(estimates(np.diag([*known, *SCALES[3:] ** 2])), (1.0,))
+    rest = np.array([7e-4, -2e-4, 1e-4])
+    set_rows(before, REMAINDER, np.tile(rest, (COUNT, 1)))
+    off = np.array([1e-3, 3e-4, -8e-4])
+    after = taken(before, MIDDLE + off, settings=LASTS)
+    likelihood = 1.0
+    for axis in range(3):
+        # What the estimate is off, and the tip's error; at the tip before their sum was seen.
+        mean = np.array([0.0, 0.6 * rest[axis]])
+        covariance = known[axis] * np.array([[1.0, -0.6], [-0.6, 0.36]])
+        covariance[1, 1] += (1.0 - 0.6**2) * BOUND**2 / 3.0
+        variance = covariance.sum()
+        gain = covariance.sum(axis=1) / variance
+        innovation = off[axis] - mean.sum()
+        wanted = mean + gain * innovation
+        np.testing.assert_allclose(changes(before, after)[:, axis], wanted[0], rtol=1e-4)
+        np.testing.assert_allclose(rows(after, REMAINDER + axis, 1), wanted[1], rtol=1e-4)
+        np.testing.assert_allclose(
+            covariances(after)[:, axis, axis],
+            covariance[0, 0] - gain[0] ** 2 * variance,
+            rtol=1e-4,
+        )
+        likelihood *= 2.0 * BOUND * norm.pdf(innovation, scale=np.sqrt(variance))
+    np.testing.assert_allclose(rows(after, EVIDENCE, 1), likelihood, rtol=1e-4)
+
+
+def test_where_nothing_was_known_before_no_error_is_taken_off() -> None:
+    before = with_lasting_noise(estimates(np.eye(ERROR) * 0.02**2), (1.0,))
+    after = taken(before, MIDDLE + 0.01, settings=LASTS)
+    np.testing.assert_allclose(changes(before, after)[:, :3], 0.01, rtol=0.005)
+
+
+def test_tips_show_which_coordinate_is_noisier() -> None:
+    noise = NoiseHypothesis(LASTING, (1.0, 2.0), (0.5, 0.5), 1.0, (0.0, 0.0))
+    settings = dataclasses.replace(PLAIN, noise_hypotheses=(noise,))
+    tiles = with_lasting_noise(estimates(np.eye(ERROR) * 1e-10), (0.5, 0.5))
+    rng = np.random.default_rng(5)
+    for _ in range(60):
+        off = rng.normal(size=3) * [2.0, 1.0, 0.3] * BOUND / np.sqrt(3.0)
+        tiles = with_state_of(taken(tiles, MIDDLE + off, settings=settings), before=tiles)
+    likely = rows(tiles, NOISE, 3 * NOISES).reshape(COUNT, 3, NOISES)
+    assert np.all(likely[:, 0, 1] > 0.9)
+    assert np.all(likely[:, 1:, 0] > 0.9)
+
+
+def with_state_of(after: Tiles, before: Tiles) -> Tiles:
+    """What was learned of the noise, with the estimates as they were."""
+    learned = rows(after, NOISE, 3 * NOISES)
+    tiles = before._replace(state=before.state.copy())
+    set_rows(tiles, NOISE, learned)
+    return tiles
 
 
 def test_an_exact_tip_is_taken() -> None:
