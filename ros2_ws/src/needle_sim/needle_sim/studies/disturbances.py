@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import math
 from typing import Any, TypeVar
 
 import numpy as np
@@ -22,6 +23,7 @@ Insertion = TypeVar("Insertion", float, FloatArray)
 NOISE_SHAPES = ("uniform", "normal")
 PATCH_LENGTH = 0.020
 """Insertion over which the curvature stays the same [m]."""
+_NOTHING_LEFT = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +37,8 @@ class Disturbances:
         where it is normal [m].
     noise_shape : str
         One of `NOISE_SHAPES`.
+    noise_lasting : float
+        Of normal noise, the correlation of an error with that of the exposure before, in [0, 1).
     outliers : float
         Share of measurements that are off in a random direction instead.
     outlier_size : tuple of float
@@ -62,6 +66,7 @@ class Disturbances:
 
     noise: float = 0.0
     noise_shape: str = "uniform"
+    noise_lasting: float = 0.0
     outliers: float = 0.0
     outlier_size: tuple[float, float] = (0.005, 0.010)
     dropped: float = 0.0
@@ -98,13 +103,12 @@ def measured(
         The measured tips [m]; NaN where missing.
     """
     count = len(tips)
-    share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
     seen = np.empty((count, 3))
     if disturbances.noise_shape == "normal":
-        # The middle of each of the 2^24 steps that a share has: 0 would be infinitely far off.
-        off = scipy.special.ndtri(share[:, :3].astype(np.float64) + 0.5**25)
-        seen[:] = tips + disturbances.noise * off
+        lasting = disturbances.noise_lasting
+        seen[:] = tips + disturbances.noise * _normal_errors(lasting, seed, exposure, first, count)
     else:
+        share = study_noise.uniform(seed, study_noise.NOISE, exposure, first, count)
         _add_noise(tips, share, disturbances.noise, seen)
     if exposure == 0:
         return seen
@@ -179,6 +183,21 @@ def _add_noise(
     for i in range(tips.shape[0]):
         for j in range(3):
             seen[i, j] = tips[i, j] + amplitude * (2.0 * share[i, j] - 1.0)
+
+
+def _normal_errors(lasting: float, seed: int, exposure: int, first: int, count: int) -> FloatArray:
+    """Return errors of variance 1, each with what is left of all those before."""
+    errors = np.zeros((count, 3))
+    for back in range(exposure + 1):
+        left = lasting**back
+        if left < _NOTHING_LEFT:
+            break
+        # The first is as large as all others together.
+        left *= 1.0 if back == exposure else math.sqrt(1.0 - lasting * lasting)
+        share = study_noise.uniform(seed, study_noise.NOISE, exposure - back, first, count)
+        # The middle of each of the 2^24 steps that a share has: 0 would be infinitely far off.
+        errors += left * scipy.special.ndtri(share[:, :3].astype(np.float64) + 0.5**25)
+    return errors
 
 
 def _outliers(

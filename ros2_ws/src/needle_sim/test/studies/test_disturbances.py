@@ -41,6 +41,18 @@ def test_normal_noise_is_normal_with_its_amplitude_as_standard_deviation() -> No
     assert np.all(np.abs(np.corrcoef(off.T) - np.eye(3)) < 0.03)
 
 
+@pytest.mark.parametrize("exposure", [1, 2, 40])
+def test_noise_that_lasts_has_its_amplitude_and_correlation_at_every_exposure(
+    exposure: int,
+) -> None:
+    noise = Disturbances(noise=0.001, noise_shape="normal", noise_lasting=0.8)
+    before, now, later = (error(noise, exposure=exposure + k) for k in (-1, 0, 2))
+    np.testing.assert_allclose(np.std(now, axis=0), 0.001, rtol=0.03)
+    for other, wanted in ((before, 0.8), (later, 0.8**2)):
+        found = [np.corrcoef(other[:, k], now[:, k])[0, 1] for k in range(3)]
+        np.testing.assert_allclose(found, wanted, atol=0.03)
+
+
 def test_noise_differs_between_exposures_and_seeds_and_is_none_at_0() -> None:
     noise = Disturbances(noise=0.001)
     base = error(noise)

@@ -112,6 +112,8 @@ TOLD_WRONG = tuple(
     )
     for key, options, least in (
         ("normal_noise", NORMAL, 0.999),
+        ("lasting_5", (*NORMAL, "--noise-lasting", "0.5"), 0.97),
+        ("lasting_8", (*NORMAL, "--noise-lasting", "0.8"), 0.9),
         ("noise_13", ("--noise-mm", "1.3"), 0.995),
         ("noise_20", ("--noise-mm", "2"), 0.97),
         *(

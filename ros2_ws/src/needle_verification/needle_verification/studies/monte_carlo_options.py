@@ -123,6 +123,8 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         raise UserError(f"--grid {given.grid!r} is not one of {', '.join(GRIDS)}")
     if given.noise_shape not in NOISE_SHAPES:
         raise UserError(f"--noise-shape {given.noise_shape!r} is not {' or '.join(NOISE_SHAPES)}")
+    if given.noise_lasting != "0" and given.noise_shape != "normal":
+        raise UserError("--noise-lasting is of normal noise: --noise-shape normal")
     if given.targets != "0" and given.turn_delay_mm != "0":
         raise UserError("--turn-delay-mm is of needles that are steered to the plane")
     if given.planner and given.targets == "0":
@@ -147,6 +149,7 @@ def parse(arguments: Sequence[str]) -> MonteCarloOptions:
         disturbances=Disturbances(
             noise=number("--noise-mm", given.noise_mm, 0.0, 20.0, "mm") * 1e-3,
             noise_shape=given.noise_shape,
+            noise_lasting=number("--noise-lasting", given.noise_lasting, 0.0, 0.999, "-"),
             outliers=number("--outliers", given.outliers, 0.0, 1.0, "-"),
             outlier_size=_outlier_size(given.outlier_mm),
             dropped=number("--dropped", given.dropped, 0.0, 1.0, "-"),
@@ -210,6 +213,7 @@ def _parser() -> CommandParser:
             "noise the standard deviation",
         ),
         ("--noise-shape", "uniform", "|".join(NOISE_SHAPES), "how that noise is distributed"),
+        ("--noise-lasting", "0", "R", "correlation of a normal error with that of the tip before"),
         ("--claimed-mm", "1", "C", "largest error that the controller is told, whatever it is"),
         (
             "--sigma-scale",

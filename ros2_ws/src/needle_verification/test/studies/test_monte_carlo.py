@@ -108,6 +108,7 @@ def test_targets_have_figures_of_points_and_none_of_the_plane(tmp_path: Path) ->
         (["--outlier-mm", "5"], "--outlier-mm '5'"),
         (["--outlier-mm", "5,2"], "--outlier-mm HI = 2"),
         (["--noise-shape", "round"], "--noise-shape 'round'"),
+        (["--noise-lasting", "0.5"], "--noise-shape normal"),
         (["--claimed-mm", "0"], "--claimed-mm = 0"),
         (["--sigma-scale", "0"], "--sigma-scale = 0"),
         (["--slip", "-1"], "--slip = -1"),
@@ -143,11 +144,12 @@ def test_help_names_every_option(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_troubles_come_in_si_and_the_claim_is_no_matter_of_the_noise() -> None:
-    words = "--noise-mm 0.58 --noise-shape normal --outlier-mm 2,3.5 --slip -0.05 --bump-mm 2"
-    options = parse([*words.split(), "--untold-delay", "3", "--sigma-scale", "2"])
+    noise = "--noise-mm 0.58 --noise-shape normal --noise-lasting 0.8 --outlier-mm 2,3.5"
+    others = "--slip -0.05 --bump-mm 2 --untold-delay 3 --sigma-scale 2"
+    options = parse([*noise.split(), *others.split()])
     found = options.disturbances
     assert found.noise == pytest.approx(0.00058)
-    assert found.noise_shape == "normal"
+    assert (found.noise_shape, found.noise_lasting) == ("normal", 0.8)
     assert found.outlier_size == pytest.approx((0.002, 0.0035))
     assert (found.slip, found.bump, found.untold_delay) == (-0.05, 0.002, 3)
     assert options.claimed_bound == 0.001
