@@ -25,8 +25,12 @@ from packaging.markers import Marker
 ROOT = Path(__file__).resolve().parents[2]
 APT_NUMPY = "numpy==1.26.4"
 PYTHONS = ("310", "311", "312", "313")
-# What aquacal asks for beside the geometry that the tests use; its OpenCV would overwrite ours.
-LEFT_OUT = ("opencv-python", "pandas", "requests", "natsort")
+LEFT_OUT = (
+    # What aquacal asks for beside the geometry that the tests use; its OpenCV would overwrite ours.
+    "opencv-python", "pandas", "requests", "natsort",
+    # Only `colcon test` uses them, and where `coverage` is, numba loads it into every node.
+    "coverage", "pytest-cov", "pytest-repeat", "pytest-rerunfailures",
+)  # fmt: skip
 
 
 def resolve(
