@@ -468,26 +468,35 @@ def is_running(process: int) -> bool:
         return False
 
 
-def entry_point(name: str, interpreter: str) -> str:
-    return f"#!{interpreter}\nprint('{name}')\n"
-
-
 def test_executables_run_from_a_path_with_a_space_and_old_ones_go(workspace: Workspace) -> None:
     python = workspace.VENV_PYTHON
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
     folder = workspace.WORKSPACE / "install" / "needle_one" / "lib" / "needle_one"
-    egg = workspace.WORKSPACE / "build" / "needle_one" / "needle_one.egg-info"
+    build = workspace.WORKSPACE / "build" / "needle_one"
+    egg = build / "needle_one.egg-info"
     folder.mkdir(parents=True)
     egg.mkdir(parents=True)
-    (egg / "entry_points.txt").write_text("[console_scripts]\nkept = needle_one.kept:main\n")
+    (egg / "entry_points.txt").write_text("[console_scripts]\nkept = kept_one:main\n")
+    (build / "kept_one.py").write_text(
+        "import sys\n"
+        "def main(): print('importlib.metadata' in sys.modules, *sys.argv[1:]); return 3\n"
+    )
     for name in ("kept", "gone"):
-        (folder / name).write_text(entry_point(name, f'"{python}"'))
+        (folder / name).write_text("#!/nowhere\n")
         (folder / name).chmod(0o755)
     workspace.tidy_executables("needle_one")
     workspace.tidy_executables("needle_one")
     assert [path.name for path in folder.iterdir()] == ["kept"]
-    assert subprocess.check_output([folder / "kept"], text=True) == "kept\n"
+    done = subprocess.run(
+        [folder / "kept", "a b"],
+        env={**os.environ, "PYTHONPATH": str(build)},
+        capture_output=True,
+        check=False,
+        text=True,
+    )
+    # Nobody waits for a look into the package's metadata.
+    assert (done.stdout, done.returncode) == ("False a b\n", 3), done.stderr
 
 
 def test_a_phase_shows_that_it_goes_on(

@@ -45,10 +45,22 @@ def requirement(text: str, name: str) -> str:
     return found.group() + "\n"
 
 
-def runnable(script: str, python: Path) -> str:
-    """Return a script whose first line can be run, whatever the path to its Python."""
-    first, _, rest = script.partition("\n")
-    if "python" not in first or (" " not in first and len(first) <= LONGEST_SHEBANG):
-        return script
-    # sh runs the second line; to Python it is a string.
-    return f"#!/bin/sh\n'''exec' {shlex.quote(str(python))} \"$0\" \"$@\"\n'''\n{rest}"
+def executable(target: str, python: Path) -> str:
+    """Return the script of an entry point, `module:function`, whatever the path to its Python.
+
+    colcon's own looks for the package's metadata first: up to a tenth of a node's start.
+    """
+    module, _, function = target.partition(":")
+    first = f"#!{python}"
+    if " " in first or len(first) > LONGEST_SHEBANG:
+        # sh runs the second line; to Python it is a string.
+        first = f"#!/bin/sh\n'''exec' {shlex.quote(str(python))} \"$0\" \"$@\"\n'''"
+    return f"""\
+{first}
+import sys
+
+from {module} import {function}
+
+if __name__ == "__main__":
+    sys.exit({function}())
+"""

@@ -22,7 +22,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 
 from setup_errors import SetupError, check_machine, check_space, describe, explain
-from setup_files import digest, read, requirement, runnable, write
+from setup_files import digest, executable, read, requirement, write
 from setup_progress import Phase, say
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -321,18 +321,16 @@ def compile_ahead(mode: str, lock: int) -> None:
 
 
 def tidy_executables(name: str) -> None:
-    """Remove executables that are no longer declared; mend first lines that cannot be run."""
+    """Remove executables that are no longer declared; write those that are."""
     points = configparser.ConfigParser(delimiters=["="])
     points.optionxform = str  # type: ignore[assignment]
     points.read(WORKSPACE / "build" / name / f"{name}.egg-info" / "entry_points.txt")
-    declared = set(points["console_scripts"]) if points.has_section("console_scripts") else set()
+    declared = points["console_scripts"] if points.has_section("console_scripts") else {}
     for path in (WORKSPACE / "install" / name / "lib" / name).glob("*"):
-        if path.name not in declared:
+        if path.name in declared:
+            path.write_text(executable(declared[path.name], VENV_PYTHON), encoding="utf-8")
+        else:
             path.unlink()
-            continue
-        script = path.read_text("utf-8")
-        if (mended := runnable(script, VENV_PYTHON)) != script:
-            path.write_text(mended, encoding="utf-8")
 
 
 def place_stand_in(mode: str) -> None:
