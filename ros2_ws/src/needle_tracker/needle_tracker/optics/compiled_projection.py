@@ -1,7 +1,6 @@
-"""One point through the refracting window into one camera, and back: for the tracker's loops.
+"""Points through the refracting window into one camera, and back: for loops.
 
-The same model as `refraction`, which serves arrays and documents it; the tests hold the two
-together.
+The same model as `refraction`, which serves arrays of any shape; the tests hold the two together.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -66,8 +65,19 @@ def pack_camera(camera: Camera) -> Array:
 def _crossing(camera: Array, distance: float, depth: float) -> float:
     """Return how far from the camera's foot, along the window, light crosses the outer face [m].
 
-    The equation is that of `RefractedCamera`. `distance` is the point's from the foot, `depth` how
-    far it is behind the outer face [m].
+    Snell's law in the plane of incidence, rho the wanted distance, s = rho / sqrt(rho^2 + h^2)
+    the sine in air: a layer takes the light t s / sqrt(n_i^2 - s^2) farther, and in the last
+    medium, of index n, the rest r = D - rho - ... over the depth d wants s = n r / sqrt(r^2 +
+    d^2). The difference of the sides increases with rho and has one root in [0, D].
+
+    Parameters
+    ----------
+    camera : ndarray
+        From `pack_camera`.
+    distance : float
+        D: of the point from the camera's foot, along the window [m].
+    depth : float
+        Of the point behind the outer face [m].
     """
     # The last medium is the one that the point is in.
     index, end = camera[25], len(camera)
@@ -111,6 +121,46 @@ def _crossing(camera: Array, distance: float, depth: float) -> float:
     return rho
 
 
+@inlined
+def _seen(
+    camera: Array, point_x: float, point_y: float, point_z: float
+) -> tuple[float, float, float]:
+    """Return where a point is seen on the outer face, in the optical frame [m]."""
+    offset_x, offset_y, offset_z = point_x - camera[12], point_y - camera[13], point_z - camera[14]
+    depth = -(camera[26] * offset_x + camera[27] * offset_y + camera[28] * offset_z)
+    if depth > 0.0:
+        along_x = offset_x + depth * camera[26]
+        along_y = offset_y + depth * camera[27]
+        along_z = offset_z + depth * camera[28]
+        distance = math.sqrt(along_y * along_y + along_z * along_z + along_x * along_x)
+        ratio = _crossing(camera, distance, depth) / distance if distance > 0.0 else 1.0
+        point_x = camera[12] + along_x * ratio
+        point_y = camera[13] + along_y * ratio
+        point_z = camera[14] + along_z * ratio
+    return (
+        camera[0] * point_x + camera[1] * point_y + camera[2] * point_z + camera[9],
+        camera[3] * point_x + camera[4] * point_y + camera[5] * point_z + camera[10],
+        camera[6] * point_x + camera[7] * point_y + camera[8] * point_z + camera[11],
+    )
+
+
+@compiled
+def see_through(camera: Array, points: Array, seen: Array) -> None:
+    """Write where points are seen on the outer face, whatever the lens.
+
+    Parameters
+    ----------
+    camera : ndarray
+        From `pack_camera`.
+    points : ndarray, shape (n, 3)
+        In `rig` [m]; those before the window are seen straight.
+    seen : ndarray, shape (n, 3)
+        Takes the result, in the optical frame [m].
+    """
+    for i in range(len(points)):
+        seen[i, 0], seen[i, 1], seen[i, 2] = _seen(camera, points[i, 0], points[i, 1], points[i, 2])
+
+
 @compiled
 def project_point(camera: Array, point: Array, pixel: Array) -> None:
     """Write the pixel at which a camera sees a point.
@@ -124,22 +174,7 @@ def project_point(camera: Array, point: Array, pixel: Array) -> None:
     pixel : ndarray, shape (2,)
         Takes the result; NaN behind the camera.
     """
-    offset_x, offset_y = point[0] - camera[12], point[1] - camera[13]
-    offset_z = point[2] - camera[14]
-    depth = -(camera[26] * offset_x + camera[27] * offset_y + camera[28] * offset_z)
-    target_x, target_y, target_z = point[0], point[1], point[2]
-    if depth > 0.0:
-        along_x = offset_x + depth * camera[26]
-        along_y = offset_y + depth * camera[27]
-        along_z = offset_z + depth * camera[28]
-        distance = math.sqrt(along_y * along_y + along_z * along_z + along_x * along_x)
-        ratio = _crossing(camera, distance, depth) / distance if distance > 0.0 else 1.0
-        target_x = camera[12] + along_x * ratio
-        target_y = camera[13] + along_y * ratio
-        target_z = camera[14] + along_z * ratio
-    x = camera[0] * target_x + camera[1] * target_y + camera[2] * target_z + camera[9]
-    y = camera[3] * target_x + camera[4] * target_y + camera[5] * target_z + camera[10]
-    z = camera[6] * target_x + camera[7] * target_y + camera[8] * target_z + camera[11]
+    x, y, z = _seen(camera, point[0], point[1], point[2])
     if z <= 0.0:
         pixel[0] = pixel[1] = np.nan
         return

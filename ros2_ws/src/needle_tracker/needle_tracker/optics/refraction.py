@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 
 from needle_tracker.optics.calibration import Camera, StereoCalibration
 from needle_tracker.optics.camera_model import optical_rays, project_optical
-from needle_tracker.optics.compiled_projection import foot_and_height, pack_camera
+from needle_tracker.optics.compiled_projection import foot_and_height, pack_camera, see_through
 
 Array = NDArray[np.float64]
 
-_ROOT_ITERATIONS = 60
-_LEAST_DEPTH = 1e-12  # [m]: keeps Snell's law regular for points that are not behind the window
 _JACOBIAN_STEP = 1e-5  # [m]: central differences are then good to about 1e-8 relative
 
 
@@ -106,99 +104,23 @@ class RefractedCamera:
         Parameters
         ----------
         points : ndarray, shape (..., 3)
-            Points in `rig` [m]; those before the window are returned themselves.
+            Points in `rig` [m]; those before the window are seen straight.
 
         Returns
         -------
         ndarray, shape (..., 3)
             Points of the optical frame [m].
         """
-        points = np.asarray(points, dtype=np.float64)
-        normal = self.camera.window.normal
-        offset = points - self._foot
-        depth = -(offset @ normal)
-        along = offset + depth[..., None] * normal
-        distance = np.hypot(np.hypot(along[..., 0], along[..., 1]), along[..., 2])
-        crossing = self._crossing(distance, depth)
-        ratio = np.divide(crossing, distance, out=np.ones_like(distance), where=distance > 0.0)
-        # The point of the outer face through which the camera sees the point.
-        target = self._foot + along * ratio[..., None]
-        target = np.where((depth > 0.0)[..., None], target, points)
-        return np.asarray(target @ self._rotation.T + self._translation)
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        seen = np.empty(points.shape)
+        see_through(self.packed, points.reshape(-1, 3), seen.reshape(-1, 3))
+        return seen
 
     def jacobian(self, point: Array) -> Array:
         """Return d(pixel)/d(point) [px/m], shape (2, 3), at one point in `rig` [m]."""
         steps = _JACOBIAN_STEP * np.concatenate([np.eye(3), -np.eye(3)])
         pixels = self.project(point + steps)
         return np.asarray((pixels[:3] - pixels[3:]).T / (2.0 * _JACOBIAN_STEP))
-
-    def _crossing(self, distance: Array, depth: Array) -> Array:
-        """Return how far from the camera's foot, along the window, light crosses the outer face.
-
-        Snell's law in the plane of incidence, rho the wanted distance, s = rho / sqrt(rho^2 + h^2)
-        the sine in air: a layer takes the light t s / sqrt(n_i^2 - s^2) farther, and in the last
-        medium, of index n, the rest r = D - rho - ... over the depth d wants s = n r / sqrt(r^2 +
-        d^2). The difference of the sides increases with rho and has one root in [0, D].
-
-        Parameters
-        ----------
-        distance : ndarray, shape (...)
-            D: of the point from the camera's foot, along the window [m].
-        depth : ndarray, shape (...)
-            Of the point behind the outer face [m].
-        """
-        passed, index, depth = self._media(depth)
-        height = self._camera_height
-        low, high = np.zeros_like(distance), np.array(distance)
-        apparent = depth + index * sum(t / n for t, n in passed)
-        rho = distance * index * height / (index * height + apparent)
-        for _ in range(_ROOT_ITERATIONS):
-            air = np.hypot(rho, height)
-            sine = rho / air
-            farther, growth = np.zeros_like(rho), np.zeros_like(rho)
-            for thickness, layer_index in passed:
-                square = layer_index**2 - sine**2
-                farther += thickness * sine / np.sqrt(square)
-                growth += thickness * layer_index**2 / (square * np.sqrt(square))
-            rest = distance - rho - farther
-            body = np.hypot(rest, depth)
-            value = sine - index * rest / body
-            bend = height**2 / air**3
-            slope = bend + index * depth**2 / body**3 * (1.0 + growth * bend)
-            low = np.where(value < 0.0, rho, low)
-            high = np.where(value > 0.0, rho, high)
-            newton = rho - value / slope
-            inside = (newton >= low) & (newton <= high)
-            following = np.where(inside, newton, 0.5 * (low + high))
-            change = np.abs(following - rho)
-            rho = following
-            if not np.any(change > 1e-15 * distance):
-                break
-        return rho
-
-    def _media(self, depth: Array) -> tuple[list[tuple[Array, float]], Array, Array]:
-        """Return what light passes on its way to points so deep behind the outer face [m].
-
-        Returns
-        -------
-        passed : list of (ndarray, float)
-            Of each layer, how much of it is passed [m]: all or nothing; and its index.
-        index : ndarray, shape (...)
-            Of the medium that the point is in.
-        depth : ndarray, shape (...)
-            How deep the point is in that medium [m].
-        """
-        window = self.camera.window
-        index = np.full_like(depth, window.inside)
-        passed = []
-        arrives = np.ones(depth.shape, dtype=bool)
-        for layer in window.layers:
-            passes = arrives & (depth > layer.thickness)
-            index = np.where(arrives & ~passes, layer.refractive_index, index)
-            passed.append((np.where(passes, layer.thickness, 0.0), layer.refractive_index))
-            depth = np.where(passes, depth - layer.thickness, depth)
-            arrives = passes
-        return passed, index, np.maximum(depth, _LEAST_DEPTH)
 
 
 def stereo_views(calibration: StereoCalibration) -> tuple[RefractedCamera, RefractedCamera]:
