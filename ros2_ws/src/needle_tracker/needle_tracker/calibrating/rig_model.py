@@ -20,9 +20,9 @@ import dataclasses
 import functools
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
@@ -43,6 +43,7 @@ _CAMERA = len(LENS) + len(POSE)
 CAMERA_PARAMETERS = 2 * _CAMERA
 # Central differences; the model is smooth, so that these are good to 1e-6 relative.
 _STEPS = {"f": 0.1, "c": 0.1, "k": 1e-4, "p": 1e-4, "r": 1e-5, "t": 1e-5, "s": 1e-5, "w": 1e-5}
+_CORNER_STEP = 1e-5  # [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,8 +140,7 @@ class RigModel:
         if self._surface is not None:
             height = self._surface.point[0]
             self.start[CAMERA_PARAMETERS : self.shared] = self._surface.inside, height
-        letters = [name.split(".")[-1][0] for name in self.names] + list("rrrttt") * len(views)
-        self._steps = np.array([_STEPS[letter] for letter in letters])
+        self._steps = np.array([_STEPS[name.split(".")[-1][0]] for name in self.names])
 
     def calibration(self, parameters: Array) -> StereoCalibration:
         """Return the calibration that a parameter vector stands for."""
@@ -151,7 +151,8 @@ class RigModel:
         """Return T_rig_board of each view, shape (views, 4, 4)."""
         steps = parameters[self.shared :].reshape(-1, 6)
         poses: Array = self._boards.copy()
-        poses[:, :3, :3] = Rotation.from_rotvec(steps[:, :3]).as_matrix() @ poses[:, :3, :3]
+        for pose, step in zip(poses, steps, strict=True):
+            pose[:3, :3] = _rotation(step[:3]) @ pose[:3, :3]
         poses[:, :3, 3] += steps[:, 3:]
         return poses
 
@@ -207,31 +208,48 @@ class RigModel:
             seen = self._seen(self._camera(parameters, side), side, corners)
             through_lens = functools.partial(self._through_lens, side=side, seen=seen)
             of_corners = functools.partial(self._of_corners, side=side, corners=corners)
-            of_boards = functools.partial(self.project, side=side)
             for column in [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, self.shared)]:
                 if free[column]:
                     pixels = through_lens if column - own.start in range(len(LENS)) else of_corners
-                    result[rows, column] = -self._slope(pixels, parameters, [column]).ravel()
-            # One board's pose moves that board's corners only: all boards at once.
-            boards = self.view_of[side]
-            for k in range(6):
-                columns = np.arange(self.shared + k, len(parameters), 6)
-                if not np.any(free[columns]):
-                    continue
-                slope = self._slope(of_boards, parameters, list(columns))
-                lines = first + 2 * np.arange(len(boards))
-                for axis in range(2):
-                    result[lines + axis, columns[boards]] = -slope[:, axis]
+                    result[rows, column] = -self._slope(pixels, parameters, column).ravel()
+            if not np.any(free[self.shared :]):
+                continue
+            # One board's pose moves that board's corners only, and each of them as it lies on it.
+            moved = self._corner_slopes(parameters, side, corners)
+            slopes = moved @ self._pose_slopes(parameters, side)
+            columns = self.shared + 6 * self.view_of[side][:, None] + np.arange(6)
+            lines = first + 2 * np.arange(len(columns))[:, None]
+            for axis in range(2):
+                result[lines + axis, columns] = -slopes[:, axis]
         return result[:, free]
 
-    def _slope(
-        self, pixels: Callable[[Array], Array], parameters: Array, columns: list[int]
-    ) -> Array:
+    def _slope(self, pixels: Callable[[Array], Array], parameters: Array, column: int) -> Array:
         step = np.zeros_like(parameters)
-        step[columns] = self._steps[columns]
-        width = 2.0 * self._steps[columns[0]]
+        step[column] = self._steps[column]
         above, below = (pixels(parameters + s * step) for s in (1.0, -1.0))
-        return np.asarray((above - below) / width)
+        return np.asarray((above - below) / (2.0 * self._steps[column]))
+
+    def _corner_slopes(self, parameters: Array, side: str, corners: Array) -> Array:
+        """Return d(pixel)/d(corner), shape (n, 2, 3) [px/m]."""
+        steps = _CORNER_STEP * np.eye(3)
+        above, below = (
+            [self._of_corners(parameters, side, corners + s * step) for step in steps]
+            for s in (1.0, -1.0)
+        )
+        slopes = (np.array(above) - np.array(below)) / (2.0 * _CORNER_STEP)
+        return np.moveaxis(slopes, 0, -1)
+
+    def _pose_slopes(self, parameters: Array, side: str) -> Array:
+        """Return d(corner)/d(rotation and translation of its board), shape (n, 3, 6)."""
+        of_view = self.view_of[side]
+        vectors = parameters[self.shared :].reshape(-1, 6)[:, :3]
+        # OpenCV has a row of the matrix's nine elements for each component of the vector.
+        turns = np.array([cv2.Rodrigues(vector)[1].reshape(3, 3, 3) for vector in vectors])
+        unturned = np.einsum("nij,nj->ni", self._boards[of_view, :3, :3], self._points[side])
+        slopes = np.zeros((len(of_view), 3, 6))
+        slopes[:, :, :3] = np.einsum("nkij,nj->nik", turns.reshape(-1, 3, 3, 3)[of_view], unturned)
+        slopes[:, :, 3:] = np.eye(3)
+        return slopes
 
     def _camera(self, parameters: Array, side: str) -> Camera:
         start, own = self._start[side], parameters[camera_slice(side)]
@@ -239,7 +257,7 @@ class RigModel:
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         # Turned about its own centre, then shifted.
         step = np.eye(4)
-        step[:3, :3] = Rotation.from_rotvec(own[len(LENS) : len(LENS) + 3]).as_matrix()
+        step[:3, :3] = _rotation(own[len(LENS) : len(LENS) + 3])
         step[:3, 3] = own[len(LENS) + 3 :]
         transform = step @ start.T_optical_rig
         window = self._window(parameters[CAMERA_PARAMETERS : self.shared], SIDES.index(side))
@@ -252,10 +270,15 @@ class RigModel:
         offset, *tilt = parameters.reshape(len(SIDES), -1)[number]
         # Any two axes across the normal.
         axes = np.linalg.svd(window.normal[None])[2][1:]
-        turned = Rotation.from_rotvec(np.array(tilt) @ axes).apply(window.normal)
+        turned = _rotation(np.array(tilt) @ axes) @ window.normal
         return dataclasses.replace(
             window, point=window.point + offset * window.normal, normal=turned
         )
+
+
+def _rotation(vector: Array) -> Array:
+    """Return the matrix of a rotation vector [rad]."""
+    return np.asarray(cv2.Rodrigues(vector)[0])
 
 
 def _join(arrays: list[Array], width: int) -> Array:

@@ -104,11 +104,14 @@ def test_the_jacobian_is_that_of_the_residuals(rig: TrueRig) -> None:
     start, boards = first_calibration(views, SIZES, given(0.0175, 1.3))
     model = RigModel(start, views, boards)
     everything = np.ones(len(model.start), dtype=bool)
-    jacobian = model.jacobian(model.start, everything)
-    for column in range(len(model.start)):
-        step = np.zeros_like(model.start)
+    # Boards turned and shifted from where they start.
+    at = model.start.copy()
+    at[model.shared :] += np.tile([0.02, -0.03, 0.05, 1e-3, -2e-3, 1e-3], len(model.views))
+    jacobian = model.jacobian(at, everything)
+    for column in range(len(at)):
+        step = np.zeros_like(at)
         step[column] = 2e-6
-        rise = model.residuals(model.start + step) - model.residuals(model.start - step)
+        rise = model.residuals(at + step) - model.residuals(at - step)
         np.testing.assert_allclose(rise / 4e-6, jacobian[:, column], atol=1e-3)
 
 
