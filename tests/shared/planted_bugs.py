@@ -1,4 +1,4 @@
-"""Bugs that are planted into the rig's own code, one for each invariant at least."""
+"""Bugs that are planted: one for each invariant at least, and those that a schedule once found."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ import pytest
 
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.ros import conversions
+from needle_device_driver.cia402 import cia402_axis
+from needle_device_driver.cia402.drive_machine import DriveMachine
+from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
@@ -17,6 +20,10 @@ from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
+from needle_verification.ros.soak import rig_run
+from needle_verification.ros.soak.virtual_topics import VirtualPublisher
+from needle_verification.soak import invariants
+from needle_verification.soak.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -112,14 +119,88 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 
 
 PLANTED = {
-    "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 75),
-    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 10),
+    "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
+    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 66),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
-    "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 5),
-    "an insertion told too deep": PlantedBug("belief_equals_joints", _insertion_told_too_deep, 1),
+    "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 7),
+    "an insertion told too deep": PlantedBug("belief_equals_joints", _insertion_told_too_deep, 2),
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
-    "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 125),
-    "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 5),
-    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 20),
+    "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
+    "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
+    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
 }
+
+
+class MendedBug(NamedTuple):
+    """A bug of the rig, or of the soak's own judges, and what it violates under its schedule."""
+
+    invariant: str
+    plant: Plant
+
+
+def _blocked_axis_keeps_its_power(patch: pytest.MonkeyPatch) -> None:
+    update = DriveMachine.update
+
+    def unaware(machine: DriveMachine, at: Feedback) -> None:
+        update(machine, dataclasses.replace(at, following_error=0))
+
+    patch.setattr(DriveMachine, "update", unaware)
+
+
+def _start_within_set_up_forgotten(patch: pytest.MonkeyPatch) -> None:
+    await_start = cia402_axis.await_start
+
+    def forgetful(link: Any, monitor: Any, *others: Any) -> None:
+        await_start(link, monitor, *others)
+        monitor.forget_start()
+
+    patch.setattr(cia402_axis, "await_start", forgetful)
+
+
+def _reliable_messages_overtake(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(VirtualPublisher, "_keeps_order", lambda *at: not at[1].overtakes)
+
+
+def _set(owner: Any, **values: Any) -> Plant:
+    def plant(patch: pytest.MonkeyPatch) -> None:
+        for name, value in values.items():
+            patch.setattr(owner, name, value)
+
+    return plant
+
+
+def _judge_forgets(**values: float) -> Plant:
+    see_device = Watch.see_device
+
+    def forgetful(watch: Watch, at: float, said: Any) -> None:
+        see_device(watch, at, said)
+        vars(watch).update(values)
+
+    return _set(Watch, see_device=forgetful)
+
+
+MENDED = {
+    "blocked_when_the_hold_is_let_go": MendedBug(
+        "no_motion_without_hold", _blocked_axis_keeps_its_power
+    ),
+    "a_drive_starts_anew_within_its_set_up": MendedBug(
+        "the_way_goes_on", _start_within_set_up_forgotten
+    ),
+    "a_reliable_topic_out_of_order": MendedBug("the_way_goes_on", _reliable_messages_overtake),
+    "a_blocked_drive_catches_up": MendedBug(
+        "none_beyond_limits", _set(invariants, CATCH_UP_BOUND=-1.0, _SPEED_ROOM=1.25)
+    ),
+    "set_points_come_twice": MendedBug(
+        "none_beyond_limits", _set(invariants, _SPEED_TICKS=4, _SPEED_ROOM=1.25)
+    ),
+    "set_points_come_late": MendedBug("none_beyond_limits", _set(invariants, _SPEED_ROOM=1.25)),
+    "a_fault_ends_homing_on_a_late_bus": MendedBug(
+        "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)
+    ),
+    "a_rebooted_drive_is_homed_where_it_stands": MendedBug(
+        "turns_as_commanded", _judge_forgets(_zero=0.0)
+    ),
+    "a_late_hold": MendedBug("no_motion_without_hold", _set(rig_run, LATEST_MESSAGE=0.0)),
+}
+"""By the schedule, in test/ros/soak/schedules, that found them."""

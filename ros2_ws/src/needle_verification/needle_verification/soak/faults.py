@@ -1,4 +1,4 @@
-"""Faults by one vocabulary: what goes wrong, on which part of the rig, from when, for how long."""
+"""Faults by one vocabulary: what goes wrong, on which part of the rig, when, for how long."""
 
 from __future__ import annotations
 
@@ -24,6 +24,22 @@ class Kind(enum.Enum):
     INTERMITTENT = "intermittent"
     REORDERED = "reordered"
     DUPLICATED = "duplicated"
+
+
+class Moment(enum.Enum):
+    """What a fault may follow: what is heard of the rig."""
+
+    START = "start"
+    ADAPTER_OPENED = "adapter opened"
+    HOMING = "homing"
+    HOLDING = "holding"
+    STEERING = "steering"
+    PRESSED = "pressed"
+    COMMAND = "command"
+    MOVING = "moving"
+    RELEASED = "released"
+    FAULT = "fault"
+    DONE = "done"
 
 
 _LINK_KINDS = (Kind.OFF, Kind.SLOW, Kind.INTERMITTENT, Kind.REORDERED, Kind.DUPLICATED)
@@ -84,7 +100,10 @@ VOCABULARY: dict[str, tuple[Kind, ...]] = {
 }
 """What can go wrong with each part."""
 
-_LATEST, _SHORTEST, _LONGEST = 9.0, 0.02, 4.0
+_LATEST, _SHORTEST, _LONGEST = 6.0, 0.02, 4.0
+# After another moment than the start [s]; for the how manyth time it comes.
+_SOONEST_AFTER, _LATEST_AFTER = 0.001, 1.0
+_TIMES = (1, 1, 2, 3)
 _MOST = 6
 
 
@@ -99,11 +118,15 @@ class Fault:
     kind : Kind
         One that it knows.
     at : float
-        When it begins, from the start of the run [s].
+        When it begins, from `after` on [s].
     lasts : float
         How long [s]; what happens in a moment takes none of it.
     size : float
         How bad, 0..1: what that means depends on part and kind.
+    after : Moment
+        What it follows.
+    nth : int
+        For the how manyth time that comes, from 1.
     """
 
     part: str
@@ -111,29 +134,41 @@ class Fault:
     at: float
     lasts: float
     size: float
+    after: Moment = Moment.START
+    nth: int = 1
 
     def __str__(self) -> str:
         """Return it in a line."""
-        what = f"{self.part}: {self.kind.value}"
-        return f"{what} ({self.size:.2f}), {self.at:.3f} s to {self.at + self.lasts:.3f} s"
+        what = f"{self.part}: {self.kind.value} ({self.size:.2f})"
+        when = f"{self.at:.3f} s after {self.after.value} {self.nth}"
+        return f"{what}, {when}, for {self.lasts:.3f} s"
 
 
 def draw_schedule(generator: random.Random) -> list[Fault]:
-    """Draw up to six faults, in the order in which they begin."""
+    """Draw up to six faults; half of them follow the start, the others anything that may come."""
     faults = []
     for _ in range(generator.randint(1, _MOST)):
         part = generator.choice(tuple(VOCABULARY))
-        faults.append(
-            Fault(
-                part,
-                generator.choice(VOCABULARY[part]),
-                generator.uniform(0.0, _LATEST),
-                # As many short as long ones.
-                _SHORTEST * (_LONGEST / _SHORTEST) ** generator.random(),
-                generator.random(),
-            )
+        fault = Fault(
+            part,
+            generator.choice(VOCABULARY[part]),
+            generator.uniform(0.0, _LATEST),
+            _as_often_short_as_long(generator, _SHORTEST, _LONGEST),
+            generator.random(),
         )
-    return sorted(faults, key=lambda fault: fault.at)
+        if generator.random() < 0.5:
+            fault = dataclasses.replace(
+                fault,
+                at=_as_often_short_as_long(generator, _SOONEST_AFTER, _LATEST_AFTER),
+                after=generator.choice(tuple(Moment)),
+                nth=generator.choice(_TIMES),
+            )
+        faults.append(fault)
+    return faults
+
+
+def _as_often_short_as_long(generator: random.Random, shortest: float, longest: float) -> float:
+    return float(shortest * (longest / shortest) ** generator.random())
 
 
 def write_schedule(path: Path, seed: int, faults: Sequence[Fault], why: str) -> None:
@@ -141,7 +176,10 @@ def write_schedule(path: Path, seed: int, faults: Sequence[Fault], why: str) -> 
     content: dict[str, Any] = {
         "seed": seed,
         "why": why,
-        "faults": [{**dataclasses.asdict(one), "kind": one.kind.value} for one in faults],
+        "faults": [
+            {**dataclasses.asdict(one), "kind": one.kind.value, "after": one.after.value}
+            for one in faults
+        ],
     }
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
 
@@ -156,7 +194,10 @@ def read_schedule(path: Path) -> tuple[int, list[Fault]]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        faults = [Fault(**{**one, "kind": Kind(one["kind"])}) for one in content["faults"]]
+        faults = [
+            Fault(**{**one, "kind": Kind(one["kind"]), "after": Moment(one["after"])})
+            for one in content["faults"]
+        ]
         seed = int(content["seed"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{path} is no schedule: {error}") from error

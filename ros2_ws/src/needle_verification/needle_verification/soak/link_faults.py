@@ -48,6 +48,34 @@ class LinkFault:
     reorders: bool = False
 
 
+class Way:
+    """Chance on one link: what a fault draws shifts nothing of how long messages take.
+
+    Parameters
+    ----------
+    world : VirtualWorld
+        Its chance.
+    span_ns : tuple of int
+        What a message takes at least and at most [ns].
+    names : str
+        From whom, what, to whom.
+
+    Attributes
+    ----------
+    faults : Random
+        Draws for what goes wrong.
+    """
+
+    def __init__(self, world: VirtualWorld, span_ns: tuple[int, int], *names: str) -> None:
+        self.faults = world.chance("faults on the way", *names)
+        self._span_ns = span_ns
+        self._chance = world.chance("way", *names)
+
+    def takes_ns(self) -> int:
+        """Return how long the next message takes [ns]."""
+        return self._chance.randint(*self._span_ns)
+
+
 class LinkFaults:
     """The faults that are on, by the name of what they are on."""
 
@@ -62,16 +90,16 @@ class LinkFaults:
         """Let the fault on a link end."""
         self._on.pop(name, None)
 
-    def fates(self, name: str, data: bytes, world: VirtualWorld) -> list[Fate]:
+    def fates(self, name: str, data: bytes, way: Way) -> list[Fate]:
         """Return all arrivals of a message that is sent now."""
         fault = self._on.get(name)
         if fault is None:
             return [Fate(data)]
-        draw = world.random.random
+        draw = way.faults.random
         fates = []
         for _ in range(2 if draw() < fault.duplicates else 1):
             if draw() < fault.loss:
                 continue
-            late_ns = world.random.randint(0, fault.late_ns)
+            late_ns = way.faults.randint(0, fault.late_ns)
             fates.append(Fate(data, late_ns, fault.reorders))
         return fates

@@ -1,4 +1,4 @@
-"""A world of processes in one thread: one clock, events in a seeded order, waits that go on."""
+"""A world of processes in one thread: one clock, events in their order, waits that go on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _CALLBACK_NS = (20_000, 200_000)
 class VirtualWorld:
     """Events of all processes, one after the other.
 
-    Those that are due at the same time come in an order that the seed draws.
+    Those that are due at the same time come in the order in which they were planned.
 
     Parameters
     ----------
@@ -31,8 +31,6 @@ class VirtualWorld:
 
     Attributes
     ----------
-    random : Random
-        The world's own: every draw in a run comes from it, in the order of events.
     steady_ns : int
         The steady clock [ns].
     system_offset_ns : int
@@ -42,11 +40,12 @@ class VirtualWorld:
     """
 
     def __init__(self, seed: int) -> None:
-        self.random = random.Random(seed)
+        self._seed = seed
+        self._chances: dict[tuple[str, ...], random.Random] = {}
         self.steady_ns = STEADY_START_NS
         self.system_offset_ns = 0
         self.crashes: list[tuple[str, str]] = []
-        self._events: list[tuple[int, float, int, Callable[[], None]]] = []
+        self._events: list[tuple[int, int, Callable[[], None]]] = []
         self._count = 0
 
     @property
@@ -59,13 +58,20 @@ class VirtualWorld:
         """The system clock [ns]."""
         return SYSTEM_START_NS + self.steady_ns - STEADY_START_NS + self.system_offset_ns
 
+    def chance(self, *what: str) -> random.Random:
+        """Return what draws for one thing, named by its words.
+
+        Each has a sequence of its own, so a draw more or less for one shifts nothing of another.
+        """
+        chance = self._chances.get(what)
+        if chance is None:
+            chance = self._chances[what] = random.Random(f"{self._seed} {' | '.join(what)}")
+        return chance
+
     def call_at(self, due_ns: int, action: Callable[[], None]) -> None:
         """Call `action` when the steady clock shows `due_ns` [ns], or next where that is past."""
         self._count += 1
-        heapq.heappush(
-            self._events,
-            (max(due_ns, self.steady_ns), self.random.random(), self._count, action),
-        )
+        heapq.heappush(self._events, (max(due_ns, self.steady_ns), self._count, action))
 
     def call_after(self, delay_ns: int, action: Callable[[], None]) -> None:
         """Call `action` after `delay_ns` [ns]."""
@@ -83,7 +89,7 @@ class VirtualWorld:
             if not self._events or self._events[0][0] > end_ns:
                 self.steady_ns = max(self.steady_ns, end_ns)
                 return bool(predicate())
-            due_ns, _, _, action = heapq.heappop(self._events)
+            due_ns, _, action = heapq.heappop(self._events)
             self.steady_ns = max(self.steady_ns, due_ns)
             action()
         return True
@@ -134,6 +140,7 @@ class VirtualProcess:
         self.started_ns = world.steady_ns
         self.slowness_ns = 0
         self._on_end = on_end
+        self._chance = world.chance("process", name)
         self._ready: list[Callable[[], None]] = []
         self._stopped = False
         self._held: list[Callable[[], None]] = []
@@ -200,7 +207,7 @@ class VirtualProcess:
         self._turn_due = False
         if not self.alive or self._stopped or self._busy or not self._ready:
             return
-        action = self._ready.pop(self.world.random.randrange(len(self._ready)))
+        action = self._ready.pop(self._chance.randrange(len(self._ready)))
         self._busy = True
         try:
             action()
@@ -217,4 +224,4 @@ class VirtualProcess:
             self._on_end(str(error))
         finally:
             self._busy = False
-        self._plan_turn(self.world.random.randint(*_CALLBACK_NS) + self.slowness_ns)
+        self._plan_turn(self._chance.randint(*_CALLBACK_NS) + self.slowness_ns)

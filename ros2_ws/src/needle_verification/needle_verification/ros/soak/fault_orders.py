@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -19,6 +20,7 @@ from needle_verification.ros.soak.virtual_can import LINKS
 from needle_verification.ros.soak.virtual_node import Place, VirtualNode, placed
 from needle_verification.ros.soak.virtual_rig import VirtualRig
 from needle_verification.soak import faults
+from needle_verification.soak.course import Undo
 from needle_verification.soak.faults import Fault, Kind
 from needle_verification.soak.link_faults import LinkFault
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
@@ -41,8 +43,6 @@ _SIGHTS = {
     Kind.SLOW: Sight.LATE,
     Kind.GARBAGE: Sight.WRONG,
 }
-
-Undo = Callable[[], None]
 
 
 def _nothing() -> None:
@@ -76,6 +76,9 @@ class FaultOrders:
     def begin(self, fault: Fault) -> Undo:
         """Let a fault begin; returns what ends it."""
         return self._spoilers.get(fault.part, self._let_stranger_act)(fault)
+
+    def _chance_of(self, fault: Fault) -> random.Random:
+        return self._world.chance("fault", fault.part)
 
     # ---- parts --------------------------------------------------------------------------------
 
@@ -168,10 +171,12 @@ class FaultOrders:
         person.absent = True
         end_ns = world.steady_ns + round(fault.lasts * NANOSECONDS)
 
+        chance = self._chance_of(fault)
+
         def tremble() -> None:
             if world.steady_ns < end_ns:
                 hand.insert = not hand.insert
-                world.call_after(round(world.random.uniform(*_TREMBLING) * NANOSECONDS), tremble)
+                world.call_after(round(chance.uniform(*_TREMBLING) * NANOSECONDS), tremble)
 
         if fault.kind is Kind.OFF:
             hand.insert = hand.retract = hand.stop = False
@@ -198,7 +203,7 @@ class FaultOrders:
         }
         garbage = {"curvature": math.nan, "step_length": -1.0, "curvatur": 1.0, "depth": "deep"}
         choice = wrong if fault.kind is Kind.WRONG else garbage
-        name = self._world.random.choice(tuple(choice))
+        name = self._chance_of(fault).choice(tuple(choice))
 
         def change() -> None:
             node.set_parameters([Parameter(name, value=choice[name])])
@@ -223,7 +228,7 @@ class FaultOrders:
             else:
                 client_of.call(name.removeprefix("/"))
             return _nothing
-        make, kind, qos = self._strange_messages(name, garbage=fault.kind is Kind.GARBAGE)
+        make, kind, qos = self._strange_messages(fault)
         publisher = stranger.create_publisher(kind, name, qos)
         end_ns = self._world.steady_ns + round(fault.lasts * NANOSECONDS)
 
@@ -248,14 +253,15 @@ class FaultOrders:
                 self._stranger = VirtualNode("stranger")
         return self._stranger
 
-    def _strange_messages(
-        self, name: str, *, garbage: bool
-    ) -> tuple[Callable[[], Any], type[Any], Any]:
+    def _strange_messages(self, fault: Fault) -> tuple[Callable[[], Any], type[Any], Any]:
         """Return what makes the next message, its class and QoS."""
-        draw, bench = self._world.random.uniform, self._rig.bench
+        chance, bench = self._chance_of(fault), self._rig.bench
+        draw = chance.uniform
 
         def number(value: float) -> float:
-            return self._world.random.choice((math.nan, math.inf, -1e300)) if garbage else value
+            if fault.kind is Kind.GARBAGE:
+                return chance.choice((math.nan, math.inf, -1e300))
+            return value
 
         def stamp() -> Any:
             return to_stamp(self._world.system_ns)
@@ -302,4 +308,4 @@ class FaultOrders:
             "/needle/tip": (tip, PointStamped, RELIABLE),
             "/target_plane": (plane, PoseStamped, LATCHED),
         }
-        return rows[name]
+        return rows[fault.part.removeprefix(faults.STRANGER)]

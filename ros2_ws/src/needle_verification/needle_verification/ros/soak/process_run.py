@@ -151,9 +151,9 @@ def run_processes(seed: int, folder: Path) -> RunResult:
                 closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
             ):
                 _insert(witness, graph, faults)
-                return RunResult(
-                    seed, tuple(faults), tuple(witness.watch.violations), "", witness.now, False, ()
-                )
+                violations = tuple(witness.watch.violations)
+                happened = tuple(faults)
+                return RunResult(seed, happened, violations, "", witness.now, False, (), happened)
         finally:
             rclpy.try_shutdown()
 

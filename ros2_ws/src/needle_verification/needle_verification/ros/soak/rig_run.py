@@ -5,22 +5,22 @@ from __future__ import annotations
 import dataclasses
 import random
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
-
-from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import Joy
 
 from needle_common.ros.conversions import values_of
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_verification.ros.soak.fault_orders import LATEST_MESSAGE, FaultOrders
+from needle_verification.ros.soak.moment_watch import watch_moments
 from needle_verification.ros.soak.virtual_bench import Motors
 from needle_verification.ros.soak.virtual_person import OUT, Wish
 from needle_verification.ros.soak.virtual_rig import VirtualRig, virtual_rig
+from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import STRANGER, Fault, Kind, draw_schedule
 from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 
+# So long moments are waited for whose faults shall follow them [s].
+_FAULTS_OVER = 30.0
 # Once all faults are over [s]: a person has so long to insert, then so long to draw the needle
 # out. A killed node counts for 8 s more, and a driver looks for its drives again.
 _GO_ON, _DRAW_OUT = 60.0, 60.0
@@ -53,6 +53,8 @@ class RunResult:
         Whether the controller was done once.
     log : tuple of str
         What the nodes logged, one line each.
+    told_by_moments : tuple of Fault
+        Those faults that happened, each told by the last moment that it met.
     """
 
     seed: int
@@ -62,11 +64,12 @@ class RunResult:
     simulated: float
     inserted: bool
     log: tuple[str, ...]
+    told_by_moments: tuple[Fault, ...]
 
 
 def schedule_of(seed: int) -> list[Fault]:
-    """Return the faults of a seed; every twentieth run has none."""
-    return draw_schedule(random.Random(f"faults of {seed}")) if seed % 20 else []
+    """Return the faults of a seed; every hundredth run has none."""
+    return draw_schedule(random.Random(f"faults of {seed}")) if seed % 100 else []
 
 
 def bounds_of_the_rig() -> Bounds:
@@ -87,11 +90,15 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     """
     with virtual_rig(seed, None if faults else UNDISTURBED_DEPTH) as rig:
         watch = _watched(rig, faults)
-        orders = FaultOrders(rig)
-        for fault in faults:
-            rig.world.call_at(_ns(fault.at), partial(_begin, rig, orders, fault))
-        calm = max((fault.at + fault.lasts for fault in faults), default=0.0)
-        rig.world.run_until(_ns(calm))
+        course = Course(rig.world, faults, FaultOrders(rig).begin)
+        watch_moments(rig, course.meet)
+        # What has not come when the needle is out again never comes.
+        rig.world.run_until(
+            _ns(_FAULTS_OVER),
+            lambda: not course.is_under_way and (not course.waits or _has_left(rig)),
+        )
+        course.give_up()
+        calm = _seconds(rig.world.steady_ns)
         rig.world.run_until(_ns(calm + _GO_ON), lambda: _has_left(rig))
         if not _has_left(rig):
             rig.person.wish = Wish.DRAW_OUT
@@ -114,12 +121,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             tuple(
                 f"{_seconds(at):9.3f} {name}: {level}: {text}" for at, name, level, text in rig.log
             ),
+            tuple(told_by_moments(course)),
         )
-
-
-def _begin(rig: VirtualRig, orders: FaultOrders, fault: Fault) -> None:
-    end = orders.begin(fault)
-    rig.world.call_at(_ns(fault.at + fault.lasts), end)
 
 
 def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
@@ -133,33 +136,43 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
     joints_spoilt = any(fault.part in _JOINTS for fault in faults)
 
+    def now() -> float:
+        return _seconds(rig.world.steady_ns)
+
     def see_motors(at: Motors) -> None:
-        now = _seconds(at.steady_ns)
+        at_s = now()
         process = rig.processes.get("device_driver")
         speaks = process is not None and process.alive and not process.stands_still
         rig.graph.digest.update(_rounded((at.insertion, at.rotation)))
-        watch.see_hand(now, holds=rig.hand.holds)
-        watch.see_driver(now, speaks=speaks)
-        watch.see_drives(now, blocked=rig.bench.has_blocked_motor)
-        watch.see_motors(now, at.insertion, at.rotation)
+        watch.see_hand(at_s, holds=rig.hand.holds)
+        watch.see_driver(at_s, speaks=speaks)
+        watch.see_drives(at_s, blocked=rig.bench.has_blocked_motor)
+        watch.see_motors(at_s, at.insertion, at.rotation)
 
-    def see(topic: str, node: str, message: Any) -> None:
-        now = _seconds(rig.world.steady_ns)
-        if topic == "/device/status" and isinstance(message, DiagnosticStatus):
-            watch.see_device(now, values_of(message))
-        elif topic == "/needle/controller_status" and isinstance(message, DiagnosticStatus):
-            watch.see_belief(now, values_of(message), joints_heard=not joints_spoilt)
-        elif topic == "/device/joint_trajectory":
-            for point in message.points:
-                rig.graph.digest.update(_rounded(point.positions))
-            watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
-        elif topic == "/device/estop":
-            watch.see_estop(now, pressed=message.data)
-        elif topic == "/device/hold" and isinstance(message, Joy) and any(message.buttons):
-            (watch.see_other_hold if node == "/stranger" else watch.see_hold)(now)
+    def see_device(_: str, message: Any) -> None:
+        watch.see_device(now(), values_of(message))
+
+    def see_belief(_: str, message: Any) -> None:
+        watch.see_belief(now(), values_of(message), joints_heard=not joints_spoilt)
+
+    def see_command(_: str, message: Any) -> None:
+        for point in message.points:
+            rig.graph.digest.update(_rounded(point.positions))
+        watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
+
+    def see_estop(_: str, message: Any) -> None:
+        watch.see_estop(now(), pressed=message.data)
+
+    def see_hold(node: str, message: Any) -> None:
+        if any(message.buttons):
+            (watch.see_other_hold if node == "/stranger" else watch.see_hold)(now())
 
     rig.bench.watchers.append(see_motors)
-    rig.graph.watchers.append(see)
+    rig.graph.watch("/device/status", see_device)
+    rig.graph.watch("/needle/controller_status", see_belief)
+    rig.graph.watch("/device/joint_trajectory", see_command)
+    rig.graph.watch("/device/estop", see_estop)
+    rig.graph.watch("/device/hold", see_hold)
     return watch
 
 

@@ -91,7 +91,7 @@ def _soak(options: argparse.Namespace) -> int:
     violations = faults = 0
     simulated = 0.0
     for number, result in enumerate(results, start=1):
-        faults += len(result.faults)
+        faults += len(result.told_by_moments)
         simulated += result.simulated
         if result.violations:
             violations += 1
@@ -156,6 +156,9 @@ def _tell(result: RunResult, folder: Path | None) -> None:
         return bool(names & {one.invariant for one in run(result.seed, faults).violations})
 
     kept = shrink(result.faults, still)
+    told = list(run(result.seed, kept).told_by_moments)
+    if still(told):
+        kept = told
     _print(f"seed {result.seed}", result.violations, kept)
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)

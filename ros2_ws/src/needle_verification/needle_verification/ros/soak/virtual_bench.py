@@ -70,7 +70,7 @@ class Bench:
         self._world = world
         drives = DriveEmulatorParameters(boot_time=0.1)
         self.bus = EmulatedBus(drives.insertion, drives.rotation, MotionClock.STEADY, world.steady)
-        draw = world.random.uniform
+        draw = world.chance("needle").uniform
         self._plant = NeedlePlant(
             initial_pose(draw(-0.1, 0.1), draw(-0.5, 0.5)),
             curvature=_CURVATURE * draw(0.9, 1.1),
@@ -147,6 +147,9 @@ class TipTeller(VirtualNode):
         super().__init__("stereo_tracker")
         self._bench = bench
         self.sight = Sight.CLEAR
+        chance = self.place.graph.world.chance
+        self._noise, self._delay = chance("tip", "noise"), chance("tip", "delay")
+        self._fault = chance("faults", "tip")
         self._last = bench.tip.copy()
         self._tip = self.create_publisher(PointStamped, "needle/tip", RELIABLE)
         self._pose = self.create_publisher(PoseWithCovarianceStamped, "needle/tip_pose", RELIABLE)
@@ -156,14 +159,14 @@ class TipTeller(VirtualNode):
         world = self.place.graph.world
         stamp = to_stamp(world.system_ns)
         if self.sight is not Sight.FROZEN:
-            noise = [world.random.uniform(-TIP_NOISE, TIP_NOISE) for _ in range(3)]
+            noise = [self._noise.uniform(-TIP_NOISE, TIP_NOISE) for _ in range(3)]
             self._last = self._bench.tip + np.array(noise)
         seen = self._last.copy()
         if self.sight is Sight.WRONG:
-            seen += [world.random.uniform(-0.02, 0.02) for _ in range(3)]
-        delay_ns = world.random.randint(*_ANSWER_NS)
+            seen += [self._fault.uniform(-0.02, 0.02) for _ in range(3)]
+        delay_ns = self._delay.randint(*_ANSWER_NS)
         if self.sight is Sight.LATE:
-            delay_ns += world.random.randint(0, 3_000_000_000)
+            delay_ns += self._fault.randint(0, 3_000_000_000)
         pose = to_tip_pose(seen, TIP_NOISE, stamp)
         found = self.sight is not Sight.BLACK
         if not found:

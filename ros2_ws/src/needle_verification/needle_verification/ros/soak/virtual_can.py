@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import can
@@ -12,7 +13,7 @@ import canopen
 from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
 from needle_sim.bus.can_frame import CanFrame
 from needle_sim.drives.emulated_bus import EmulatedBus
-from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.link_faults import LinkFaults, Way
 from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
 
 # A frame's way, adapter included [ns], at least and at most.
@@ -39,6 +40,8 @@ class VirtualCan:
     ----------
     unplugged : bool
         Whether the adapter is gone.
+    watchers : list of callable
+        Called whenever somebody opens it.
     """
 
     def __init__(self, world: VirtualWorld, bus: EmulatedBus, faults: LinkFaults) -> None:
@@ -46,13 +49,17 @@ class VirtualCan:
         self._faults = faults
         self.bus = bus
         self.unplugged = False
+        self.watchers: list[Callable[[], None]] = []
         self._links: list[VirtualLink] = []
-        self._arrivals = dict.fromkeys(LINKS, 0)
+        self._last_ns = dict.fromkeys(LINKS, 0)
+        self._ways: dict[tuple[str, str], Way] = {}
         self._poll()
 
     def plug_in(self, link: VirtualLink) -> None:
         """Let a link hear the bus."""
         self._links.append(link)
+        for watch in self.watchers:
+            watch()
 
     def unplug(self) -> None:
         """Take the adapter away from whoever has it open."""
@@ -68,12 +75,9 @@ class VirtualCan:
 
     def send(self, identifier: int, data: bytes) -> None:
         """Put a frame of the computer's on the bus."""
-        for fate in self._faults.fates(TO_DRIVES, data, self._world):
-            frame = CanFrame(identifier, fate.data)
-            self._world.call_at(
-                self._arrival(TO_DRIVES, fate.late_ns, overtakes=fate.overtakes),
-                lambda frame=frame: self._take(frame),  # type: ignore[misc]
-            )
+        for due_ns, arrived in self._arrivals(TO_DRIVES, identifier, data):
+            frame = CanFrame(identifier, arrived)
+            self._world.call_at(due_ns, partial(self._take, frame))
 
     def _take(self, frame: CanFrame) -> None:
         self.bus.receive(frame, self._world.steady)
@@ -85,26 +89,28 @@ class VirtualCan:
 
     def _hand_on(self) -> None:
         for frame in self.bus.poll(self._world.steady):
-            for fate in self._faults.fates(FROM_DRIVES, frame.data, self._world):
+            for due_ns, arrived in self._arrivals(FROM_DRIVES, frame.identifier, frame.data):
                 message = can.Message(
-                    arbitration_id=frame.identifier, data=fate.data, is_extended_id=False
+                    arbitration_id=frame.identifier, data=arrived, is_extended_id=False
                 )
-                self._world.call_at(
-                    self._arrival(FROM_DRIVES, fate.late_ns, overtakes=fate.overtakes),
-                    lambda message=message: self._arrive(message),  # type: ignore[misc]
-                )
+                self._world.call_at(due_ns, partial(self._arrive, message))
 
     def _arrive(self, message: can.Message) -> None:
         for link in tuple(self._links):
             link.hear(message)
 
-    def _arrival(self, name: str, late_ns: int, *, overtakes: bool) -> int:
-        due_ns = self._world.steady_ns + self._world.random.randint(*_FRAME_NS) + late_ns
-        if overtakes:
-            return due_ns
-        # A bus keeps the order; one nanosecond, since ties are drawn.
-        self._arrivals[name] = max(due_ns, self._arrivals[name] + 1)
-        return self._arrivals[name]
+    def _arrivals(self, link: str, identifier: int, data: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield when a frame that is sent now arrives [ns], and what arrives."""
+        key = link, f"{identifier:X}"
+        if key not in self._ways:
+            self._ways[key] = Way(self._world, _FRAME_NS, *key)
+        way = self._ways[key]
+        for fate in self._faults.fates(link, data, way):
+            due_ns = self._world.steady_ns + way.takes_ns() + fate.late_ns
+            if not fate.overtakes:
+                # A bus keeps the order.
+                due_ns = self._last_ns[link] = max(due_ns, self._last_ns[link])
+            yield due_ns, fate.data
 
 
 class VirtualLink(CanLink):

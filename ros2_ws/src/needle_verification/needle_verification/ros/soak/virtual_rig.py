@@ -32,7 +32,7 @@ from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, 
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 PERSON = "person"
-_DEPTHS = (0.003, 0.012)
+_DEPTHS = (0.003, 0.008)
 _PRESETS = ("best", "paper")
 _INSERTIONS = ("stepwise", "continuous")
 # A node that ended is started again by whoever sees it [ns].
@@ -84,13 +84,14 @@ class VirtualRig:
         self.nodes: dict[str, Node] = {}
         self.log: list[tuple[int, str, str, str]] = []
         self.ends: list[tuple[int, str, str]] = []
-        draw = self.world.random
+        draw = self.world.chance("rig")
         self.depth = draw.uniform(*_DEPTHS) if depth is None else depth
         self.preset = draw.choice(_PRESETS)
         self.insertion = draw.choice(_INSERTIONS)
         self.start(PERSON)
         for name in NODES:
-            self.world.call_after(draw.randint(0, NANOSECONDS // 5), partial(self.start, name))
+            late_ns = self.world.chance("start", name).randint(0, NANOSECONDS // 5)
+            self.world.call_after(late_ns, partial(self.start, name))
 
     @property
     def person(self) -> Person:

@@ -15,7 +15,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 
 from needle_verification.soak.invariants import DISCOVERED_WITHIN
-from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.link_faults import Fate, LinkFaults, Way
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
 # From an endpoint's creation until another process knows it [ns], at least and at most.
@@ -28,6 +28,7 @@ _RESEND_NS = (20_000_000, 100_000_000)
 _LEASE_NS = 8_000_000_000
 
 
+Watcher = Callable[[str, Any], None]
 Careful = Callable[[Callable[[], None]], None]
 """Calls back; a node sets its own, which knows what to do with a failure."""
 
@@ -73,7 +74,8 @@ class Endpoint:
     def known_ns(self, process: VirtualProcess) -> int:
         """Return when a process comes to know it, steady clock [ns]."""
         if process not in self._known_ns:
-            late_ns = self.graph.world.random.randint(*_DISCOVERY_NS)
+            found = "discovery", self.node_name, self.topic_name, process.name
+            late_ns = self.graph.world.chance(*found).randint(*_DISCOVERY_NS)
             self._known_ns[process] = max(self.created_ns, process.started_ns) + late_ns
         return self._known_ns[process]
 
@@ -105,22 +107,25 @@ class VirtualGraph:
     ----------
     digest : hashlib hash
         Of all that was published and called: by whom, when, how long.
-    watchers : list of callable
-        Called with topic, full name of the node and message whenever something is published.
     """
 
     def __init__(self, world: VirtualWorld, faults: LinkFaults) -> None:
         self.world = world
         self.faults = faults
         self.digest = hashlib.sha256()
-        self.watchers: list[Callable[[str, str, Any], None]] = []
+        self._watchers: dict[str, list[Watcher]] = {}
         self.publishers: dict[str, list[VirtualPublisher]] = {}
         self.subscriptions: dict[str, list[VirtualSubscription]] = {}
         self.services: dict[str, list[VirtualService]] = {}
 
-    def transport_ns(self) -> int:
-        """Return how long the next message takes [ns]."""
-        return self.world.random.randint(*_TRANSPORT_NS)
+    def watch(self, topic: str, watcher: Watcher) -> None:
+        """Call `watcher` with the node's full name and the message, whenever one is published."""
+        self._watchers.setdefault(topic, []).append(watcher)
+
+    def show(self, topic: str, node_name: str, message: Any) -> None:
+        """Show a message to who watches its topic."""
+        for watcher in self._watchers.get(topic, ()):
+            watcher(node_name, message)
 
     def remove(self, process: VirtualProcess, *, killed: bool) -> None:
         """Take a process' endpoints out; others go on to count those of one that was killed."""
@@ -140,6 +145,7 @@ class VirtualPublisher(Endpoint):
         self.msg_type = kind
         self._kept: deque[bytes] = deque(maxlen=self.qos_profile.depth)
         self._arrivals: dict[VirtualSubscription, int] = {}
+        self._ways: dict[VirtualSubscription, Way] = {}
         self._unacknowledged: dict[VirtualSubscription, deque[tuple[bytes, int]]] = {}
         self.graph.publishers.setdefault(self.topic_name, []).append(self)
         for subscription in self.graph.subscriptions.get(self.topic_name, ()):
@@ -154,8 +160,7 @@ class VirtualPublisher(Endpoint):
         # Not the bytes: what fills them up between two fields is whatever lay in memory.
         mark = f"{graph.world.steady_ns} {self.node_name} {self.topic_name} {len(data)}\n"
         graph.digest.update(mark.encode())
-        for watch in graph.watchers:
-            watch(self.topic_name, self.node_name, message)
+        graph.show(self.topic_name, self.node_name, message)
         if _is_latched(self.qos_profile):
             self._kept.append(data)
         now = graph.world.steady_ns
@@ -208,7 +213,8 @@ class VirtualPublisher(Endpoint):
             if not self._put_on_link(subscription, *waiting[0]):
                 world = self.graph.world
                 again = partial(self._send_again, subscription)
-                world.call_after(world.random.randint(*_RESEND_NS), again)
+                late_ns = self._way(subscription).faults.randint(*_RESEND_NS)
+                world.call_after(late_ns, again)
                 return
             waiting.popleft()
 
@@ -227,12 +233,12 @@ class VirtualPublisher(Endpoint):
     def _put_on_link(self, subscription: VirtualSubscription, data: bytes, sent_ns: int) -> bool:
         """Send a message once; returns whether it arrives."""
         world = self.graph.world
-        fates = self.graph.faults.fates(self.topic_name, data, world)
+        way = self._way(subscription)
+        fates = self.graph.faults.fates(self.topic_name, data, way)
         for fate in fates:
-            arrival = world.steady_ns + self.graph.transport_ns() + fate.late_ns
-            if not fate.overtakes or self._is_reliable(subscription):
-                # One nanosecond later at least, since ties are drawn.
-                arrival = max(arrival, self._arrivals.get(subscription, 0) + 1)
+            arrival = world.steady_ns + way.takes_ns() + fate.late_ns
+            if self._keeps_order(fate, subscription):
+                arrival = max(arrival, self._arrivals.get(subscription, 0))
                 self._arrivals[subscription] = arrival
 
             def arrive(data: bytes = fate.data, sent_ns: int = sent_ns) -> None:
@@ -240,6 +246,16 @@ class VirtualPublisher(Endpoint):
 
             world.call_at(arrival, arrive)
         return bool(fates)
+
+    def _keeps_order(self, fate: Fate, subscription: VirtualSubscription) -> bool:
+        return not fate.overtakes or self._is_reliable(subscription)
+
+    def _way(self, subscription: VirtualSubscription) -> Way:
+        way = self._ways.get(subscription)
+        if way is None:
+            names = self.node_name, self.topic_name, subscription.node_name
+            way = self._ways[subscription] = Way(self.graph.world, _TRANSPORT_NS, *names)
+        return way
 
 
 class VirtualSubscription(Endpoint):
@@ -333,6 +349,7 @@ class VirtualClient:
         self._process = process
         self.srv_type = kind
         self.srv_name = name
+        self._way = Way(graph.world, _TRANSPORT_NS, process.name, name)
 
     def service_is_ready(self) -> bool:
         """Return whether a server is known."""
@@ -362,8 +379,8 @@ class VirtualClient:
 
     def _pass(self, data: bytes, arrive: Callable[[bytes], None]) -> None:
         world = self._graph.world
-        for fate in self._graph.faults.fates(self.srv_name, data, world):
-            late_ns = self._graph.transport_ns() + fate.late_ns
+        for fate in self._graph.faults.fates(self.srv_name, data, self._way):
+            late_ns = self._way.takes_ns() + fate.late_ns
             world.call_after(late_ns, lambda data=fate.data: arrive(data))  # type: ignore[misc]
 
     def _servers(self) -> list[VirtualService]:

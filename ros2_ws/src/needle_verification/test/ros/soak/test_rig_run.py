@@ -6,9 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from needle_verification.ros.soak import rig_run
 from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
 from needle_verification.soak.faults import read_schedule
-from planted_bugs import PLANTED
+from planted_bugs import MENDED, PLANTED
 
 SCHEDULES = Path(__file__).parent / "schedules"
 
@@ -17,12 +18,24 @@ def violated(result: RunResult) -> set[str]:
     return {violation.invariant for violation in result.violations}
 
 
-def test_an_undisturbed_run_converges_and_a_seed_gives_one_run() -> None:
-    one = run(20, schedule_of(20))
-    assert not one.faults
-    assert one.inserted
-    assert not one.violations
-    assert run(20, []).digest == one.digest
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for a person who gets nowhere no longer than it takes to see that."""
+    monkeypatch.setattr(rig_run, "_GO_ON", 15.0)
+    monkeypatch.setattr(rig_run, "_DRAW_OUT", 15.0)
+
+
+def test_an_undisturbed_run_converges() -> None:
+    result = run(100, schedule_of(100))
+    assert not result.faults
+    assert result.inserted
+    assert not result.violations
+
+
+def test_a_seed_gives_one_run() -> None:
+    one, again = (run(3, schedule_of(3)) for _ in range(2))
+    assert one.faults
+    assert run(3, one.told_by_moments).digest == again.digest == one.digest
 
 
 @pytest.mark.parametrize("seed", range(2, 14))
@@ -32,11 +45,26 @@ def test_faults_violate_nothing(seed: int) -> None:
     assert not result.violations
 
 
-@pytest.mark.parametrize("path", sorted(SCHEDULES.glob("*.json")), ids=lambda path: path.stem)
-def test_what_once_violated_does_not_any_more(path: Path) -> None:
-    assert not run(*read_schedule(path)).violations
+def test_each_schedule_has_its_bug() -> None:
+    assert {path.stem for path in SCHEDULES.glob("*.json")} == set(MENDED)
 
 
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("name", MENDED)
+def test_what_once_violated_does_not_any_more(name: str) -> None:
+    result = run(*read_schedule(SCHEDULES / f"{name}.json"))
+    assert not result.violations
+    assert len(result.told_by_moments) == len(result.faults), "each fault met its moment"
+
+
+@pytest.mark.usefixtures("impatient")
+@pytest.mark.parametrize("name", MENDED)
+def test_what_once_violated_would_again(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    MENDED[name].plant(monkeypatch)
+    assert MENDED[name].invariant in violated(run(*read_schedule(SCHEDULES / f"{name}.json")))
+
+
+@pytest.mark.usefixtures("impatient")
 @pytest.mark.parametrize("name", PLANTED)
 def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     bug = PLANTED[name]

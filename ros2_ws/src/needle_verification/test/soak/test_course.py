@@ -1,0 +1,93 @@
+"""Faults begin by what they meet, wherever on the clock that is; chance is of one thing alone."""
+
+from __future__ import annotations
+
+from needle_verification.soak.course import Course, told_by_moments
+from needle_verification.soak.faults import Fault, Kind, Moment
+from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS, VirtualWorld
+
+SECOND_PRESS = Fault("bus", Kind.OFF, 0.5, 1.0, 0.5, Moment.PRESSED, 2)
+EARLY = Fault("operator", Kind.STUCK, 2.25, 0.5, 0.5)
+
+
+class Happening:
+    """A course, and when its faults began and ended [s]."""
+
+    def __init__(self, *faults: Fault) -> None:
+        self.world = VirtualWorld(1)
+        self.told: list[tuple[str, str, float]] = []
+        self.course = Course(self.world, faults, self._begin)
+        self.course.meet(Moment.START)
+
+    def until(self, at: float) -> None:
+        self.world.run_until(STEADY_START_NS + round(at * NANOSECONDS))
+
+    def _begin(self, fault: Fault) -> object:
+        self._note(fault, "begins")
+        return lambda: self._note(fault, "ends")
+
+    def _note(self, fault: Fault, what: str) -> None:
+        at = (self.world.steady_ns - STEADY_START_NS) / NANOSECONDS
+        self.told.append((fault.part, what, at))
+
+
+def test_a_fault_follows_the_moment_that_it_tells() -> None:
+    run = Happening(SECOND_PRESS, EARLY)
+    for at in (1.0, 4.0, 7.0):
+        run.until(at)
+        run.course.meet(Moment.PRESSED)
+    assert run.course.is_under_way is False
+    run.until(20.0)
+    assert run.told == [
+        ("operator", "begins", 2.25),
+        ("operator", "ends", 2.75),
+        ("bus", "begins", 4.5),
+        ("bus", "ends", 5.5),
+    ]
+
+
+def test_what_waits_and_what_is_under_way() -> None:
+    run = Happening(SECOND_PRESS)
+    assert run.course.waits
+    run.course.meet(Moment.PRESSED)
+    run.course.meet(Moment.PRESSED)
+    assert not run.course.waits
+    assert run.course.is_under_way
+    run.until(1.4)
+    assert run.course.is_under_way
+    run.until(1.5)
+    assert not run.course.is_under_way
+
+
+def test_what_is_given_up_never_happens() -> None:
+    run = Happening(SECOND_PRESS)
+    run.course.give_up()
+    run.course.meet(Moment.PRESSED)
+    run.course.meet(Moment.PRESSED)
+    run.until(5.0)
+    assert run.told == []
+    assert not run.course.is_under_way
+    assert told_by_moments(run.course) == []
+
+
+def test_a_fault_is_told_by_the_last_moment_it_met() -> None:
+    run = Happening(EARLY)
+    for moment, at in ((Moment.PRESSED, 1.0), (Moment.PRESSED, 2.0), (Moment.DONE, 2.5)):
+        run.until(at)
+        run.course.meet(moment)
+    run.until(5.0)
+    (told,) = told_by_moments(run.course)
+    assert told == Fault("operator", Kind.STUCK, 0.25, 0.5, 0.5, Moment.PRESSED, 2)
+
+
+def test_a_draw_for_one_thing_shifts_no_other() -> None:
+    alone, beside = VirtualWorld(3), VirtualWorld(3)
+    drawn = []
+    for world in (alone, beside):
+        first = world.chance("way", "/joy").random()
+        if world is beside:
+            world.chance("way", "/tip").random()
+        drawn.append((first, world.chance("way", "/joy").random()))
+    assert drawn[0] == drawn[1]
+    assert len({*drawn[0], VirtualWorld(4).chance("way", "/joy").random()}) == 3
+    assert alone.chance("way", "/tip").random() == VirtualWorld(3).chance("way", "/tip").random()
