@@ -84,9 +84,14 @@ class EmulatedBus:
     def poll(self, now: float) -> list[CanFrame]:
         """Let time go by until `now` [s]; return what the drives put on the bus."""
         self._move_until(now)
-        frames: list[CanFrame] = []
         for drive in self.drives.values():
             drive.tick(now)
+        return self.take_sent()
+
+    def take_sent(self) -> list[CanFrame]:
+        """Return what the drives have put on the bus since it was last taken."""
+        frames: list[CanFrame] = []
+        for drive in self.drives.values():
             frames += drive.device.outbox
             drive.device.outbox.clear()
         return [] if self.is_cut else frames

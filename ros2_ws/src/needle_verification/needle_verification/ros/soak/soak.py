@@ -137,8 +137,9 @@ def _process_results(seeds: range, folder: Path | None) -> Iterator[RunResult]:
 
 def _begin_worker() -> None:
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
-    # What is imported stays: the collection after each run need not look at it.
+    # Each run is collected at its end; what is imported stays, and need not be looked at.
     gc.freeze()
+    gc.disable()
 
 
 def _run_seed(seed: int) -> RunResult:

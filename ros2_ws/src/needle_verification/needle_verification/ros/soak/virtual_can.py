@@ -81,14 +81,14 @@ class VirtualCan:
 
     def _take(self, frame: CanFrame) -> None:
         self.bus.receive(frame, self._world.steady)
-        self._hand_on()
+        self._hand_on(self.bus.take_sent())
 
     def _poll(self) -> None:
-        self._hand_on()
+        self._hand_on(self.bus.poll(self._world.steady))
         self._world.call_after(_POLL_NS, self._poll)
 
-    def _hand_on(self) -> None:
-        for frame in self.bus.poll(self._world.steady):
+    def _hand_on(self, frames: list[CanFrame]) -> None:
+        for frame in frames:
             for due_ns, arrived in self._arrivals(FROM_DRIVES, frame.identifier, frame.data):
                 message = can.Message(
                     arbitration_id=frame.identifier, data=arrived, is_extended_id=False
@@ -180,6 +180,19 @@ class _Arrival(threading.Condition):
     def __init__(self, process: VirtualProcess) -> None:
         super().__init__()
         self._process = process
+        self._notified = False
+
+    def notify_all(self) -> None:
+        self._notified = True
 
     def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
-        return self._process.wait_for(predicate, timeout)
+        held = bool(predicate())
+
+        def holds() -> bool:
+            nonlocal held
+            if self._notified:
+                self._notified = False
+                held = bool(predicate())
+            return held
+
+        return self._process.wait_for(holds, timeout)

@@ -156,17 +156,23 @@ class VirtualPublisher(Endpoint):
         if not self.process.alive:
             return
         graph = self.graph
-        data = message if isinstance(message, bytes) else serialize_message(message)
-        # Not the bytes: what fills them up between two fields is whatever lay in memory.
-        mark = f"{graph.world.steady_ns} {self.node_name} {self.topic_name} {len(data)}\n"
-        graph.digest.update(mark.encode())
-        graph.show(self.topic_name, self.node_name, message)
-        if _is_latched(self.qos_profile):
-            self._kept.append(data)
         now = graph.world.steady_ns
-        for subscription in graph.subscriptions.get(self.topic_name, ()):
-            if self._matched_ns(subscription) <= now and self._suits(subscription):
-                self._send(subscription, data)
+        # Not the bytes: what fills them up between two fields is whatever lay in memory.
+        graph.digest.update(f"{now} {self.node_name} {self.topic_name}\n".encode())
+        graph.show(self.topic_name, self.node_name, message)
+        readers = [
+            subscription
+            for subscription in graph.subscriptions.get(self.topic_name, ())
+            if self._matched_ns(subscription) <= now and self._suits(subscription)
+        ]
+        latched = _is_latched(self.qos_profile)
+        if not (readers or latched):
+            return
+        data = message if isinstance(message, bytes) else serialize_message(message)
+        if latched:
+            self._kept.append(data)
+        for subscription in readers:
+            self._send(subscription, data)
 
     def get_subscription_count(self) -> int:
         """Return how many subscriptions it knows."""
