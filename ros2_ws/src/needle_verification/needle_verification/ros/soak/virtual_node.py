@@ -19,11 +19,10 @@ from rclpy.time import Time
 from needle_common.errors import UserError
 from needle_common.ros.base_node import DiagnosticsPublisher
 from needle_common.ros.whole_node import WholeLifecycleNode, WholeNode
+from needle_verification.ros.soak.virtual_services import VirtualClient, VirtualService
 from needle_verification.ros.soak.virtual_topics import (
-    VirtualClient,
     VirtualGraph,
     VirtualPublisher,
-    VirtualService,
     VirtualSubscription,
 )
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess

@@ -1,4 +1,4 @@
-"""Topics and services of a virtual graph: found after a while, delivered late, queued, lost."""
+"""Topics of a virtual graph: found after a while, delivered late, queued, lost."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
-from rclpy.task import Future
 
 from needle_verification.soak.invariants import DISCOVERED_WITHIN
 from needle_verification.soak.link_faults import Fate, LinkFaults, Way
@@ -20,8 +19,8 @@ from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, 
 
 # From an endpoint's creation until another process knows it [ns], at least and at most.
 _DISCOVERY_NS = (5_000_000, round(DISCOVERED_WITHIN * NANOSECONDS))
-# On a topic's way [ns].
-_TRANSPORT_NS = (50_000, 1_500_000)
+TRANSPORT_NS = (50_000, 1_500_000)
+"""What a message takes on its way [ns], at least and at most."""
 # From a reliable writer's sending to its sending again, where no acknowledgement came [ns].
 _RESEND_NS = (20_000_000, 100_000_000)
 # Until others take a killed process for gone [ns].
@@ -33,7 +32,8 @@ Careful = Callable[[Callable[[], None]], None]
 """Calls back; a node sets its own, which knows what to do with a failure."""
 
 
-def _plainly(act: Callable[[], None]) -> None:
+def plainly(act: Callable[[], None]) -> None:
+    """Call back where no node has set its own."""
     act()
 
 
@@ -116,7 +116,7 @@ class VirtualGraph:
         self._watchers: dict[str, list[Watcher]] = {}
         self.publishers: dict[str, list[VirtualPublisher]] = {}
         self.subscriptions: dict[str, list[VirtualSubscription]] = {}
-        self.services: dict[str, list[VirtualService]] = {}
+        self.services: dict[str, list[Any]] = {}
 
     def watch(self, topic: str, watcher: Watcher) -> None:
         """Call `watcher` with the node's full name and the message, whenever one is published."""
@@ -260,7 +260,7 @@ class VirtualPublisher(Endpoint):
         way = self._ways.get(subscription)
         if way is None:
             names = self.node_name, self.topic_name, subscription.node_name
-            way = self._ways[subscription] = Way(self.graph.world, _TRANSPORT_NS, *names)
+            way = self._ways[subscription] = Way(self.graph.world, TRANSPORT_NS, *names)
         return way
 
 
@@ -274,7 +274,7 @@ class VirtualSubscription(Endpoint):
         self._raw = raw
         self._with_info = _takes_two(callback)
         self._queue: deque[tuple[bytes, int]] = deque()
-        self.careful: Careful = _plainly
+        self.careful: Careful = plainly
         self.handle = self
         self.graph.subscriptions.setdefault(self.topic_name, []).append(self)
         for publisher in self.graph.publishers.get(self.topic_name, ()):
@@ -319,79 +319,6 @@ class VirtualSubscription(Endpoint):
 
     def _info(self, sent_ns: int) -> dict[str, int]:
         return {"source_timestamp": sent_ns, "received_timestamp": self.graph.world.system_ns}
-
-
-class VirtualService(Endpoint):
-    """rclpy's Service, as far as the nodes use it."""
-
-    def __init__(self, *place: Any, kind: type[Any], callback: Any) -> None:
-        super().__init__(*place)
-        self.srv_type = kind
-        self.callback = callback
-        self.careful: Careful = _plainly
-        self.graph.services.setdefault(self.srv_name, []).append(self)
-
-    def answer(self, data: bytes, reply: Callable[[bytes], None]) -> None:
-        """Answer a request that has come."""
-
-        def act() -> None:
-            if self.gone_ns is None:
-                request = deserialize_message(data, self.srv_type.Request)
-                self.careful(lambda: self._reply(request, reply))
-
-        self.process.do(act)
-
-    def _reply(self, request: Any, reply: Callable[[bytes], None]) -> None:
-        reply(serialize_message(self.callback(request, self.srv_type.Response())))
-
-
-class VirtualClient:
-    """rclpy's Client, as far as the nodes use it."""
-
-    def __init__(
-        self, graph: VirtualGraph, process: VirtualProcess, kind: type[Any], name: str
-    ) -> None:
-        self._graph = graph
-        self._process = process
-        self.srv_type = kind
-        self.srv_name = name
-        self._way = Way(graph.world, _TRANSPORT_NS, process.name, name)
-
-    def service_is_ready(self) -> bool:
-        """Return whether a server is known."""
-        return bool(self._servers())
-
-    def call_async(self, request: Any) -> Future[Any]:
-        """Send a request; where the server is gone no answer ever comes."""
-        graph, future = self._graph, Future()
-        data = serialize_message(request)
-        mark = f"{graph.world.steady_ns} {self._process.name} calls {self.srv_name} {request}\n"
-        graph.digest.update(mark.encode())
-
-        def take(answer: bytes) -> None:
-            self._process.do(
-                lambda: future.set_result(deserialize_message(answer, self.srv_type.Response))
-            )
-
-        def reply(answer: bytes) -> None:
-            self._pass(answer, take)
-
-        for server in self._servers():
-            self._pass(data, lambda there, server=server: server.answer(there, reply))  # type: ignore[misc]
-        return future
-
-    def remove_pending_request(self, _: Future[Any]) -> None:
-        """Forget a request; its answer changes nothing any more."""
-
-    def _pass(self, data: bytes, arrive: Callable[[bytes], None]) -> None:
-        world = self._graph.world
-        for fate in self._graph.faults.fates(self.srv_name, data, self._way):
-            late_ns = self._way.takes_ns() + fate.late_ns
-            world.call_after(late_ns, lambda data=fate.data: arrive(data))  # type: ignore[misc]
-
-    def _servers(self) -> list[VirtualService]:
-        servers = self._graph.services.get(self.srv_name, ())
-        return [server for server in servers if server.is_seen(self._process)]
 
 
 def _is_latched(qos: QoSProfile) -> bool:
