@@ -204,15 +204,16 @@ class FaultOrders:
         garbage = {"curvature": math.nan, "step_length": -1.0, "curvatur": 1.0, "depth": "deep"}
         choice = wrong if fault.kind is Kind.WRONG else garbage
         name = self._chance_of(fault).choice(tuple(choice))
+        process = self._rig.processes["plane_controller"]
+        had = node.get_parameter(name).value if node.has_parameter(name) else None
 
-        def change() -> None:
-            node.set_parameters([Parameter(name, value=choice[name])])
+        def change_to(value: Any) -> None:
+            change = partial(node.set_parameters, [Parameter(name, value=value)])
+            process.do(lambda: node._carefully("set_parameters", change))
 
-        def try_to_change() -> None:
-            node._carefully("set_parameters", change)
-
-        self._rig.processes["plane_controller"].do(try_to_change)
-        return _nothing
+        change_to(choice[name])
+        # A name that it does not know was not taken.
+        return partial(change_to, had) if had is not None else _nothing
 
     # ---- strangers ----------------------------------------------------------------------------
 
