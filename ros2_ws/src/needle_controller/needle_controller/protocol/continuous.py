@@ -135,12 +135,7 @@ class ContinuousSteering(Steering):
             self._failed.forget()
             return []
         self._refusal_known_ns = self.command_ns
-        actions: list[Action] = [Log("warning", f"path {text}", "abort")]
-        self.reason = f"path {text}"
-        why = self._failed.aborted(text, moved=self.intake.has_moved)
-        if why:
-            return actions + self._leave(SteeringState.FAULT, why, "error")
-        return actions + self._ask() + self._use_tip()
+        return self._take_abort("path", "path", text)
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
         """Do nothing: a path depends on joints, not on where the one before has led."""

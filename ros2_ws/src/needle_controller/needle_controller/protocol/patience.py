@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.steering_types import Action, Log
 from needle_controller.protocol.step_watch import REST_INSERTION
 
 
@@ -25,11 +26,11 @@ class Patience:
         """Begin to wait anew."""
         self._since = self._heard_since = None
 
-    def heard(self) -> bool:
-        """Take that the device is heard; return whether that ends a silence."""
+    def hear(self) -> list[Action]:
+        """Take that the device is heard; say so where that ends a silence."""
         self._heard_since = None
         was_silent, self.silence = bool(self.silence), ""
-        return was_silent
+        return [Log("info", "the device is heard again")] if was_silent else []
 
     def waited(self, steady: float, *, moving: bool) -> float:
         """Return for how long something is awaited, not counting while it moves [s]."""
@@ -37,11 +38,17 @@ class Patience:
             self._since = steady
         return steady - self._since
 
-    def unheard(self, steady: float) -> float:
-        """Return for how long the device has not been heard [s]."""
+    def listen(self, steady: float, timeout: float) -> list[Action]:
+        """Say, once, that the device has not been heard for so long [s].
+
+        Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
+        """
         if self._heard_since is None:
             self._heard_since = steady
-        return steady - self._heard_since
+        if self.silence or steady - self._heard_since < timeout:
+            return []
+        self.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
+        return [Log("warning", self.silence)]
 
     def has_moved(self, latest: JointSample | None) -> bool:
         """Return whether the joints have moved since the last look."""

@@ -131,7 +131,7 @@ class Steering:
             return [Log("warning", self.intake.joints.complaint, "joints")]
         if heard in {Heard.DOUBTED, Heard.REPEATED}:
             return []
-        actions = self._heard()
+        actions = self.patience.hear()
         if heard is Heard.JUMPED and before is not None:
             actions += self._take_jump(before, sample)
         out_below = self.settings.needle_out_insertion
@@ -171,12 +171,7 @@ class Steering:
         if text == "succeeded":
             self._followed = StepWatch(step, sent_ns)
             return [*self._ask(), *self._watch_step(None), *self._use_tip()]
-        actions: list[Action] = [Log("warning", f"step {self.step + 1} {text}", "abort")]
-        self.reason = f"step {text}"
-        why = self._failed.aborted(text, moved=self.intake.has_moved)
-        if why:
-            return actions + self._leave(SteeringState.FAULT, why, "error")
-        return actions + self._ask() + self._use_tip()
+        return self._take_abort("step", f"step {self.step + 1}", text)
 
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
         """Take that a recorded device made another step: its command's stamp [ns], where it led."""
@@ -189,7 +184,7 @@ class Steering:
             # Who lets go has not made a command fail, and who presses anew has looked.
             self._failed.forget()
         self._device = status
-        actions = self._heard()
+        actions = self.patience.hear()
         if not self._steering:
             return actions
         if status.state in _STOPPED_DEVICE:
@@ -249,14 +244,16 @@ class Steering:
                 "not move: the command or its answer is lost"
             )
             return self._leave(SteeringState.FAULT, why, "error")
-        if self.patience.unheard(steady) < timeout or self.patience.silence:
-            return []
-        # Nothing else follows: a simulation that a person pauses is as silent as a dead driver.
-        self.patience.silence = f"nothing heard of the device for {timeout:g} s, a step under way"
-        return [Log("warning", self.patience.silence)]
+        return self.patience.listen(steady, timeout)
 
-    def _heard(self) -> list[Action]:
-        return [Log("info", "the device is heard again")] if self.patience.heard() else []
+    def _take_abort(self, kind: str, name: str, text: str) -> list[Action]:
+        """Go on from a command that was aborted, unless too many were in a row."""
+        actions: list[Action] = [Log("warning", f"{name} {text}", "abort")]
+        self.reason = f"{kind} {text}"
+        why = self._failed.aborted(text, moved=self.intake.has_moved)
+        if why:
+            return actions + self._leave(SteeringState.FAULT, why, "error")
+        return actions + self._ask() + self._use_tip()
 
     def _ask(self) -> list[Action]:
         """Ask for a tip of the needle at rest, or for the hold that must come first."""
