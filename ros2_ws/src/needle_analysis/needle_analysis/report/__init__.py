@@ -1,1 +1,1 @@
-"""A run, or two, as a page with figures."""
+"""A run, or two, as a page: what it says, and in which words."""

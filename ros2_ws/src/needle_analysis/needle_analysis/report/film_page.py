@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from needle_analysis.report.film import READINGS, Frame
-from needle_analysis.report.film_views import View
+from needle_analysis.figures.film import READINGS, Frame
+from needle_analysis.figures.film_views import View
 
 _FRAMES_PER_SECOND = 8
 _SCRIPT = """

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from needle_analysis.report.figure_style import png_size
+from needle_analysis.figures.figure_style import png_size
 from needle_common.commands.cli import JsonValue
 
 _CSS = """

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from needle_analysis.figures.pair_figures import is_same_needle
 from needle_analysis.report import html_page
 from needle_analysis.report.glossary import Glossary
-from needle_analysis.report.pair_figures import is_same_needle
 from needle_analysis.report.report_page import TILE_NOTE, TILES, verdict_text
 from needle_bags.reading.bag_reader import Run
 from needle_common.commands.cli import JsonValue

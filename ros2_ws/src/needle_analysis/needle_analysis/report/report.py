@@ -10,16 +10,16 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from needle_analysis.report.event_figure import event_figure
-from needle_analysis.report.figure_style import save
-from needle_analysis.report.figures import error_figure, path_figure, states_figure
-from needle_analysis.report.film import film_of
-from needle_analysis.report.film_views import camera_views, plan_views
-from needle_analysis.report.image_figure import frames_shown, images_figure
-from needle_analysis.report.pair_figures import pair_figures
+from needle_analysis.figures.event_figure import event_figure
+from needle_analysis.figures.figure_style import save
+from needle_analysis.figures.film import film_of
+from needle_analysis.figures.film_views import camera_views, plan_views
+from needle_analysis.figures.image_figure import frames_shown, images_figure
+from needle_analysis.figures.insertion_figures import error_figure, path_figure, states_figure
+from needle_analysis.figures.pair_figures import pair_figures
+from needle_analysis.figures.step_figures import innovation_figure, timing_figure
 from needle_analysis.report.pair_page import build_pair_page, pair_values
 from needle_analysis.report.report_page import build_page, verdict_text
-from needle_analysis.report.step_figures import innovation_figure, timing_figure
 from needle_analysis.run.innovation import innovations
 from needle_analysis.run.run_summary import summarize, tip_error
 from needle_analysis.run.stage_timing import StageTiming, stage_timings

@@ -5,13 +5,13 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 
+from needle_analysis.figures.event_figure import level_name
+from needle_analysis.figures.film import Frame
+from needle_analysis.figures.film_views import View
+from needle_analysis.figures.step_figures import timing_rows
 from needle_analysis.report import html_page
-from needle_analysis.report.event_figure import level_name
-from needle_analysis.report.film import Frame
 from needle_analysis.report.film_page import film_html
-from needle_analysis.report.film_views import View
 from needle_analysis.report.glossary import Glossary
-from needle_analysis.report.step_figures import timing_rows
 from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import rerun_of
 from needle_analysis.run.stage_timing import StageTiming

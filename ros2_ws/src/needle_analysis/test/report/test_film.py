@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 import pytest
 
+from needle_analysis.figures.film import MOST_FRAMES, READINGS, film_of
+from needle_analysis.figures.film_views import MOST_BYTES, _small_jpeg, plan_views
 from needle_analysis.report import report
-from needle_analysis.report.film import MOST_FRAMES, READINGS, film_of
-from needle_analysis.report.film_views import MOST_BYTES, _small_jpeg, plan_views
 from needle_bags.reading.bag_images import images_at
 from needle_bags.reading.bag_reader import Run, Series, read_run
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from needle_analysis.figures.event_figure import lanes_of
+from needle_analysis.figures.pair_figures import is_same_needle, pair_figures
 from needle_analysis.report import report
-from needle_analysis.report.event_figure import lanes_of
 from needle_analysis.report.glossary import TERMS, Glossary
-from needle_analysis.report.pair_figures import is_same_needle, pair_figures
 from needle_analysis.report.report_page import verdict_text
 from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.run.run_events import troubles

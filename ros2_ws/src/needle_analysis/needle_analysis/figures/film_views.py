@@ -13,7 +13,7 @@ import numpy.typing as npt
 import yaml
 from matplotlib.figure import Figure
 
-from needle_analysis.report.figure_style import (
+from needle_analysis.figures.figure_style import (
     GOAL_BAND,
     MM,
     STYLE,
@@ -23,7 +23,7 @@ from needle_analysis.report.figure_style import (
     png_size,
     save,
 )
-from needle_analysis.report.film import Frame
+from needle_analysis.figures.film import Frame
 from needle_analysis.run.run_summary import GOAL, finite_tips, target_offset
 from needle_bags.reading.bag_images import SIDES, images_at
 from needle_bags.reading.bag_reader import Run

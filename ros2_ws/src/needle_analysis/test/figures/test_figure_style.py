@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from needle_analysis.report import figure_style as style
+from needle_analysis.figures import figure_style as style
 
 LINES = {
     name: getattr(style, name)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
 
-from needle_analysis.report.figure_style import (
+from needle_analysis.figures.figure_style import (
     ESTIMATE,
     GOAL_BAND,
     GREY,

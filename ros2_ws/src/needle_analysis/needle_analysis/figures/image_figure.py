@@ -9,9 +9,9 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from needle_analysis.report.figure_style import WIDTH, place
-from needle_analysis.report.film import Frame
-from needle_analysis.report.film_views import Image, Projection, projections
+from needle_analysis.figures.figure_style import WIDTH, place
+from needle_analysis.figures.film import Frame
+from needle_analysis.figures.film_views import Image, Projection, projections
 from needle_bags.reading.bag_images import SIDES
 from needle_bags.reading.bag_reader import Run
 

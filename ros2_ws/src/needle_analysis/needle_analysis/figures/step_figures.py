@@ -11,7 +11,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from needle_analysis.report.figure_style import (
+from needle_analysis.figures.figure_style import (
     AXES,
     DOTTED,
     ESTIMATE,

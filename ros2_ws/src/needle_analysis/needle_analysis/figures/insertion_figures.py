@@ -10,7 +10,7 @@ import numpy.typing as npt
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from needle_analysis.report.figure_style import (
+from needle_analysis.figures.figure_style import (
     AXES,
     BROAD,
     DASHED,

@@ -9,7 +9,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from needle_analysis.report.figure_style import (
+from needle_analysis.figures.figure_style import (
     ESTIMATE,
     GOAL_BAND,
     GREY,
