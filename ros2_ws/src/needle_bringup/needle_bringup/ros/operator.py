@@ -30,7 +30,8 @@ from needle_common.ros.base_node import (
     run_node,
 )
 from needle_common.ros.bounded_subscription import listen
-from needle_common.ros.conversions import HOLD, LATCHED, to_stamp, values_of
+from needle_common.ros.conversions import HOLD, LATCHED, values_of
+from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
@@ -50,8 +51,6 @@ Calls       device/stop, device/retract, plane_controller/stop
 """
 
 HOLD_RATE = 50.0
-# What a message promises: without the next one the device ends the hold after it [s].
-HOLD_LIFETIME = 0.1
 DEVICE_STOP = "device/stop"
 # The hold is best effort: a release worth sending is worth sending again.
 RELEASES = 3
@@ -77,8 +76,7 @@ class OperatorNode(WholeNode):
         self._grip = Grip()
         self._press_again = False
         self._told = ""
-        self._last_stamp = 0
-        self._hold = self.create_publisher(Joy, "device/hold", HOLD)
+        self._hold = HoldTopic(self, self.get_name(), HOLD_LIFETIME)
         self._service_clients = {
             name: self.create_client(Trigger, name)
             for name in (DEVICE_STOP, RETRACT, STOP_STEERING)
@@ -90,7 +88,7 @@ class OperatorNode(WholeNode):
 
     def release(self) -> None:
         """Say that nothing is held."""
-        self._send_hold(0.0, pressed=False)
+        self._hold.publish(pressed=False, speed=0.0)
 
     def _make_source(self, open_device: Callable[[str], Device]) -> EventSource | JoySource:
         values = self._settings.values
@@ -111,7 +109,7 @@ class OperatorNode(WholeNode):
         return joy
 
     def _missing(self) -> list[str]:
-        missing = [] if self._hold.get_subscription_count() else ["subscriber of device/hold"]
+        missing = [] if self._hold.is_heard else ["subscriber of device/hold"]
         return [self._grip.trouble, *missing] if self._grip.trouble else missing
 
     def _on_timer(self) -> None:
@@ -119,7 +117,8 @@ class OperatorNode(WholeNode):
         grip = self._grip = self._gate.take(self._source.read(now), now)
         controller = self._service_clients[STOP_STEERING].service_is_ready()
         call = self._retraction.look(grip.held is Held.RETRACT, now, controller=controller)
-        self._send_hold(grip.speed, pressed=grip.held is Held.INSERT or self._retraction.holds)
+        pressed = grip.held is Held.INSERT or self._retraction.holds
+        self._hold.publish(pressed=pressed, speed=grip.speed)
         if grip.stop:
             self._call(DEVICE_STOP)
         if call is not None:
@@ -140,14 +139,6 @@ class OperatorNode(WholeNode):
         self._press_again = values.get("press_again") == self.get_name()
         owner, activity = values.get("hold_owner", ""), values.get("activity", "")
         self._retraction.see_device(owner, activity, time.monotonic())
-
-    def _send_hold(self, speed: float, *, pressed: bool) -> None:
-        # Stamps must increase whatever the system clock does.
-        self._last_stamp = max(time.time_ns(), self._last_stamp + 1)
-        message = Joy(axes=[speed if pressed else 0.0, HOLD_LIFETIME], buttons=[int(pressed)])
-        message.header.stamp = to_stamp(self._last_stamp)
-        message.header.frame_id = self.get_name()
-        self._hold.publish(message)
 
     def _report(self) -> None:
         level, text = self._health()

@@ -13,7 +13,6 @@ from rclpy.client import Client
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
 from needle_bringup.ros.simulated_operator_parameters import SimulatedOperatorParameters
@@ -29,8 +28,9 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_common.process.end_request import EndRequest
 from needle_common.process.reach import DISCOVERY, is_open
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp, values_of
+from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
 from needle_common.ros.discovery import PARAMETERS_OF, RECORDER, full_name, publishers_of
+from needle_common.ros.hold_topic import HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
@@ -79,11 +79,10 @@ class SimulatedOperatorNode(WholeNode):
             )
             for call in PREPARATION
         }
-        self._last_stamp = 0
         self._recorded_nodes: set[str] = set()
         if values.wait_for_recorder:
             self.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
-        self._hold = self.create_publisher(Joy, "device/hold", HOLD)
+        self._hold = HoldTopic(self, self.get_name())
         self._controller_status = self.create_subscription(
             DiagnosticStatus, "needle/controller_status", self._on_controller_status, LATCHED
         )
@@ -194,7 +193,7 @@ class SimulatedOperatorNode(WholeNode):
         for subscription in (self._controller_status, self._device_status):
             if not subscription.get_publisher_count():
                 missing.append(f"publisher of {subscription.topic_name}")
-        if not self._hold.get_subscription_count():
+        if not self._hold.is_heard:
             missing.append("subscriber of device/hold")
         return missing or self._unrecorded_nodes()
 
@@ -208,14 +207,7 @@ class SimulatedOperatorNode(WholeNode):
         return self._service_clients[call.service].call_async(request)
 
     def _send_hold(self, *, pressed: bool) -> None:
-        # Stamps must increase whatever the system clock does.
-        self._last_stamp = max(time.time_ns(), self._last_stamp + 1)
-        message = Joy()
-        message.header.stamp = to_stamp(self._last_stamp)
-        message.header.frame_id = self.get_name()
-        message.axes = [self._settings.values.speed_scale if pressed else 0.0]
-        message.buttons = [int(pressed)]
-        self._hold.publish(message)
+        self._hold.publish(pressed=pressed, speed=self._settings.values.speed_scale)
 
     def _report(self) -> None:
         if self._sequence.steering:

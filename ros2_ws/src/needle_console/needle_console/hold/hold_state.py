@@ -5,6 +5,9 @@ from __future__ import annotations
 import dataclasses
 import enum
 
+OWNER = "console"
+"""Name by which the device knows the console's hold."""
+
 
 class Mode(enum.Enum):
     """What a press is for."""

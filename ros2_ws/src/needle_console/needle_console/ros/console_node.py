@@ -16,18 +16,18 @@ from needle_common.errors import UserError
 from needle_common.files.installed import find_shared
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_common.ros.conversions import LATCHED, to_quaternion
+from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_console.access.access import Access
 from needle_console.hold.hold_server import HoldServer
-from needle_console.hold.hold_state import HoldState
+from needle_console.hold.hold_state import OWNER, HoldState
 from needle_console.hold.retraction import Retraction
 from needle_console.page.console_page import HoldLink
 from needle_console.page.desk import Desk
 from needle_console.page.web_server import WebServer
 from needle_console.ros.console_parameters import ConsoleParameters
-from needle_console.ros.hold_topic import OWNER, HoldTopic
 from needle_console.ros.rig_services import OF_BUTTON, STOP, RigServices
 from needle_console.ros.rig_topics import RigTopics
 from needle_console.view.advice import STEERING, Button
@@ -66,7 +66,7 @@ class ConsoleNode(WholeNode):
         self._retraction = Retraction()
         self._targets_wanted: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._diagnostics = DiagnosticsPublisher(self)
-        self._hold_topic = HoldTopic(self)
+        self._hold_topic = HoldTopic(self, OWNER, HOLD_LIFETIME)
         self._planes = self.create_publisher(PoseStamped, "target_plane", LATCHED)
         self._points = self.create_publisher(PointStamped, "target_point", LATCHED)
         self._calls = RigServices(self, self._picture.see_answer)

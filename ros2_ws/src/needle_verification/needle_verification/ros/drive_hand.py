@@ -9,7 +9,7 @@ from collections.abc import Callable
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from sensor_msgs.msg import JointState, Joy
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
@@ -17,7 +17,6 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from needle_common.errors import UserError
 from needle_common.ros.base_node import STEADY_CLOCK
 from needle_common.ros.conversions import (
-    HOLD,
     JOINT_STATES,
     LATCHED,
     NANOSECONDS,
@@ -26,6 +25,7 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
+from needle_common.ros.hold_topic import HoldTopic
 from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 JOINTS = ("insertion_joint", "rotation_joint")
@@ -64,14 +64,13 @@ class DriveHand(ListeningNode):
         self.pressed = False
         # What commands are stamped with.
         self.now_ns: Callable[[], int] = lambda: self.get_clock().now().nanoseconds
-        self._last_hold = 0
         self._last_stamp = 0
         self._commands = (
             self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
             if steers
             else None
         )
-        self._holds = self.create_publisher(Joy, "device/hold", HOLD)
+        self._hold = HoldTopic(self, self.get_name())
         listen = self.create_subscription
         self._joint_states = listen(JointState, "joint_states", self._on_joints, JOINT_STATES)
         listen(JointState, "sim/drive_positions", self._on_positions, JOINT_STATES)
@@ -162,11 +161,7 @@ class DriveHand(ListeningNode):
 
     def send_hold(self) -> None:
         """Say what the hold is."""
-        self._last_hold = max(time.time_ns(), self._last_hold + 1)
-        message = Joy(axes=[float(self.pressed)], buttons=[int(self.pressed)])
-        message.header.frame_id = self.get_name()
-        message.header.stamp = to_stamp(self._last_hold)
-        self._holds.publish(message)
+        self._hold.publish(pressed=self.pressed, speed=1.0)
 
     # ---- hearing ------------------------------------------------------------------------------
 

@@ -11,9 +11,9 @@ import sys
 
 import rclpy
 
+from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
 from needle_common.ros.whole_node import WholeNode
-from needle_console.hold.hold_state import HoldState
-from needle_console.ros.hold_topic import HoldTopic
+from needle_console.hold.hold_state import OWNER, HoldState
 from needle_verification.trials.button_page import serving_button
 
 
@@ -21,7 +21,7 @@ def main() -> int:
     """Serve until the input ends; returns the exit code."""
     rclpy.init(args=[])
     node = WholeNode("console_stand_in")
-    topic = HoldTopic(node)
+    topic = HoldTopic(node, OWNER, HOLD_LIFETIME)
 
     def publish(state: HoldState) -> None:
         topic.publish(pressed=state.pressed, speed=state.speed)
