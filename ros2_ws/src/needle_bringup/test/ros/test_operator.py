@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 
 import pytest
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import Joy
 from std_srvs.srv import Trigger
 
 from needle_bringup.operator.controls import Controls
 from needle_bringup.ros.operator_parameters import OperatorParameters
 from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_nanoseconds
+from needle_common.ros.conversions import RELIABLE, to_nanoseconds
+from operator_scene import OperatorScene, RigNode
 
-LIMIT = 20.0
 INSERT, RETRACT, STOP = 0, 1, 2
 SERVICES = ("device/stop", "device/retract", "plane_controller/stop")
 PARAMETERS = {
@@ -37,25 +31,21 @@ PARAMETERS = {
 }
 
 
-class PlayedRig(Node):
+class PlayedRig(RigNode):
     """Sends a joystick's state, answers like driver and controller, keeps what was held."""
 
     def __init__(self, context: Context) -> None:
-        super().__init__("played_rig", context=context)
-        self.asked: list[str] = []
-        self.holds: list[Joy] = []
+        super().__init__(context)
         self.down: set[int] = set()
         self.silent = False
         for name in SERVICES:
             self.create_service(Trigger, name, self._answer(name))
-        self.create_subscription(Joy, "device/hold", self.holds.append, HOLD)
-        self._device = self.create_publisher(DiagnosticStatus, "device/status", LATCHED)
         self._joy = self.create_publisher(Joy, "joy", RELIABLE)
         self.create_timer(0.02, self._send)
 
     def tell(self, **values: str) -> None:
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-        self._device.publish(DiagnosticStatus(values=pairs))
+        self.device.publish(DiagnosticStatus(values=pairs))
 
     def _send(self) -> None:
         if not self.silent:
@@ -71,28 +61,12 @@ class PlayedRig(Node):
         return answer
 
 
-class Scene:
-    """A played rig and the operator's process before it."""
+class Scene(OperatorScene[PlayedRig]):
+    """The operator before a played rig."""
 
     def __init__(self, domain: int) -> None:
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.rig = PlayedRig(self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.rig)
         words = [word for name, value in PARAMETERS.items() for word in ("-p", f"{name}:={value}")]
-        self.operator = subprocess.Popen(
-            [find_executable("needle_bringup", "operator"), "--ros-args", *words],
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def until(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < deadline, (self.rig.asked, self.rig.holds[-3:])
-            self.executor.spin_once(timeout_sec=0.02)
+        super().__init__(domain, PlayedRig, "operator", "--ros-args", *words)
 
     def is_held(self) -> bool:
         return bool(self.rig.holds[-1].buttons[0])
@@ -102,22 +76,11 @@ class Scene:
         wanted = len(self.rig.holds) + count
         self.until(lambda: len(self.rig.holds) >= wanted)
 
-    def close(self) -> None:
-        self.operator.kill()
-        self.operator.wait()
-        assert self.operator.stderr is not None
-        self.operator.stderr.close()
-        self.executor.shutdown()
-        self.rig.destroy_node()
-        self.context.try_shutdown()
-
 
 @pytest.fixture
 def scene() -> Iterator[Scene]:
-    with own_domain() as domain:
-        one = Scene(domain)
+    with own_domain() as domain, closing(Scene(domain)) as one:
         yield one
-        one.close()
 
 
 def test_a_joystick_inserts_retracts_and_stops_until_it_falls_silent(scene: Scene) -> None:

@@ -1,35 +1,27 @@
 """The stand-in as a process, against a rig that is played by the test."""
 
-import os
 import signal
-import subprocess
-import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
 
 import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from sensor_msgs.msg import Joy
 from std_srvs.srv import SetBool, Trigger
 
-from needle_common.files.installed import find_executable
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import HOLD, LATCHED, to_nanoseconds
+from needle_common.ros.conversions import LATCHED, to_nanoseconds
+from operator_scene import OperatorScene, RigNode
 
-LIMIT = 20.0
 
-
-class PlayedRig(Node):
+class PlayedRig(RigNode):
     """Answers like sim_rig and plane_controller; remembers what was asked and held."""
 
     def __init__(self, context: Context, *, simulated: str = "true") -> None:
-        super().__init__("played_rig", context=context)
+        super().__init__(context)
         self.simulated = simulated
-        self.asked: list[str] = []
-        self.holds: list[Joy] = []
         self.refusal = ""
         self.starts = 0
         self.mute: set[str] = set()
@@ -37,8 +29,6 @@ class PlayedRig(Node):
             self._serve(SetBool, name)
         for name in ("device/home", "plane_controller/start"):
             self._serve(Trigger, name)
-        self.create_subscription(Joy, "device/hold", self.holds.append, HOLD)
-        self._device = self.create_publisher(DiagnosticStatus, "device/status", LATCHED)
         self._controller = self.create_publisher(
             DiagnosticStatus, "needle/controller_status", LATCHED
         )
@@ -48,7 +38,7 @@ class PlayedRig(Node):
     def tell_device(self, **values: str) -> None:
         message = _status({"simulated": self.simulated, **values})
         message.hardware_id = self.get_name()
-        self._device.publish(message)
+        self.device.publish(message)
 
     def tell_controller(self, state: str, step: int, reason: str = "") -> None:
         values = {"state": state, "step": str(step), "reason": reason}
@@ -87,49 +77,23 @@ def _status(values: dict[str, str]) -> DiagnosticStatus:
     return DiagnosticStatus(values=[KeyValue(key=k, value=v) for k, v in values.items()])
 
 
-class Scene:
-    """A played rig and the stand-in's process before it."""
+class Scene(OperatorScene[PlayedRig]):
+    """The stand-in before a played rig."""
 
-    def __init__(self, domain: int, *, simulated: str = "true") -> None:
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.rig = PlayedRig(self.context, simulated=simulated)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.rig)
-        self.operator = subprocess.Popen(
-            [find_executable("needle_bringup", "simulated_operator")],
-            env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-
-    def until(self, condition: Callable[[], object]) -> None:
-        deadline = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < deadline, self.rig.asked
-            self.executor.spin_once(timeout_sec=0.02)
+    def __init__(self, domain: int, simulated: str = "true") -> None:
+        super().__init__(domain, partial(PlayedRig, simulated=simulated), "simulated_operator")
 
     def end(self) -> tuple[int, str]:
         self.until(lambda: self.operator.poll() is not None)
         assert self.operator.stderr is not None
         return self.operator.returncode, self.operator.stderr.read()
 
-    def close(self) -> None:
-        self.operator.kill()
-        self.operator.wait()
-        assert self.operator.stderr is not None
-        self.operator.stderr.close()
-        self.executor.shutdown()
-        self.rig.destroy_node()
-        self.context.try_shutdown()
-
 
 @pytest.fixture
 def scene(request: pytest.FixtureRequest) -> Iterator[Scene]:
-    with own_domain() as domain:
-        one = Scene(domain, simulated=getattr(request, "param", "true"))
+    simulated = getattr(request, "param", "true")
+    with own_domain() as domain, closing(Scene(domain, simulated)) as one:
         yield one
-        one.close()
 
 
 STARTED = [
