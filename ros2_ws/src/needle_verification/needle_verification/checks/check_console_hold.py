@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from needle_verification.checking import Check, Finding, Workbench
-from needle_verification.descendants import ran
+from needle_verification.checking import Check, Finding, Workbench, trial_outcomes
 
+TRIALS = "needle_verification.ros.console.console_trials"
 MOMENTS, HOSTILE = 50, 10
 LOSSES = {
     "closed": "page closed",
@@ -41,24 +39,12 @@ _TICK_MS = 20.0
 def console_hold(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
     """Lose page, focus, browser, connection and server while a page's button is held at 5 mm/s."""
     for loss in LOSSES:
-        yield judge(loss, trials(moments, loss))
+        yield judge(loss, trial_outcomes(TRIALS, moments, loss))
 
 
 def console_hostile(_: Workbench, count: int = HOSTILE) -> Iterator[Finding]:
     """Move nothing by hostile pages, and end the hold of the right one among them."""
-    yield from judge_hostile(trials(count, "hostile"))
-
-
-def trials(count: int, *losses: str) -> list[dict[str, Any]]:
-    """Run trials in a process of their own; return what each came to.
-
-    Raises
-    ------
-    UserError
-        If they do not end well.
-    """
-    words = ["-m", "needle_verification.ros.console.console_trials", str(count), *losses]
-    return [json.loads(line) for line in ran([sys.executable, *words]).stdout.splitlines()]
+    yield from judge_hostile(trial_outcomes(TRIALS, count, "hostile"))
 
 
 def judge(loss: str, outcomes: Sequence[dict[str, Any]]) -> Finding:

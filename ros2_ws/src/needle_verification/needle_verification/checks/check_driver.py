@@ -195,7 +195,7 @@ def two_rigs(_: Workbench, starts: int = MOMENTS) -> Iterator[Finding]:
 def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
     """Hold up neither cycle nor emergency stop by anything that others send."""
     for outcome in _trials("nuisances", seconds, *NUISANCES):
-        kind, longest = outcome["nuisance"], float(outcome["longest_cycle_s"])
+        kind, longest = outcome["kind"], float(outcome["longest_cycle_s"])
         heard = float(outcome["estop_heard_s"])
         # What copying the longest message takes is what is left; no more than this one is seen.
         bound = LONGEST_COPY if kind == "points" else DRIVES_WAIT

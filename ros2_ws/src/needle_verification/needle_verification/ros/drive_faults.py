@@ -6,7 +6,7 @@ import contextlib
 import random
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import NANOSECONDS
 from needle_verification.ros.drive_hand import INSERTION_COUNT, DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
+from needle_verification.trials.trial_runner import Outcomes, Trial
 
 AXES = ("insertion", "rotation")
 FAULTS = ("cut_bus", "unplug", "stall", "reboot", "emcy", "hang", "kill_driver")
@@ -27,14 +28,8 @@ _STILL = 0.3
 
 
 def fault_trials(
-    folder: Path,
-    domain: int,
-    kinds: Sequence[str],
-    count: int,
-    seed: int,
-    *,
-    watchdog: float | None = None,
-) -> Iterator[dict[str, Any]]:
+    folder: Path, domain: int, trials: Iterable[Trial], watchdog: float | None = None
+) -> Outcomes:
     """Yield what came of each trial, in real time.
 
     Parameters
@@ -43,12 +38,8 @@ def fault_trials(
         Takes the logs.
     domain : int
         ROS_DOMAIN_ID.
-    kinds : sequence of str
-        Which of `FAULTS`.
-    count : int
-        Trials of each.
-    seed : int
-        Of moments and motions.
+    trials : iterable of Trial
+        Their kinds are of `FAULTS`.
     watchdog : float, optional
         How long driver and drives wait for each other, in place of the driver's defaults [s].
     """
@@ -62,11 +53,9 @@ def fault_trials(
     ):
         hand.until(hand.ready, "the driver", 60.0)
         _get_ready(hand)
-        for kind in kinds:
-            rng = random.Random(f"{seed} {kind}")
-            for number in range(count):
-                yield {"fault": kind, "number": number, **_fault(processes, hand, kind, rng)}
-                processes.check()
+        for trial in trials:
+            yield trial.outcome(_fault(processes, hand, trial.kind, trial.rng))
+            processes.check()
 
 
 def _start_over(hand: DriveHand) -> None:

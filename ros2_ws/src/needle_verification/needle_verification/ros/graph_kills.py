@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from needle_common.ros.conversions import LATCHED, values_of
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
+from needle_verification.trials.trial_runner import Outcomes, Trial
 
 KILLED = ("plane_controller", "stereo_tracker", "simulated_operator")
 _READY = 120.0
@@ -22,9 +23,7 @@ _RESUMED = 60.0
 _DEEP_ENOUGH = 0.002
 
 
-def kill_trials(
-    folder: Path, domain: int, kinds: Sequence[str], count: int, seed: int
-) -> Iterator[dict[str, Any]]:
+def kill_trials(folder: Path, domain: int, trials: Iterable[Trial]) -> Outcomes:
     """Yield what came of each trial, in real time, each with a graph of its own.
 
     Parameters
@@ -33,24 +32,16 @@ def kill_trials(
         Takes the logs.
     domain : int
         ROS_DOMAIN_ID.
-    kinds : sequence of str
-        Which of `KILLED`.
-    count : int
-        Trials of each.
-    seed : int
-        Of moments and simulations.
+    trials : iterable of Trial
+        Their kinds are the nodes of `KILLED`.
     """
-    for kind in kinds:
-        rng = random.Random(f"{seed} {kind}")
-        for number in range(count):
-            place = folder / f"{kind}_{number}"
-            place.mkdir()
-            parameters = graph_in_real_time(rng.randrange(1000))
-            with (
-                closing(DriveHand(steers=False)) as hand,
-                closing(TrialProcesses(place, domain, parameters)) as graph,
-            ):
-                yield {"fault": kind, "number": number, **_kill(graph, hand, kind, rng)}
+    for trial in trials:
+        parameters = graph_in_real_time(trial.rng.randrange(1000))
+        with (
+            closing(DriveHand(steers=False)) as hand,
+            closing(TrialProcesses(trial.make_folder(folder), domain, parameters)) as graph,
+        ):
+            yield trial.outcome(_kill(graph, hand, trial.kind, trial.rng))
 
 
 def _kill(graph: TrialProcesses, hand: DriveHand, kind: str, rng: random.Random) -> dict[str, Any]:

@@ -1,11 +1,13 @@
-"""Node of a trial: it listens while the trial waits, and calls services."""
+"""Node of a trial: it listens while the trial waits, and calls services; and its ROS."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from needle_common.errors import UserError
@@ -13,6 +15,16 @@ from needle_common.ros.base_node import executor_of
 from needle_common.ros.whole_node import WholeNode
 
 PATIENCE = 20.0
+
+
+@contextmanager
+def ros(domain: int) -> Iterator[None]:
+    """Start ROS in this process and in this domain, and shut it down in the end."""
+    rclpy.init(args=[], domain_id=domain)
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()
 
 
 class ListeningNode(WholeNode):

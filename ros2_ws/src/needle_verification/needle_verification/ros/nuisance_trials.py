@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from needle_common.ros.conversions import RELIABLE, values_of
 from needle_device_driver.ros.parameters import LONGEST_WATCHDOG
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
+from needle_verification.trials.trial_runner import Outcomes, Trial
 
 _STEP = 0.0019
 _SPEED = 0.0003
@@ -25,8 +26,8 @@ _BEFORE = 0.5
 
 
 def nuisance_trials(
-    folder: Path, domain: int, kinds: Sequence[str], duration: float
-) -> Iterator[dict[str, Any]]:
+    folder: Path, domain: int, trials: Iterable[Trial], duration: float
+) -> Outcomes:
     """Yield what came of each kind of nuisance.
 
     Parameters
@@ -35,8 +36,8 @@ def nuisance_trials(
         Takes the logs.
     domain : int
         ROS_DOMAIN_ID.
-    kinds : sequence of str
-        Which of `NUISANCE_KINDS`.
+    trials : iterable of Trial
+        Their kinds are of `NUISANCE_KINDS`.
     duration : float
         How long each goes on [s], within one step.
     """
@@ -44,13 +45,13 @@ def nuisance_trials(
     patient = {"watchdog": LONGEST_WATCHDOG, "reply_age_limit": LONGEST_WATCHDOG}
     parameters = drives_and_driver({}, patient)
     with closing(DriveHand()) as hand, closing(TrialProcesses(folder, domain, parameters)) as nodes:
-        trial = _Trial(hand, nodes, domain)
-        for kind in kinds:
-            yield {"nuisance": kind, **trial.run(kind, duration)}
+        step = _DisturbedStep(hand, nodes, domain)
+        for trial in trials:
+            yield trial.outcome(step.run(trial.kind, duration))
             nodes.check()
 
 
-class _Trial:
+class _DisturbedStep:
     """A hand that steps, and what the driver says of its cycles meanwhile."""
 
     def __init__(self, hand: DriveHand, processes: TrialProcesses, domain: int) -> None:

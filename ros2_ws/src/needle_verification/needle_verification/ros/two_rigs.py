@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Iterator
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from needle_verification.trials.trial_processes import (
     drives_and_driver,
     without_recorder,
 )
+from needle_verification.trials.trial_runner import Outcomes, Trial
 
 DEVICES = ("device_driver", "sim_rig")
 STARTED = (*DEVICES, "plane_controller", "simulated_operator")
@@ -27,7 +28,7 @@ _PATIENCE = 60.0
 _AFTERWARDS = 0.5
 
 
-def two_rigs_trials(folder: Path, domain: int, count: int, seed: int) -> Iterator[dict[str, Any]]:
+def two_rigs_trials(folder: Path, domain: int, trials: Iterable[Trial]) -> Outcomes:
     """Yield what came of each trial.
 
     The drives are emulated and the driver is not in simulated time: it takes them for real.
@@ -38,19 +39,14 @@ def two_rigs_trials(folder: Path, domain: int, count: int, seed: int) -> Iterato
         Takes the logs.
     domain : int
         ROS_DOMAIN_ID.
-    count : int
-        How many.
-    seed : int
-        Of order and delays.
+    trials : iterable of Trial
+        Each of its own order and delays.
     """
-    rng = random.Random(f"{seed} two rigs")
-    for number in range(count):
-        place = folder / f"two_rigs_{number}"
-        place.mkdir()
-        yield {"number": number, **_trial(place, domain, rng)}
+    for trial in trials:
+        yield trial.outcome(_start(trial.make_folder(folder), domain, trial.rng))
 
 
-def _trial(place: Path, domain: int, rng: random.Random) -> dict[str, Any]:
+def _start(place: Path, domain: int, rng: random.Random) -> dict[str, Any]:
     order = list(STARTED)
     rng.shuffle(order)
     # Some at once, some when the others have long been there.

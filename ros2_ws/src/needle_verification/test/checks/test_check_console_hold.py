@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from needle_verification.checking import trial_outcomes
 from needle_verification.checks import check_console_hold
 from needle_verification.trials.chromium import chromium
 
@@ -18,9 +19,9 @@ pytest.importorskip("websockets", reason="the console's lock is not installed: s
 def test_the_needle_stops_whatever_is_lost_and_a_fresh_press_moves_it_again() -> None:
     # Each trial begins with a press that moves the needle, after the loss of the one before.
     kinds = (*check_console_hold.LOSSES, "stalled")
-    outcomes = check_console_hold.trials(1, *kinds)
-    assert tuple(outcome["loss"] for outcome in outcomes) == kinds
-    findings = [check_console_hold.judge(outcome["loss"], [outcome]) for outcome in outcomes]
+    outcomes = trial_outcomes(check_console_hold.TRIALS, 1, *kinds)
+    assert tuple(outcome["kind"] for outcome in outcomes) == kinds
+    findings = [check_console_hold.judge(outcome["kind"], [outcome]) for outcome in outcomes]
     assert [finding for finding in findings if not finding.passed] == []
 
 

@@ -38,9 +38,9 @@ def test_faults_are_named_and_need_a_command_to_go_on() -> None:
     # Distances are not judged here: a busy machine gets more time.
     kinds = ("cut_bus", "emcy", "kill_driver")
     outcomes = check_driver._trials("faults", 1, *kinds, "--watchdog", 0.5)
-    assert tuple(found["fault"] for found in outcomes) == kinds
+    assert tuple(found["kind"] for found in outcomes) == kinds
     for found in outcomes:
-        findings = list(check_driver.judge_recovery(found["fault"], [found]))
+        findings = list(check_driver.judge_recovery(found["kind"], [found]))
         assert [finding for finding in findings if not finding.passed] == []
 
 

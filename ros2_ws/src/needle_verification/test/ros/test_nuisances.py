@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import rclpy
-
 from needle_common.process.ros_domain import own_domain
+from needle_verification.ros.listening_node import ros
+from needle_verification.ros.nuisance import NUISANCE_KINDS
 from needle_verification.ros.nuisance_trials import nuisance_trials
+from needle_verification.trials.trial_runner import trials_of
 
 # Before a bound, a request of 20,000 names took most of a second, on an idle machine.
 GENEROUS = 0.7
 
 
 def test_long_requests_and_names_hold_up_neither_cycle_nor_emergency_stop(tmp_path: Path) -> None:
-    with own_domain() as domain:
-        rclpy.init(args=[], domain_id=domain)
-        try:
-            seen = list(nuisance_trials(tmp_path, domain, ("parameters", "name"), 1.0))
-        finally:
-            rclpy.try_shutdown()
-    assert [outcome["nuisance"] for outcome in seen] == ["parameters", "name"]
+    kinds = ["parameters", "name"]
+    trials = trials_of(NUISANCE_KINDS, kinds, 1, seed=1)
+    with own_domain() as domain, ros(domain):
+        seen = list(nuisance_trials(tmp_path, domain, trials, 1.0))
+    assert [outcome["kind"] for outcome in seen] == kinds
     for outcome in seen:
         assert outcome["longest_cycle_s"] < GENEROUS
         assert outcome["estop_heard_s"] < GENEROUS

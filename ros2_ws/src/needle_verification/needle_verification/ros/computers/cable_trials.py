@@ -12,57 +12,54 @@ that is so far ahead of the driver's.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import os
 import random
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG
-from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
 from needle_common.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
-from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
 from needle_common.ros.partner_clocks import PART
-from needle_verification.ros.holds.hold_trials import hold_anew
+from needle_verification.ros.holds.hands import (
+    LATEST,
+    OPERATOR,
+    READY,
+    RECENT,
+    PedalFoot,
+    fast_insertion,
+    hold_anew,
+    until_deep,
+)
 from needle_verification.ros.holds.hold_witness import HoldWitness
-from needle_verification.trials.light import Light
-from needle_verification.trials.namespaces import Cable, Computer, enter_network
-from needle_verification.trials.piped_pedal import PipedPedal
+from needle_verification.ros.listening_node import ros
+from needle_verification.trials.computers.light import Light
+from needle_verification.trials.computers.namespaces import Cable, Computer, enter_network
 from needle_verification.trials.trial_processes import (
     Parameters,
     TrialProcesses,
     drives_and_driver,
-    without_recorder,
 )
+from needle_verification.trials.trial_runner import Outcomes, Trial, run_trials, trials_of
 
+KINDS = ("cut",)
 DELAY, LOSS = 0.005, 0.01
 SHORTEST, LONGEST = 0.1, 5.0
 _DRIVER = "/device_driver"
-_OPERATOR, _CAMERAS = "operator", "stereo_tracker"
-_PIPED = "needle_verification.ros.holds.piped_operator"
+_CAMERAS = "stereo_tracker"
 _TIP_CAMERA = "needle_verification.ros.computers.tip_camera"
-_KEY = 48
-_SPEED = 0.005  # [m/s], the fastest there is
-_DEPTH_MM = 190.0
-_DEEP = 0.17  # from here on the next trial has a rig of its own [m]
-_READY = 60.0
-# The latest moment of a cut after the needle moves, and how long what comes back is watched [s].
-_LATEST, _BACK = 0.4, 2.0
-# A needle that moved so shortly before moves now [s].
-_RECENT = 0.05
+# How long what comes back is watched [s].
+_BACK = 2.0
 # After so long without motion the next one is another [s].
 _REST = 0.1
 
@@ -121,23 +118,26 @@ class _Rig:
 
     witness: _DriveWitness
     graph: TrialProcesses
-    pedal: PipedPedal
-    cable: Cable
+    foot: PedalFoot
 
 
 def cable_trials(
-    folder: Path, count: int, seed: int, longest: float = LONGEST, ahead: float = 0.0
-) -> Iterator[dict[str, Any]]:
+    folder: Path,
+    domain: int,
+    trials: Iterable[Trial],
+    longest: float = LONGEST,
+    ahead: float = 0.0,
+) -> Outcomes:
     """Yield what came of each cut; this process is on the computer of the drives from now on.
 
     Parameters
     ----------
     folder : Path
         Takes the logs.
-    count : int
-        How many cuts.
-    seed : int
-        Of moments, lengths and losses.
+    domain : int
+        ROS_DOMAIN_ID.
+    trials : iterable of Trial
+        Each a cut.
     longest : float
         The longest cut [s].
     ahead : float
@@ -148,113 +148,83 @@ def cable_trials(
     UserError
         If no second computer can be made here.
     """
-    rng = random.Random(seed)
-    with _computers(seed) as computers:
-        numbers = iter(range(count))
-        number = next(numbers, None)
-        while number is not None:
-            place = folder / f"from_{number}"
-            place.mkdir()
-            with ExitStack() as held:
-                rig = _rig(held, place, computers, ahead)
-                hold_anew(rig.pedal, rig.witness)
-                while number is not None and rig.witness.insertion < _DEEP:
-                    yield {"number": number, **_cut(rig, rng, longest)}
+    left = deque(trials)
+    with _computers(left[0].rng.randrange(1000)) as (persons, cable), ros(domain):
+        while left:
+            with _rig(left[0].make_folder(folder), domain, persons, ahead) as rig:
+                hold_anew(rig.foot, rig.witness)
+                for trial in until_deep(left, rig.witness):
+                    yield trial.outcome(_cut(rig, cable, trial.rng, longest))
                     rig.graph.check()
-                    number = next(numbers, None)
-
-
-@dataclasses.dataclass
-class _Computers:
-    """The person's computer, and the cable that leads to the one where this process is."""
-
-    domain: int
-    persons: Computer
-    cable: Cable
 
 
 @contextmanager
-def _computers(seed: int) -> Iterator[_Computers]:
-    """Make two computers and a bad cable; this process is on that of the drives from now on."""
-    with ExitStack() as held:
-        domain = held.enter_context(own_domain())
-        persons, drives = (held.enter_context(closing(Computer())) for _ in range(2))
+def _computers(seed: int) -> Iterator[tuple[Computer, Cable]]:
+    """Make the person's computer, and a bad cable to that of the drives, where this process is."""
+    with closing(Computer()) as persons, closing(Computer()) as drives:
         cable = Cable((persons, drives), delay=DELAY, loss=LOSS, seed=seed)
-        held.enter_context(closing(cable))
-        enter_network(drives.pid)
-        # What a person sets on both computers; the rest follows from it.
-        os.environ[DISCOVERY_RANGE] = "SUBNET"
-        os.environ.pop(PROFILES, None)
-        keep_to_this_machine()
-        rclpy.init(args=[], domain_id=domain)
-        held.callback(rclpy.try_shutdown)
-        yield _Computers(domain, persons, cable)
+        with closing(cable):
+            enter_network(drives.pid)
+            # What a person sets on both computers; the rest follows from it.
+            os.environ[DISCOVERY_RANGE] = "SUBNET"
+            os.environ.pop(PROFILES, None)
+            keep_to_this_machine()
+            yield persons, cable
 
 
-def _rig(held: ExitStack, folder: Path, computers: _Computers, ahead: float) -> _Rig:
+@contextmanager
+def _rig(folder: Path, domain: int, persons: Computer, ahead: float) -> Iterator[_Rig]:
     """Start the nodes where they belong, and make them ready."""
-    light_file, pedal_file = folder / "light", folder / "pedal"
-    witness = held.enter_context(
-        closing(_DriveWitness(held.enter_context(closing(Light(light_file)))))
-    )
-    pedal = PipedPedal(pedal_file, _KEY)
-    held.callback(pedal.unplug)
-    before = dict.fromkeys((_OPERATOR, _CAMERAS, "plane_controller"), computers.persons.inside)
-    graph = held.enter_context(
-        closing(TrialProcesses(folder, computers.domain, _parameters(), before=before))
-    )
-    seen = {"light": str(light_file), "clock_ahead": ahead}
-    graph.start_module(_CAMERAS, _TIP_CAMERA, seen)
-    values = {"source": "pedal", "device": str(pedal_file), "key": _KEY}
-    graph.start_module(_OPERATOR, _PIPED, values)
-    witness.prepare(_READY)
-    witness.clock_of(_DRIVER)
-    return _Rig(witness, graph, pedal, computers.cable)
+    light_file = folder / "light"
+    before = dict.fromkeys((OPERATOR, _CAMERAS, "plane_controller"), persons.inside)
+    with (
+        closing(Light(light_file)) as light,
+        closing(_DriveWitness(light)) as witness,
+        closing(TrialProcesses(folder, domain, _parameters(), before=before)) as graph,
+        closing(PedalFoot(folder, graph, witness)) as foot,
+    ):
+        seen = {"light": str(light_file), "clock_ahead": ahead}
+        graph.start_module(_CAMERAS, _TIP_CAMERA, seen)
+        witness.prepare(READY)
+        witness.clock_of(_DRIVER)
+        yield _Rig(witness, graph, foot)
 
 
-def _cut(rig: _Rig, rng: random.Random, longest: float) -> dict[str, Any]:
+def _cut(rig: _Rig, cable: Cable, rng: random.Random, longest: float) -> dict[str, Any]:
     """Cut the cable at a random moment, mend it with the hold still pressed, watch, press anew."""
     witness = rig.witness
-    witness.pause(rng.uniform(0.0, _LATEST))
+    witness.pause(rng.uniform(0.0, LATEST))
     length = rng.uniform(SHORTEST, longest)
-    if witness.way(time.time() - _RECENT, math.inf) == 0.0:
+    if witness.way(time.time() - RECENT, math.inf) == 0.0:
         # A busy machine lets a path run out, or a hold.
-        hold_anew(rig.pedal, witness)
+        hold_anew(rig.foot, witness)
     ahead, within = witness.clock_of(_DRIVER)
     del witness.holders[:]
     cut = time.time()
-    rig.cable.cut()
+    cable.cut()
     witness.pause(length)
-    rig.cable.mend()
+    cable.mend()
     witness.pause(_BACK)
     end, resumed = witness.end_of_motion(cut)
     outcome = {
         "clock_ahead_s": ahead,
         "clock_within_s": within,
         "length_s": length,
-        "moving": witness.way(cut - _RECENT, cut) > 0.0,
+        "moving": witness.way(cut - RECENT, cut) > 0.0,
         # A hold that went on counting was not lost.
-        "lost": set(witness.holders) != {_OPERATOR},
+        "lost": set(witness.holders) != {OPERATOR},
         "last_motion_ms": (end - cut) * 1e3,
         "distance_mm": witness.way(cut, end) * 1e3,
         "resumed_mm": resumed * 1e3,
     }
     begin = time.monotonic()
-    hold_anew(rig.pedal, witness)
+    hold_anew(rig.foot, witness)
     return {**outcome, "again_s": time.monotonic() - begin}
 
 
 def _parameters() -> Parameters:
-    # A needle that rests after each step would be at rest at many cuts.
-    options = SimulateOptions(
-        level="tip", controller="paper", insertion="continuous", depth_mm=_DEPTH_MM
-    )
-    controller = without_recorder(options)["plane_controller"]
-    controller |= {
-        "use_sim_time": False,
-        "nominal_speed": _SPEED,
-        "tip_covariance": "configured",
-    }
+    controller = fast_insertion()["plane_controller"]
+    controller |= {"use_sim_time": False, "tip_covariance": "configured"}
     # The drives' bus is not what is tried: a machine that is busy otherwise must not cut it.
     patient = {"watchdog": REAL_TIME_WATCHDOG, "reply_age_limit": REAL_TIME_WATCHDOG}
     return {**drives_and_driver({}, patient), "plane_controller": controller}
@@ -263,22 +233,18 @@ def _parameters() -> Parameters:
 def main() -> int:
     """Run trials; returns the exit code."""
     parser = CommandParser("cable_trials", __doc__ or "", "")
-    parser.add_argument("count", type=int, help="how many cuts")
-    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--longest", type=float, default=LONGEST, help="the longest cut [s]")
-
     parser.add_argument("--clock-ahead", type=float, default=0.0, help="the cameras' clock [s]")
-
-    def run() -> int:
-        given = parser.parse_args()
-        with tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
-            for outcome in cable_trials(
-                Path(name), given.count, given.seed, given.longest, given.clock_ahead
-            ):
-                print(json.dumps(outcome), flush=True)
-        return EXIT_DONE
-
-    return run_command(run)
+    return run_trials(
+        parser,
+        lambda given, folder, domain: cable_trials(
+            folder,
+            domain,
+            trials_of(KINDS, given.kinds, given.count, given.seed),
+            given.longest,
+            given.clock_ahead,
+        ),
+    )
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import fixed_parameter
 from needle_sim.rig.bench import SimulatedBench
-from needle_verification.trials.light import Light
+from needle_verification.trials.computers.light import Light
 
 _PERIOD = 1.0 / 30.0
 

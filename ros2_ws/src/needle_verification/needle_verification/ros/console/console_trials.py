@@ -8,26 +8,24 @@ and so on. `... 5 hostile`: other pages try all that they should not.
 from __future__ import annotations
 
 import contextlib
-import json
-import random
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import rclpy
-
-from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
 from needle_verification.ros.console.console_losses import LOSSES, Loss, let_go
 from needle_verification.ros.console.console_scene import Scene
+from needle_verification.ros.listening_node import ros
 from needle_verification.trials.button_page import TOKEN
+from needle_verification.trials.trial_runner import Outcomes, Trial, run_trials, trials_of
+
+HOSTILE = "hostile"
+KINDS = (*LOSSES, HOSTILE)
 
 # Later motion began anew [ms].
 RESUMED_MS = 500.0
@@ -37,9 +35,7 @@ _REPLAYED = 0.3
 _REPLAYS, _BETWEEN_REPLAYS = 10, 0.3
 
 
-def console_trials(
-    folder: Path, domain: int, kinds: list[str], count: int, seed: int
-) -> Iterator[dict[str, Any]]:
+def console_trials(folder: Path, domain: int, trials: Iterable[Trial]) -> Outcomes:
     """Yield what came of each trial, all with one rig.
 
     Parameters
@@ -48,55 +44,33 @@ def console_trials(
         Takes profiles and logs.
     domain : int
         ROS_DOMAIN_ID.
-    kinds : list of str
-        Which of `LOSSES`.
-    count : int
-        Trials of each.
-    seed : int
-        Of moments and ways to press.
+    trials : iterable of Trial
+        Their kinds are of `KINDS`.
     """
-    with closing(Scene(folder, domain)) as scene:
-        for kind in kinds:
-            scene.rng = random.Random(f"{seed} {kind}")
-            for number in range(count):
-                yield {"loss": kind, "number": number, **_trial(scene, LOSSES[kind], _MOVES_BEFORE)}
+    with ros(domain), closing(Scene(folder, domain)) as scene:
+        for trial in trials:
+            scene.rng = trial.rng
+            yield trial.outcome(
+                _among_hostile_pages(scene)
+                if trial.kind == HOSTILE
+                else _lose(scene, LOSSES[trial.kind], _MOVES_BEFORE)
+            )
 
 
-def hostile_trials(folder: Path, domain: int, count: int, seed: int) -> Iterator[dict[str, Any]]:
-    """Yield what came of each trial among hostile pages: nobody holds, then the right page lets go.
-
-    Parameters
-    ----------
-    folder : Path
-        Takes profiles and logs.
-    domain : int
-        ROS_DOMAIN_ID.
-    count : int
-        How many.
-    seed : int
-        Of moments and ways to press.
-    """
-    with closing(Scene(folder, domain)) as scene:
-        scene.rng = random.Random(f"{seed} hostile")
-        for number in range(count):
-            # Something to replay.
-            scene.press_until(_REPLAYED)
-            scene.release()
-            with _hostile_pages(scene.console.ports):
-                # What had moved before may be heard only now.
-                since_ns = time.time_ns()
-                for _ in range(_REPLAYS):
-                    scene.proxy.replay()
-                    scene.hand.pause(_BETWEEN_REPLAYS)
-                moved = scene.hand.moves[-1].sent_ns > since_ns
-                outcome = _trial(scene, let_go, _AMONG_HOSTILE)
-            yield {
-                "loss": "hostile",
-                "number": number,
-                **outcome,
-                "moved_by_others": moved,
-                "refused": scene.console.refusals(),
-            }
+def _among_hostile_pages(scene: Scene) -> dict[str, Any]:
+    """Look that nobody else moves the needle, then that the right page's person can let go."""
+    # Something to replay.
+    scene.press_until(_REPLAYED)
+    scene.release()
+    with _hostile_pages(scene.console.ports):
+        # What had moved before may be heard only now.
+        since_ns = time.time_ns()
+        for _ in range(_REPLAYS):
+            scene.proxy.replay()
+            scene.hand.pause(_BETWEEN_REPLAYS)
+        moved = scene.hand.moves[-1].sent_ns > since_ns
+        outcome = _lose(scene, let_go, _AMONG_HOSTILE)
+    return {**outcome, "moved_by_others": moved, "refused": scene.console.refusals()}
 
 
 @contextlib.contextmanager
@@ -115,7 +89,7 @@ def _hostile_pages(ports: Mapping[str, int]) -> Iterator[None]:
         process.wait()
 
 
-def _trial(scene: Scene, lose: Loss, moves: tuple[float, float]) -> dict[str, Any]:
+def _lose(scene: Scene, lose: Loss, moves: tuple[float, float]) -> dict[str, Any]:
     hand = scene.hand
     lost_before = scene.press_until(scene.rng.uniform(*moves))
     seen = len(hand.moves)
@@ -136,32 +110,12 @@ def _trial(scene: Scene, lose: Loss, moves: tuple[float, float]) -> dict[str, An
 
 def main() -> int:
     """Run trials; returns the exit code."""
-    parser = CommandParser("console_trials", __doc__ or "", "")
-    parser.add_argument("count", type=int)
-    parser.add_argument("kinds", nargs="*", help=f"{', '.join(LOSSES)}; all if none; or hostile")
-    parser.add_argument("--seed", type=int, default=1)
-
-    def run() -> int:
-        given = parser.parse_args()
-        kinds = given.kinds or list(LOSSES)
-        if unknown := [kind for kind in kinds if kind not in LOSSES and kinds != ["hostile"]]:
-            raise UserError(f"{unknown[0]!r} is not one of {', '.join(LOSSES)}")
-        with own_domain() as domain, tempfile.TemporaryDirectory(prefix="needle_trial_") as name:
-            rclpy.init(args=[], domain_id=domain)
-            try:
-                where = Path(name), domain
-                outcomes = (
-                    hostile_trials(*where, given.count, given.seed)
-                    if kinds == ["hostile"]
-                    else console_trials(*where, kinds, given.count, given.seed)
-                )
-                for outcome in outcomes:
-                    print(json.dumps(outcome), flush=True)
-            finally:
-                rclpy.try_shutdown()
-        return EXIT_DONE
-
-    return run_command(run)
+    return run_trials(
+        CommandParser("console_trials", __doc__ or "", ""),
+        lambda given, folder, domain: console_trials(
+            folder, domain, trials_of(KINDS, given.kinds, given.count, given.seed)
+        ),
+    )
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from needle_common.errors import UserError
 ADDRESSES = ("10.213.78.1", "10.213.78.2")
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _TOOLS = ("ip", "unshare", "nsenter")
-_CABLE = "needle_verification.trials.bad_cable"
+_CABLE = "needle_verification.trials.computers.bad_cable"
 # Shared memory, too: through it nodes of one machine would go on talking beside the cable. It
 # lasts as long as its input, and so no longer than this process.
 _LIVE = "mount -t tmpfs shm /dev/shm && ip link set lo up && echo ready && exec cat"

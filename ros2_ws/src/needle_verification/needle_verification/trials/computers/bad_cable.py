@@ -1,6 +1,6 @@
 """A cable between two networks of this machine: it delays, loses, and can be cut. No ROS in here.
 
-`python -m needle_verification.trials.bad_cable PID PID --delay 0.005 --loss 0.01 --seed 1` plugs a
+`python -m needle_verification.trials.computers.bad_cable PID PID --delay 0.005 --loss 0.01` plugs a
 network interface `cable0` into the network of each of the two processes and hands on what is sent
 between them until its input ends. It says `ready` when both are plugged in; the lines `cut` and
 `mend` are answered by the time at which they were obeyed (steady clock) [s].
@@ -21,7 +21,7 @@ import time
 from needle_common.commands.cli import EXIT_DONE, run_command
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
-from needle_verification.trials.namespaces import enter_network
+from needle_verification.trials.computers.namespaces import enter_network
 
 INTERFACE = "cable0"
 _TUN = "/dev/net/tun"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from needle_verification.trials.bad_cable import BadCable
+from needle_verification.trials.computers.bad_cable import BadCable
 
 
 def test_a_frame_comes_after_the_delay_and_in_its_order() -> None:

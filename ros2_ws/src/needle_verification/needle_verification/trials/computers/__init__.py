@@ -1,0 +1,1 @@
+"""Computers of a trial that are one machine: networks, a cable, light."""
