@@ -10,7 +10,6 @@ from contextlib import closing
 from functools import partial
 from pathlib import Path
 
-import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
@@ -19,6 +18,7 @@ from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import HOLD, RELIABLE, values_of
 from needle_verification.ros.drive_hand import DriveHand
+from needle_verification.ros.listening_node import ros
 from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
 from needle_verification.ros.soak.virtual_person import OUT
 from needle_verification.soak.faults import Fault, Kind
@@ -143,19 +143,15 @@ def run_processes(seed: int, folder: Path) -> RunResult:
         Takes the nodes' logs.
     """
     faults = processes_schedule_of(seed)
-    with own_domain() as domain:
-        rclpy.init(args=[], domain_id=domain)
-        try:
-            with (
-                closing(Witness()) as witness,
-                closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
-            ):
-                _insert(witness, graph, faults)
-                violations = tuple(witness.watch.violations)
-                happened = tuple(faults)
-                return RunResult(seed, happened, violations, "", witness.now, False, (), happened)
-        finally:
-            rclpy.try_shutdown()
+    with (
+        own_domain() as domain,
+        ros(domain),
+        closing(Witness()) as witness,
+        closing(TrialProcesses(folder, domain, graph_in_real_time(seed))) as graph,
+    ):
+        _insert(witness, graph, faults)
+        violations = tuple(witness.watch.violations)
+        return RunResult(seed, tuple(faults), violations, witness.now, of_processes=True)
 
 
 def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:

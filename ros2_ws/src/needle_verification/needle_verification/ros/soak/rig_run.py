@@ -45,10 +45,13 @@ class RunResult:
         What happened to it.
     violations : tuple of Violation
         What must never be, and was.
-    digest : str
-        Of all that was published and called, of every command and of the motors' ways.
     simulated : float
         How long it took in its own time [s].
+    of_processes : bool
+        Whether it was one of real processes: it cannot be had again, and has nothing of what
+        follows.
+    digest : str
+        Of all that was published and called, of every command and of the motors' ways.
     inserted : bool
         Whether the controller was done once.
     log : tuple of str
@@ -60,11 +63,12 @@ class RunResult:
     seed: int
     faults: tuple[Fault, ...]
     violations: tuple[Violation, ...]
-    digest: str
     simulated: float
-    inserted: bool
-    log: tuple[str, ...]
-    told_by_moments: tuple[Fault, ...]
+    of_processes: bool = False
+    digest: str = ""
+    inserted: bool = False
+    log: tuple[str, ...] = ()
+    told_by_moments: tuple[Fault, ...] = ()
 
 
 def schedule_of(seed: int) -> list[Fault]:
@@ -115,13 +119,13 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             seed,
             tuple(faults),
             tuple(watch.violations),
-            rig.graph.digest.hexdigest(),
             now,
-            rig.person.done,
-            tuple(
+            digest=rig.graph.digest.hexdigest(),
+            inserted=rig.person.done,
+            log=tuple(
                 f"{_seconds(at):9.3f} {name}: {level}: {text}" for at, name, level, text in rig.log
             ),
-            tuple(told_by_moments(course)),
+            told_by_moments=tuple(told_by_moments(course)),
         )
 
 

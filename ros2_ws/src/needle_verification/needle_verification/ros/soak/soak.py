@@ -147,7 +147,7 @@ def _run_seed(seed: int) -> RunResult:
 
 
 def _tell(result: RunResult, folder: Path | None) -> None:
-    if not result.digest:
+    if result.of_processes:
         # Real time cannot be had again: as it was, not shrunk.
         _print(f"processes, seed {result.seed}", result.violations, result.faults)
         return
