@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 from collections import Counter
 
-from code_lines import ROOT, code_lines, modules
+from code_lines import ROOT, code_lines, is_test, modules
 from pytest_lanes import LONG_FILES
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
 # How many are longer today; it only ever becomes less.
 LONG_MODULES = 12
+# Docstrings begin with a noun or a verb, not with a clause.
+CLAUSES = {"How", "Nobody", "What", "When", "Where", "Who", "Whoever", "Whose", "Why"}
 SOURCE = '''"""A docstring.
 
 Of three lines.
@@ -56,6 +59,18 @@ def test_no_folder_holds_too_many_modules_to_be_found_in() -> None:
         if number > MOST_MODULES
     }
     assert not full
+
+
+def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
+    clauses = [
+        f"{module.relative_to(ROOT)}: {text}"
+        for module in modules(ROOT)
+        if not is_test(module, ROOT)
+        for node in ast.walk(ast.parse(module.read_text("utf-8")))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef)
+        if (text := (ast.get_docstring(node) or "").partition("\n")[0]).partition(" ")[0] in CLAUSES
+    ]
+    assert clauses == []
 
 
 def test_the_test_files_that_are_run_first_are_there() -> None:

@@ -1,4 +1,4 @@
-"""What nodes publish, hear, serve, call, declare and report, noted while they are made."""
+"""Record of what nodes publish, hear, serve, call, declare and report while they are made."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Endpoint:
 
 @dataclasses.dataclass
 class Noted:
-    """What one node did while it was made, in one of its ways to be set.
+    """Record of what one node did while it was made, in one of its ways to be set.
 
     Attributes
     ----------

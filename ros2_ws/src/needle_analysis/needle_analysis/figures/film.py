@@ -106,7 +106,7 @@ def _trails(run: Run, series: Series, stamps: Stamps) -> list[Floats]:
 
 
 class _Readings:
-    """What is told of an exposure."""
+    """Readings of an exposure."""
 
     def __init__(self, run: Run) -> None:
         self._run = run

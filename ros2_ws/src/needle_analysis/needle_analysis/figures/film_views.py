@@ -1,4 +1,4 @@
-"""What a film shows: the cameras' pictures, the needle from the side and from above."""
+"""Views of a film: the cameras' pictures, the needle from the side and from above."""
 
 from __future__ import annotations
 

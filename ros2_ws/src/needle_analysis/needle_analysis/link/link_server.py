@@ -53,12 +53,12 @@ class LinkServer:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """Port that is listened on."""
         return int(self._server.getsockname()[1])
 
     @property
     def listeners(self) -> int:
-        """How many there are."""
+        """Number of clients that are connected."""
         return len(self._listeners)
 
     def turn(self, now: float) -> None:

@@ -1,1 +1,1 @@
-"""What a person sees of a needle while it is steered: no ROS."""
+"""Picture of a needle while it is steered: no ROS."""

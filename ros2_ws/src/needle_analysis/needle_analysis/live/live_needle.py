@@ -40,7 +40,7 @@ class SeenTip:
 
 @dataclasses.dataclass(frozen=True)
 class Belief:
-    """What the controller believes, in `target_plane`.
+    """The controller's estimate, in `target_plane`.
 
     Attributes
     ----------
@@ -120,7 +120,7 @@ class LiveNeedle:
 
     @property
     def belief(self) -> Belief | None:
-        """What the controller believes, in `rig`; None while it believes nothing."""
+        """The controller's estimate, in `rig`; None while there is none."""
         plane, belief = self.plane, self._belief
         if plane is None or belief is None:
             return None

@@ -1,4 +1,4 @@
-"""What is drawn of a needle, as standard messages in `rig`."""
+"""A needle's drawing as standard messages in `rig`."""
 
 from __future__ import annotations
 

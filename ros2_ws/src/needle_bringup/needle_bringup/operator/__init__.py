@@ -1,1 +1,1 @@
-"""What a person holds, and what may come of it: from a device's bytes to the hold."""
+"""A person's pedal, key or joystick: from a device's bytes to the hold."""

@@ -14,7 +14,7 @@ OPEN_PERIOD = 0.5
 
 
 class Device(Protocol):
-    """What a source needs of `InputDevice`."""
+    """The part of `InputDevice` that a source needs."""
 
     keys: frozenset[int]
 

@@ -1,4 +1,4 @@
-"""What a person's hand does, as a source of it tells."""
+"""A person's hand, as its source reports it."""
 
 from __future__ import annotations
 

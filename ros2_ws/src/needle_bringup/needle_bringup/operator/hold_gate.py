@@ -12,7 +12,7 @@ LONGEST_GAP = 0.1
 
 
 class Held(enum.Enum):
-    """What a press that counts is for."""
+    """Purpose of a press that counts."""
 
     NOTHING = "nothing"
     INSERT = "insert"
@@ -21,7 +21,7 @@ class Held(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class Grip:
-    """What counts of a hand.
+    """The part of a hand's reading that counts.
 
     Attributes
     ----------

@@ -84,7 +84,7 @@ class OperatorParameters:
 
     @property
     def controls(self) -> Controls:
-        """What the source's buttons and axes mean."""
+        """Meaning of the source's buttons and axes."""
         return Controls(
             insert=self.key,
             retract=_known(self.retract_key),

@@ -21,7 +21,7 @@ _GATES = {("sim_rig", "curvature"): ("stereo_tracker", "max_curvature", 9.0)}
 
 @dataclasses.dataclass(frozen=True)
 class Shared:
-    """What several nodes must have alike.
+    """Value on which several nodes must agree.
 
     Attributes
     ----------

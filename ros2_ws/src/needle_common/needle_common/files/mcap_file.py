@@ -78,7 +78,7 @@ class _Part(NamedTuple):
 
 
 class Index(NamedTuple):
-    """What a file's end says is in it, where that begins, and whether a checksum vouches for it."""
+    """Index at a file's end: its contents, where it begins, whether a checksum vouches for it."""
 
     records: Summary
     start: int

@@ -1,4 +1,4 @@
-"""What an answered question tells of another computer's clock."""
+"""Offset of another computer's clock, from questions that it answered."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _KEPT_NS = 10_000_000_000
 
 @dataclasses.dataclass(frozen=True)
 class ClockOffset:
-    """How far a clock is ahead of one's own.
+    """Offset of a clock against one's own.
 
     Attributes
     ----------
@@ -26,7 +26,7 @@ class ClockOffset:
 
     @property
     def surely(self) -> float:
-        """How far apart the two clocks are at least [s]."""
+        """Least difference of the two clocks [s]."""
         return max(abs(self.ahead) - self.within, 0.0)
 
 
@@ -48,7 +48,7 @@ def clock_offset(asked_ns: int, answered_ns: int, heard_ns: int) -> ClockOffset:
 
 
 class ClockReadings:
-    """What the answers of the last 10 s tell of one clock."""
+    """Answers of the last 10 s about one clock."""
 
     def __init__(self) -> None:
         self._readings: collections.deque[tuple[int, ClockOffset]] = collections.deque()

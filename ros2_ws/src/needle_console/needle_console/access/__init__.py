@@ -1,1 +1,1 @@
-"""Who may open a connection: token, Origin and Host."""
+"""Access control of connections: token, Origin and Host."""

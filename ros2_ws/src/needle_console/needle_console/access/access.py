@@ -1,4 +1,4 @@
-"""Who may open a connection: names that the rig is known by, pages of its own, a secret."""
+"""Access control of connections: the rig's names, pages of its own, a secret."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class HoldDesk:
 
     @property
     def until(self) -> float:
-        """When the hold ends unless more comes [s]; minus infinity without one."""
+        """Time at which the hold ends unless more comes [s]; minus infinity without one."""
         return -math.inf if self._owner is None else self._pages[self._owner].session.until
 
     def open(self, now: float) -> int | None:

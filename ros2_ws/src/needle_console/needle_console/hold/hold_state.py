@@ -1,4 +1,4 @@
-"""What a person's hand says: pressed or not, how fast, which way."""
+"""The hold that a person asks for: pressed or not, how fast, which way."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ OWNER = "console"
 
 
 class Mode(enum.Enum):
-    """What a press is for."""
+    """Purpose of a press."""
 
     INSERT = "insert"
     RETRACT = "retract"

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 
 class Nonces:
-    """What was sent to one page, and when.
+    """Nonces sent to one page, with their times.
 
     Parameters
     ----------

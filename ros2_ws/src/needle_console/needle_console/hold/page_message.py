@@ -1,4 +1,4 @@
-"""What a page says, read strictly: what is not exactly as agreed is garbage."""
+"""Strict reader of a page's messages: whatever is not exactly as agreed is garbage."""
 
 from __future__ import annotations
 

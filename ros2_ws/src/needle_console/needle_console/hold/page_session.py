@@ -49,7 +49,7 @@ class PageSession:
 
     @property
     def until(self) -> float:
-        """When the hold ends unless more comes [s]; minus infinity without one."""
+        """Time at which the hold ends unless more comes [s]; minus infinity without one."""
         return self._until
 
     def state(self, now: float) -> HoldState:

@@ -1,4 +1,4 @@
-"""What does not count, and why: each kind is counted, and said once."""
+"""Refused connections and messages: each kind is counted, and logged once."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import threading
 
 
 class Refusal(enum.Enum):
-    """Why a connection or a message does not count; the value is for a person."""
+    """Reason for which a connection or message does not count; the value is for a person."""
 
     HOST = "foreign Host"
     ORIGIN = "foreign Origin"

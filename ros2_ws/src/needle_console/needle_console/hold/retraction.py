@@ -1,4 +1,4 @@
-"""What a press to retract asks of the rig, in its order."""
+"""Drawing the needle out by a held button: hold and calls in their order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ BEGINS_WITHIN = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class Todo:
-    """What to do now.
+    """Hold to publish and services to call now.
 
     Attributes
     ----------

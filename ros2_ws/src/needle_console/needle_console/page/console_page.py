@@ -26,7 +26,7 @@ _HEAD = """
 
 @dataclasses.dataclass(frozen=True)
 class HoldLink:
-    """Where a page's hold connects to.
+    """Address to which a page's hold connects.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a person can do: buttons, hold, speed, stop, targets."""
+"""Controls of a page: buttons, hold, speed, stop, targets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page may see and do, whatever stands behind it."""
+"""Interface between a page and the rig behind it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the console hears of the rig, into its picture."""
+"""Subscriptions of the console, which fill its picture of the rig."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What is drawn and said, from snapshots of plain data."""
+"""Drawings and texts made from snapshots of plain data."""

@@ -1,4 +1,4 @@
-"""What to do next, in words, and which buttons make sense."""
+"""Advice on what to do next, and which buttons make sense."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ STEERING = ("STEERING", "WAITING_FOR_TIP")
 
 
 class Button(enum.Enum):
-    """What a person can press; the value is what stands on it."""
+    """Buttons of the page; the value is the label."""
 
     CONFIRM = "Confirm needle out"
     HOME = "Home"

@@ -1,4 +1,4 @@
-"""What device and controller say of themselves, as plain data."""
+"""Status of device and controller as plain data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When an estimate says that it cannot be relied on, and why."""
+"""Reasons for which an estimate declares itself doubtful."""
 
 from __future__ import annotations
 

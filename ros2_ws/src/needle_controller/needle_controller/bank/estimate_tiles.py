@@ -1,4 +1,4 @@
-"""How many needles' estimates lie in memory: in tiles, side by side, one row for each number.
+"""Memory layout of many needles' estimates: tiles, side by side, one row for each number.
 
 Estimates follow one another, needle by needle, and fill tiles of `LANES`. What is done to one
 estimate is done to all of a tile in the same instructions, whichever needle each belongs to, and

@@ -1,4 +1,4 @@
-"""What the hypothesis filter assumes: noise, the entry, torsion, and when it gives up an idea."""
+"""Assumptions of the hypothesis filter: noise, entry, torsion, and when a hypothesis is dropped."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Drift(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """What the estimates are kept to, and when they end; see `FilterSettings`."""
+    """Bounds on the estimates, and when they end; see `FilterSettings`."""
 
     smallest_curvature: float
     largest_curvature: float
@@ -89,7 +89,7 @@ class Limits(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class FilterSettings:
-    """What the filter assumes.
+    """Assumptions of the filter.
 
     Attributes
     ----------

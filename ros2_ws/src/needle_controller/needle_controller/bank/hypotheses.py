@@ -1,4 +1,4 @@
-"""What a bank of estimates starts from: hypotheses of torsion and of the roll at the entry."""
+"""Hypotheses from which a bank of estimates starts: torsion, and roll at the entry."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from needle_controller.bank.estimate_tiles import NOISES
 
 @dataclasses.dataclass(frozen=True)
 class TorsionHypothesis:
-    """How the shaft's torsion may be; its size is then estimated: the lag length, or the play.
+    """One model of the shaft's torsion; its size, lag length or play, is then estimated.
 
     Attributes
     ----------
@@ -39,7 +39,7 @@ class TorsionHypothesis:
 
 @dataclasses.dataclass(frozen=True)
 class RollHypothesis:
-    """How the tip may be turned at the entry, against where the base's rotation puts it.
+    """Possible roll of the tip at the entry, against where the base's rotation puts it.
 
     Attributes
     ----------
@@ -68,7 +68,7 @@ tip; or normal, of each coordinate's own size, and such that errors may last fro
 
 @dataclasses.dataclass(frozen=True)
 class NoiseHypothesis:
-    """What the noise of a measured coordinate may be, against what is claimed of it.
+    """Possible noise of a measured coordinate, against what is claimed of it.
 
     Attributes
     ----------

@@ -66,7 +66,7 @@ _NO_MEAN_ROLL = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Hypotheses:
-    """What a law needs of a bank of estimates.
+    """The part of a bank of estimates that a law needs.
 
     Attributes
     ----------

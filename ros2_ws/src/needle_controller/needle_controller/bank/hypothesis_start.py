@@ -1,4 +1,4 @@
-"""What a bank begins with: every torsion hypothesis with every roll, at the first tip."""
+"""First estimates of a bank: every torsion hypothesis with every roll, at the first tip."""
 
 from __future__ import annotations
 

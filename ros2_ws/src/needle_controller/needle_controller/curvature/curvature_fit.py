@@ -56,7 +56,7 @@ _HEADING_STD = math.radians(5.0)
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFitSettings:
-    """What is known beside the tips.
+    """Knowledge beside the tips.
 
     Attributes
     ----------
@@ -101,7 +101,7 @@ class CurvatureFitSettings:
 
 @dataclasses.dataclass(frozen=True)
 class CurvatureFit:
-    """What tips of pure insertion say of the curvature.
+    """Curvature found from tips of pure insertion.
 
     Attributes
     ----------

@@ -68,7 +68,7 @@ way, too short, not finite, ...), 130 interrupted.
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """What was asked for; mm and degrees, as the user writes them."""
+    """Options of the command; mm and degrees, as the user writes them."""
 
     source: Path
     insertion: Path | None

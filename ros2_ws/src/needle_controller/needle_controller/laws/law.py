@@ -17,7 +17,7 @@ from needle_controller.observers.luenberger_steps import demand_states
 
 @dataclasses.dataclass(frozen=True)
 class SteeringCommand:
-    """What the law wants over the next step.
+    """The law's command for the next step.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ _NO_TURN = 1e-6
 
 
 class PointLawSettings(NamedTuple):
-    """What the point law is made of.
+    """Settings of the point law.
 
     Attributes
     ----------

@@ -29,7 +29,7 @@ _USUAL_PLAY = math.radians(40.0)
 
 
 class RollLawSettings(NamedTuple):
-    """What the roll law is made of.
+    """Settings of the roll law.
 
     Attributes
     ----------

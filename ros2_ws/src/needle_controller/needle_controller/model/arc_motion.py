@@ -50,7 +50,7 @@ def left_jacobian(vector: npt.ArrayLike) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class RelativeMotion:
-    """Where a motion leads, in the axes of its start, and how that depends on the curvature.
+    """A motion's end in the axes of its start, and its derivative by the curvature.
 
     Attributes
     ----------

@@ -27,7 +27,7 @@ _SAME_LENGTH = 12
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """What the weights give.
+    """Gains that follow from the weights.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where a target that moves will be: from where it was seen, some seconds ahead.
+"""Prediction of a moving target, some seconds ahead, from where it was seen.
 
 Tissue drifts, and breathes: what was seen of a target is explained by a drift, or by a drift and a
 period with its first overtone, whichever is simpler and explains it. What neither explains is not
@@ -51,7 +51,7 @@ class TargetMotion:
 
     @property
     def last(self) -> Array:
-        """Where it was last seen, shape (..., 3) [m].
+        """Place where it was last seen, shape (..., 3) [m].
 
         Raises
         ------
@@ -62,7 +62,7 @@ class TargetMotion:
 
     @property
     def seen(self) -> float:
-        """When it was last seen [s]."""
+        """Time at which it was last seen [s]."""
         return self._times[-1]
 
     def see(self, time: float, points: npt.ArrayLike) -> None:
@@ -107,7 +107,7 @@ class TargetMotion:
 
 
 class _Motion:
-    """What explains some targets' samples: times (K,) [s], points (K, ..., 3) [m]."""
+    """Motion that explains some targets' samples: times (K,) [s], points (K, ..., 3) [m]."""
 
     def __init__(self, times: Array, points: Array) -> None:
         self._shape = points.shape[1:-1]

@@ -1,4 +1,4 @@
-"""What every estimator of the needle is to the rest: one interface for one needle and for 10,000.
+"""Interface of every estimator, the same for one needle and for 10,000.
 
 Everything is in the frame `target_plane`, SI. Leading axes are needles: the node's single needle
 has shape (3,), a study's 10,000 needles (10000, 3).
@@ -24,7 +24,7 @@ from needle_controller.model.kinematics import (
 
 @dataclasses.dataclass(frozen=True)
 class Estimate:
-    """What is known of the needle after the last measurement.
+    """State of the needle as known after the last measurement.
 
     Attributes
     ----------

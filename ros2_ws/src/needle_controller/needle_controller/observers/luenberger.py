@@ -25,7 +25,7 @@ from needle_controller.observers.saturation import saturate
 
 @dataclasses.dataclass(frozen=True)
 class LuenbergerSettings:
-    """What the observer assumes.
+    """Assumptions of the observer.
 
     Attributes
     ----------

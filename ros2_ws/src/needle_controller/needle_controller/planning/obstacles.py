@@ -1,4 +1,4 @@
-"""What the needle must not touch: spheres and capsules in `rig`."""
+"""Obstacles that the needle must not touch: spheres and capsules in `rig`."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ class NeedlePath:
 
     @property
     def aim(self) -> Array:
-        """What the needle is steered towards first, shape (3,) [m]."""
+        """Point that the needle is steered towards first, shape (3,) [m]."""
         return np.asarray(self.legs[0, :3])
 
     def rest(self, insertion: float) -> Array:
@@ -111,13 +111,13 @@ class TipState:
 
     @property
     def unknown(self) -> Unknown:
-        """How well it is known, as compiled code takes it."""
+        """Uncertainty of the start, as compiled code takes it."""
         return Unknown(self.position_std, self.heading_std)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Question:
-    """What a path is asked for with; see `PathPlanner.path`."""
+    """Arguments with which a path is asked for; see `PathPlanner.path`."""
 
     tip: TipState
     target: Array

@@ -1,4 +1,4 @@
-"""What paths are planned with, and what is known where one begins."""
+"""Settings of the planner, and the uncertainty where a path begins."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from needle_common.settings.bounds import Bounds
 
 # Read by compiled code.
 class PathSettings(NamedTuple):
-    """What a path is planned with.
+    """Settings with which a path is planned.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class PathSettings(NamedTuple):
 
 
 class Unknown(NamedTuple):
-    """How well the tip's pose is known where a path begins.
+    """Uncertainty of the tip's pose where a path begins.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""Where a path may be led past obstacles: points on rings around them, then points everywhere."""
+"""Points by which a path may pass obstacles: on rings around them, then everywhere."""
 
 from __future__ import annotations
 

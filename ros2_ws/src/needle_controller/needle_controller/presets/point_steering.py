@@ -62,7 +62,7 @@ class PointSteering:
 
     @property
     def aim(self) -> Array:
-        """Where the target is expected when the needle is there, in `rig`, shape (..., 3) [m]."""
+        """Target as expected when the needle is there, in `rig`, shape (..., 3) [m]."""
         return self.motion.last if self._foretold is None else self._foretold
 
     def command(

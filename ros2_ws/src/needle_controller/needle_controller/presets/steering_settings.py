@@ -1,4 +1,4 @@
-"""What steering is made of: the parameters of plane_controller."""
+"""Settings of steering: the parameters of plane_controller."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ PAPER_NOISE: dict[str, Any] = {
 
 @dataclasses.dataclass(frozen=True)
 class SteeringSettings:
-    """What estimator, law and step protocol are made of; taken as a whole or refused.
+    """Settings of estimator, law and step protocol; taken as a whole or refused.
 
     Raises
     ------
@@ -344,13 +344,13 @@ class SteeringSettings:
 
     @property
     def controller(self) -> str:
-        """What steers, in words: the preset, and what of other packages is in it."""
+        """Name of the controller: the preset, and its parts from other packages."""
         own = [f"{kind} {getattr(self, kind)}" for kind in GROUPS if getattr(self, kind)]
         return f"{self.preset} with {', '.join(own)}" if own else self.preset
 
     @property
     def turning(self) -> dict[str, float]:
-        """What every law that turns the bevel is told, by the names of its settings."""
+        """Settings common to all laws that turn the bevel, by name."""
         names = ("step_length", "max_rotation_per_length", "max_winding")
         return {name: getattr(self, name) for name in names}
 

@@ -1,4 +1,4 @@
-"""What a node has heard, in its order, so that a bag tells what it decided from.
+"""Record of what a node has heard, in order, so that a bag tells what it decided from.
 
 A node on a busy machine hears a message some time after it was sent, what was sent meanwhile may be
 heard before it, and what its queue has no room for it never hears.
@@ -22,7 +22,7 @@ class HeardMessage(NamedTuple):
 
 
 class HeardMessages:
-    """What was heard since it was last told."""
+    """Messages heard since they were last told."""
 
     def __init__(self) -> None:
         self._heard: list[HeardMessage] = []

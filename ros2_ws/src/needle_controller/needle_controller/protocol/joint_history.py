@@ -1,4 +1,4 @@
-"""What the joints measured, at any instant between two samples."""
+"""Joint positions at any instant between two samples."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class JointSample:
 
 
 class Heard(enum.Enum):
-    """What became of a sample."""
+    """Verdict on a sample."""
 
     TAKEN = "taken"
     REPEATED = "repeated"

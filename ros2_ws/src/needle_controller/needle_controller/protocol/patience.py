@@ -1,4 +1,4 @@
-"""How long what is awaited has not come, and what of the device has not been heard."""
+"""Waits for what has not come, and silence of the device."""
 
 from __future__ import annotations
 

@@ -32,7 +32,7 @@ _FAR_AWAY = Obstacles([Obstacle((0.5, 0.0, 0.01), (0.5, 0.0, 0.02), 0.001)])
 
 @dataclasses.dataclass(frozen=True)
 class ControlUpdate:
-    """What one tip led to.
+    """Result of one tip.
 
     Attributes
     ----------
@@ -102,7 +102,7 @@ class PlaneControl:
 
     @property
     def target_point(self) -> Array | None:
-        """Where the tip is to go, in `rig`, shape (3,) [m]; None: into the plane.
+        """Point that the tip is to reach, in `rig`, shape (3,) [m]; None: the plane.
 
         What is set rests there; see `see_target_point`.
         """

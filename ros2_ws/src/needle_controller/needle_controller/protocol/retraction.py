@@ -30,7 +30,7 @@ class RetractionWatch:
 
     @property
     def obstacle(self) -> str:
-        """Why the needle must be drawn out before it is steered; empty if it need not be."""
+        """Reason to draw the needle out before it is steered; empty if there is none."""
         if self._drawn_back:
             return "the needle was retracted: draw it out first"
         if self._before is not None and self._after is not None:

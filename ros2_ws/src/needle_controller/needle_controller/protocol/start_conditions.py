@@ -1,4 +1,4 @@
-"""What must hold before steering begins."""
+"""Conditions under which steering begins."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
 @dataclasses.dataclass(frozen=True)
 class Situation:
-    """What is known when somebody asks to start.
+    """State of the rig when somebody asks to start.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What goes into the step protocol of `steering`, and what comes out of it, as plain data."""
+"""Inputs and outputs of the step protocol in `steering`, as plain data."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class SteeringState(enum.Enum):
 
 
 class Awaiting(enum.Enum):
-    """What the next action needs."""
+    """Input that the next action needs."""
 
     NOTHING = "nothing"
     HOLD = "hold"
@@ -30,7 +30,7 @@ class Awaiting(enum.Enum):
 
 @dataclasses.dataclass(frozen=True)
 class DeviceReport:
-    """What the driver says of itself.
+    """The driver's report on itself.
 
     Attributes
     ----------

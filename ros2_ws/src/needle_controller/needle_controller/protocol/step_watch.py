@@ -21,7 +21,7 @@ MOST_UNFOLLOWED = 3
 
 
 class Followed(enum.Enum):
-    """What the joints say of a step."""
+    """State of a step, as the joints show it."""
 
     NOT_YET = "not yet"
     ARRIVED = "arrived"

@@ -1,4 +1,4 @@
-"""What a source of tips says of each beside its place: its covariance, by stamp."""
+"""Covariances that a source of tips gives with them, by stamp."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _SYMMETRY = 1e-9
 
 @dataclasses.dataclass(frozen=True)
 class TipCovariance:
-    """What a needle/tip_pose says of how well the tip of the same stamp is known.
+    """Covariance from needle/tip_pose of the tip with the same stamp.
 
     Attributes
     ----------

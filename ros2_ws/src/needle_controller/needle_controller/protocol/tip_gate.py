@@ -19,7 +19,7 @@ STAMP_AHEAD_NS = 1_000_000_000
 
 
 class Fault(enum.Enum):
-    """What can be wrong with a tip; each is counted and logged for itself."""
+    """Faults of a tip; each is counted and logged for itself."""
 
     FRAME = "frame"
     NOT_FINITE = "not_finite"

@@ -1,4 +1,4 @@
-"""How far a person can rely on an estimate, and on where a needle ended."""
+"""Trust in an estimate, and in where a needle ended."""
 
 from __future__ import annotations
 

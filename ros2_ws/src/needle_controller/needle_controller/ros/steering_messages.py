@@ -1,4 +1,4 @@
-"""What each message does to the controller and what it makes of that: for the node and `rerun`."""
+"""Handlers of the controller's messages, and its answers: for the node and `rerun`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What becomes of a command: it starts, replaces a path, waits for its time, or is refused."""
+"""Fate of a command: it starts, replaces a path, waits for its time, or is refused."""
 
 from __future__ import annotations
 

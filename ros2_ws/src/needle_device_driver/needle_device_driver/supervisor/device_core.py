@@ -94,7 +94,7 @@ class DeviceCore:
 
     @property
     def rotation_owed(self) -> float:
-        """How far the rotation is behind a needle that is pushed too fast for it [rad]."""
+        """Lag of the rotation behind a needle that is pushed too fast for it [rad]."""
         if self._run is None or self.snapshot is None:
             return 0.0
         owed = self._run.rotation_owed(self.snapshot)

@@ -104,7 +104,7 @@ class Hold:
 
     @property
     def timeout(self) -> float:
-        """How long the owner's last message counts [s]; without owner, how long any may."""
+        """Time for which the owner's last message counts [s]; without owner, the longest of any."""
         return self._timeout if self._owner is None else self._senders[self._owner].timeout
 
     def is_off(self, now: float) -> bool:

@@ -1,4 +1,4 @@
-"""How far the needle may be drawn out where no home position says how deep it is."""
+"""Bound on drawing the needle out where no home position says how deep it is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is drawn and not traced: lint, dust, paths of older needles, and edges of a clear box."""
+"""Marks that are drawn, not traced: lint, dust, paths of older needles, edges of a clear box."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ class SimRigParameters:
 
     @property
     def needle(self) -> NeedleShape:
-        """What the cameras see of the needle."""
+        """Shape of the needle."""
         return NeedleShape(
             self.needle_diameter, self.pre_bend, self.pre_bend_distance, self.pre_bend_lean
         )

@@ -1,4 +1,4 @@
-"""What the tracker has to say about its health: counters in, diagnostics out."""
+"""The tracker's health: counters in, diagnostics out."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _EXCHANGE = "exchange stereo_camera's parameters left and right, or the cables"
 
 
 class ReasonCounts:
-    """How often each reason was given: the latest by name, all others together.
+    """Counts of reasons: the latest by name, all others together.
 
     Reasons quote what came from outside: there is no end of them, and each report tells them all.
     """

@@ -38,7 +38,7 @@ class Frame:
 
 @dataclasses.dataclass(frozen=True)
 class RollEstimate:
-    """What the controller last said: stamp [ns], axes of the tip's frame in `rig`, sigma [rad]."""
+    """The controller's last estimate: stamp [ns], axes of the tip's frame in `rig`, sigma [rad]."""
 
     stamp: int
     rotation: NDArray[np.float64]
@@ -47,7 +47,7 @@ class RollEstimate:
 
 @dataclasses.dataclass(frozen=True)
 class PairingSettings:
-    """What is told beside the tracker's own settings.
+    """Settings beside the tracker's own.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class PairingSettings:
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """What became of a pair.
+    """Result of a pair.
 
     Attributes
     ----------

@@ -73,7 +73,7 @@ _NEW_RUN = 10e-3  # a jump of the insertion that no run makes between two images
 
 @dataclasses.dataclass(frozen=True)
 class TrackedSequence:
-    """What a sequence gave: CSV rows, reasons for missing tips, names that nothing was made of.
+    """Results of a sequence: CSV rows, reasons for missing tips, names of unreadable pairs.
 
     And whether left and right images seem to be swapped.
     """

@@ -1,4 +1,4 @@
-"""What tips are worth where it is known where the needle was: errors, and errors in sigmas."""
+"""Errors of tips against the truth, in mm and in sigmas."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Deviation:
 
 @dataclasses.dataclass(frozen=True)
 class CheckResult:
-    """What a target says about a calibration.
+    """Verdict of a target on a calibration.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What a calibration is made with: the board, and the places where it was laid."""
+"""Inputs of a calibration: the board, and the places where it was laid."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary")
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where a board lay.
+    """Place where a board lay.
 
     Attributes
     ----------

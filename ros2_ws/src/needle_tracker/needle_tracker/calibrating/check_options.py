@@ -43,7 +43,7 @@ exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 bad input, no image
 
 @dataclasses.dataclass(frozen=True)
 class CheckOptions:
-    """What was asked for; SI."""
+    """Options of the command; SI."""
 
     calibration: Path
     session: Path

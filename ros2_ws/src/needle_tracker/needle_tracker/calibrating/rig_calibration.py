@@ -45,7 +45,7 @@ _OWN_WINDOWS_CENTRE_LIMIT = 0.01
 
 @dataclasses.dataclass(frozen=True)
 class Determined:
-    """What became of one parameter: `sigma` is what the views gave, `value` what is used."""
+    """Result for one parameter: `sigma` is what the views gave, `value` what is used."""
 
     value: float
     sigma: float

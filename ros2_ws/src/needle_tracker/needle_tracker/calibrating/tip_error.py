@@ -1,4 +1,4 @@
-"""What an error of the calibration does to a tip in the phantom.
+"""Effect of a calibration's error on a tip in the phantom.
 
 The two rays of a wrong calibration still meet, somewhere else: nothing but this computation, or a
 target of known place, shows it.

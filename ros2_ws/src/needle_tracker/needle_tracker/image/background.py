@@ -1,4 +1,4 @@
-"""What stands behind the needle: an image from before it came, and what differs from that.
+"""Background of the needle: an image from before it came, and what differs from that.
 
 Graph paper, print or weave has lines as dark and whole as a needle, and one of them that runs along
 its end hides where that is. What was there before the needle takes them away.

@@ -1,4 +1,4 @@
-"""Where in the search grid a needle can be whose way so far is known.
+"""Part of the search grid in which a needle can be whose way so far is known.
 
 A needle goes where its tip has been: what was believed of the tip says where the shaft lies now. A
 line that crosses the phantom, a shadow or the edge of a hand then has no part in the search, except

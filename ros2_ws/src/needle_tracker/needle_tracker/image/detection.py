@@ -39,7 +39,7 @@ _OWN_WIDTH = 0.7e-3  # ... so far to either side [m]
 
 @dataclasses.dataclass(frozen=True)
 class DetectionSettings:
-    """How a needle looks.
+    """Looks of a needle.
 
     Attributes
     ----------

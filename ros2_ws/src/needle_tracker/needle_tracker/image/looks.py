@@ -42,7 +42,7 @@ _SEARCH_WIDTHS = 4.0  # and beside where it is searched for
 
 
 class Look(Protocol):
-    """How one camera's images are searched for paths, and ends fitted in them."""
+    """Search of one camera's images for paths, and fits of the ends in them."""
 
     def find_paths(
         self,

@@ -1,4 +1,4 @@
-"""Where in an image the needle can be: a polar grid about the entry point, seen by one camera.
+"""Grid of places where the needle can be in an image: polar, about the entry, of one camera.
 
 The grid lies in the plane through the needle's axis (z of `rig`) that faces the camera's window.
 
@@ -25,7 +25,7 @@ Mask = NDArray[np.bool_]
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What the needle can do at all.
+    """Physical reach of the needle.
 
     Attributes
     ----------

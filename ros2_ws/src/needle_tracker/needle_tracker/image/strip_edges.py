@@ -1,4 +1,4 @@
-"""Where a needle's two edges are in a few rows of a fine strip, whatever lies beside or on it.
+"""A needle's two edges in a few rows of a fine strip, whatever lies beside or on it.
 
 A needle's edges are steep and as far apart as it is wide. What it throws on the floor has soft
 edges; a glint on the shaft rises where an edge falls. So the edges still tell where the middle is

@@ -1,4 +1,4 @@
-"""Where along a fitted shaft the needle ends, and how far beyond half its mass it tapers off.
+"""End of the needle along a fitted shaft, and its taper beyond half its mass.
 
 The darkness summed across the needle, row by row, falls from its level to nothing. A flat end falls
 as fast as the image's blur lets the shaft's own edges fall; a bevelled one falls over its length,

@@ -77,7 +77,7 @@ class ImageTip:
 
 @dataclasses.dataclass(frozen=True)
 class Expected:
-    """Where a tip is expected in an image.
+    """Place where a tip is expected in an image.
 
     Attributes
     ----------

@@ -28,7 +28,7 @@ class Layer:
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """Where light goes from air into the body that the needle is in.
+    """Surface at which light goes from air into the body that the needle is in.
 
     Attributes
     ----------

@@ -1,1 +1,1 @@
-"""Where images and joint states come from, and which belong together."""
+"""Sources of images and joint states, and which belong together."""

@@ -63,7 +63,7 @@ class PairSequence:
 
     @property
     def missing(self) -> str:
-        """What the videos did not give, in words, known at the end; empty where all is there."""
+        """Frames that the videos lacked, in words, known at the end; empty where all is there."""
         parts = []
         if self.unpaired:
             parts.append(f"{len(self.unpaired)} frames without a partner")

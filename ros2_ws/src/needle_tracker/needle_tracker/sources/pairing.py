@@ -26,7 +26,7 @@ class Pair(Generic[T]):
 
 @dataclasses.dataclass
 class PairCounts:
-    """How the pairing went so far: pairs made, and images dropped without a partner."""
+    """Counts of the pairing: pairs made, and images dropped without a partner."""
 
     pairs: int = 0
     unpaired_left: int = 0

@@ -1,4 +1,4 @@
-"""Where image pairs come from: two cameras, two folders or two video files."""
+"""Sources of image pairs: two cameras, two folders or two video files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class StereoSource(Protocol):
 
     @property
     def missing(self) -> str:
-        """What a recording that has ended did not give; empty where nothing is missing."""
+        """Frames that a recording lacked, known at its end; empty where nothing is missing."""
 
     def next(self) -> StampedPair | None:
         """Return the next pair; None where this one could not be read.
@@ -60,7 +60,7 @@ class EndOfRecordingError(Exception):
 
 @dataclasses.dataclass(frozen=True)
 class SourceSettings:
-    """What a source is asked for.
+    """Settings of a source.
 
     Attributes
     ----------

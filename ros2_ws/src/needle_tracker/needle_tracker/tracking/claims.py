@@ -1,4 +1,4 @@
-"""How well a look can know the needle's end, beyond what the fit of one pair says.
+"""Uncertainty of the needle's end beyond what the fit of one pair says.
 
 A line ends where its darkness ends: where a ground face looks like the floor, both images end short
 by as much, and where light falls on one side of the needle, the line lies to the other in both. A
@@ -107,7 +107,7 @@ class Claims:
 
 
 class StagedEnd:
-    """What the stage says of an end that is seen badly: the needle is as long as it was pushed in.
+    """The stage's word on an end that is seen badly: the needle is as long as it was pushed in.
 
     A stage's zero is off by as much in all pairs of a run. The end that was seen best in it says by
     how much, as far as it knows better than what a zero is worth. Faces that are unseen make ends

@@ -1,4 +1,4 @@
-"""How much must be seen before a tip is believed that was found without a prediction.
+"""Evidence that is needed before a tip is believed that was found without a prediction.
 
 One good sight in both views is enough where the needle must be; what contradicts the track, or is
 seen less well, has to be seen again, and again in agreement with itself.
@@ -87,7 +87,7 @@ def look_alike(left: ImageTip, right: ImageTip) -> bool:
 
 
 class VisibilityAverage:
-    """How much the needle stands out in both views while it is seen well."""
+    """Average visibility of the needle in both views while it is seen well."""
 
     def __init__(self) -> None:
         self._levels: tuple[float, float] | None = None

@@ -155,7 +155,7 @@ class HiddenEnds:
 
 @dataclasses.dataclass(frozen=True)
 class Sights:
-    """What both views say about the needle's end.
+    """Both views' findings on the needle's end.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Sights:
 
 @dataclasses.dataclass(frozen=True)
 class Misfit:
-    """How far a view's tip is from the prediction.
+    """Distance of a view's tip from the prediction.
 
     Attributes
     ----------

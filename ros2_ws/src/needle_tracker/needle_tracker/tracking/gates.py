@@ -1,4 +1,4 @@
-"""What a measured tip must keep to be the needle's at all: physics, not history."""
+"""Conditions on a measured tip to be the needle's at all: physics, not history."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a pair of images gave."""
+"""Measurement from a pair of images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Measurement:
-    """What a pair of images gave.
+    """Measurement from a pair of images.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What one view alone says of a followed needle that both together do not show.
+"""Evidence of one view alone on a followed needle that both together do not show.
 
 A needle that one camera does not see for a while is not lost: the other says where it is but for
 the depth, and that hardly changes on its way. As long as the prediction knows that well, there is a

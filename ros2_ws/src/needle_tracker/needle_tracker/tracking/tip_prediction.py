@@ -1,4 +1,4 @@
-"""Where the tip goes: a Kalman filter over the insertion for its position and heading.
+"""Prediction of the tip: a Kalman filter over the insertion for its position and heading.
 
 The state is the tip p and its heading h, a unit vector; the needle goes its heading's way, which
 bends by at most the largest curvature: p' = p + s h, h' = h + (random across h, up to kappa s),

@@ -38,7 +38,7 @@ _LARGEST_SURPRISE = 25.0  # squared, over its covariance
 
 
 class TrackState(enum.Enum):
-    """What the tracker knows about the needle."""
+    """The tracker's knowledge of the needle."""
 
     SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
     CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet

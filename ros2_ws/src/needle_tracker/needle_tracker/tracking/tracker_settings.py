@@ -1,4 +1,4 @@
-"""What the tracker is told beside the calibration."""
+"""Settings of the tracker beside the calibration."""
 
 from __future__ import annotations
 

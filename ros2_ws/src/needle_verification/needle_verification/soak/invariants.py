@@ -1,4 +1,4 @@
-"""What must hold in every run, judged from outside: motors, hand, and what is published."""
+"""Invariants of every run, judged from outside: motors, hand, and what is published."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What happens to a message on its way."""
+"""Faults of messages on their way."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Fate:
 
 @dataclasses.dataclass
 class LinkFault:
-    """What goes wrong on one topic, service or bus while it lasts.
+    """Fault of one topic, service or bus while it lasts.
 
     Attributes
     ----------

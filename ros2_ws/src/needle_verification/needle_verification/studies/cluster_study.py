@@ -36,7 +36,7 @@ class ClusterPart:
 
 @dataclasses.dataclass(frozen=True)
 class PartDone:
-    """What became of a part.
+    """Result of a part.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class PartDone:
 
 @dataclasses.dataclass(frozen=True)
 class StudyDone:
-    """What became of all parts.
+    """Result of all parts.
 
     Attributes
     ----------

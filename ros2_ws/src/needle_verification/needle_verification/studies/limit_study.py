@@ -52,7 +52,7 @@ _CHUNK = 25
 
 @dataclasses.dataclass(frozen=True)
 class Reached:
-    """What became of some needles.
+    """Results of some needles.
 
     Attributes
     ----------

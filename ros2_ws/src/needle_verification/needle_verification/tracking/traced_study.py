@@ -21,7 +21,7 @@ needle three times."""
 
 
 class Told(enum.Enum):
-    """What the tracker knows beside the pairs of a sequence."""
+    """The tracker's knowledge beside the pairs of a sequence."""
 
     NOTHING = "without"
     INSERTION = "with"
@@ -30,7 +30,7 @@ class Told(enum.Enum):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class TracedAnswer:
-    """What the tracker said of a path-traced pair.
+    """The tracker's answer to a path-traced pair.
 
     Attributes
     ----------

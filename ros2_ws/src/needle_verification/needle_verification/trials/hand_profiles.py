@@ -1,4 +1,4 @@
-"""What hands do with a needle: constant speeds, changing ones with stops and releases, pushes."""
+"""Ways of hands with a needle: constant speeds, changing ones with stops and releases, pushes."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ _PRESS = {"nonce": "", "sequence": 1, "pressed": True, "speed": 1.0, "mode": "in
 
 
 class HostilePages:
-    """What they try.
+    """Attempts of hostile pages.
 
     Parameters
     ----------

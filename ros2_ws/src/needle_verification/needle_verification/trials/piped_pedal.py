@@ -67,7 +67,7 @@ class PipedPedal:
 
 
 class PipeDevice:
-    """What the kernel is to a device file, for the pipe of a `PipedPedal`.
+    """The kernel's side of a device file, for the pipe of a `PipedPedal`.
 
     As there, who opens it sees no event from before, but the state that came of it.
 

@@ -46,7 +46,7 @@ _START_NS = 1_000_000_000
 
 @dataclasses.dataclass(frozen=True)
 class Hand:
-    """What a person does at a moment.
+    """A person's action at a moment.
 
     Attributes
     ----------

@@ -114,7 +114,7 @@ class _DriveWitness(HoldWitness):
 
 @dataclasses.dataclass
 class _Rig:
-    """What a trial works with."""
+    """Rig of a trial."""
 
     witness: _DriveWitness
     graph: TrialProcesses

@@ -1,4 +1,4 @@
-"""What can be lost between a finger and the needle."""
+"""Losses between a finger and the needle."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a trial of the console takes: rig, console, browser, a way to press, a hand that steers."""
+"""Setting of a trial of the console: rig, console, browser, a way to press, a hand that steers."""
 
 from __future__ import annotations
 

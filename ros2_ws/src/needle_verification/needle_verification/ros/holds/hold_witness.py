@@ -23,7 +23,7 @@ _STILL = 1e-9
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where the needle was.
+    """Place of the needle at a time.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class HoldWitness(ListeningNode):
 
     @property
     def insertion(self) -> float:
-        """Where the needle is [m]."""
+        """The needle's insertion now [m]."""
         return self.places[-1].insertion if self.places else 0.0
 
     def last_motion(self, begin: float, end: float) -> float:

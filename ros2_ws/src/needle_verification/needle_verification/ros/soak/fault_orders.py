@@ -1,4 +1,4 @@
-"""What each fault of the vocabulary does to the virtual rig, when it begins and when it ends."""
+"""Effects of each fault of the vocabulary on the virtual rig, at its begin and at its end."""
 
 from __future__ import annotations
 

@@ -35,7 +35,7 @@ _JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_
 
 @dataclasses.dataclass(frozen=True)
 class RunResult:
-    """What came of a run.
+    """Result of a run.
 
     Attributes
     ----------

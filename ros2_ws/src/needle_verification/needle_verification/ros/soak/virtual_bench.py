@@ -31,7 +31,7 @@ _PIECE = 0.0002, 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Motors:
-    """Where both motors really are.
+    """True positions of both motors.
 
     Attributes
     ----------
@@ -106,7 +106,7 @@ class Bench:
 
     @property
     def _way(self) -> tuple[float, float]:
-        """What the motors have moved since the needle followed them [m], [rad]."""
+        """Motion of the motors since the needle followed them [m], [rad]."""
         at, taken = self.motors, self._taken
         return at.insertion - taken.insertion, at.rotation - taken.rotation
 

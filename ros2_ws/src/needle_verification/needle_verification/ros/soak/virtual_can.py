@@ -161,7 +161,7 @@ class VirtualLink(CanLink):
 
 
 class _Opening:
-    """What python-can's buses are to the link."""
+    """The part of python-can's bus that the link uses."""
 
     def __init__(self, adapter: VirtualCan, link: VirtualLink, process: VirtualProcess) -> None:
         self._adapter, self._link, self._process = adapter, link, process

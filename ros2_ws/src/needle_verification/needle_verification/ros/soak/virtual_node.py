@@ -32,7 +32,7 @@ _PARAMETER_EVENTS_DEPTH = 1000
 
 @dataclasses.dataclass(frozen=True)
 class Place:
-    """Where the next node is made.
+    """Graph and process in which the next node is made.
 
     Attributes
     ----------

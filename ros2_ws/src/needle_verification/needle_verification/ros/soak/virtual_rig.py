@@ -102,7 +102,7 @@ class VirtualRig:
 
     @property
     def tracker(self) -> TipTeller | None:
-        """What tells the tip, while it runs."""
+        """Source of tips, while it runs."""
         tracker = self.nodes.get("stereo_tracker")
         return tracker if isinstance(tracker, TipTeller) else None
 

@@ -38,7 +38,7 @@ def plainly(act: Callable[[], None]) -> None:
 
 
 class Endpoint:
-    """What a node has made and others find.
+    """A node's publisher, subscription, service or client, as others find it.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class Endpoint:
 
     @property
     def info(self) -> SimpleNamespace:
-        """What rclpy's `get_*_info_by_topic` tells of it."""
+        """Answer of rclpy's `get_*_info_by_topic` about it."""
         namespace, _, name = self.node_name.rpartition("/")
         return SimpleNamespace(
             node_name=name, node_namespace=namespace or "/", qos_profile=self.qos_profile

@@ -31,7 +31,7 @@ _LONGEST_FRAME = 65536
 
 
 class BadCable:
-    """What is on its way between two ends.
+    """Frames on their way between two ends.
 
     Parameters
     ----------

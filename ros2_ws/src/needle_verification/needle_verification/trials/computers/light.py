@@ -10,7 +10,7 @@ _PLACE = struct.Struct("dd")
 
 
 class Light:
-    """Where the needle is, for processes of one machine whatever their networks.
+    """Position of the needle, for processes of one machine whatever their networks.
 
     Parameters
     ----------
