@@ -1,7 +1,7 @@
 """Work in parts on a Dask cluster: which worker does which part, and when, makes no difference.
 
 A worker that dies has its parts done by another. One that runs other code, or other versions of
-what is reckoned with, ends the work: its results would not be those of this machine.
+numerical libraries, ends the work: its results would not be those of this machine.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 CONNECTS_WITHIN = 30.0
 """How long a scheduler has to answer [s]."""
-_RECKONED_WITH = ("numpy", "scipy", "numba")
+_NUMERICAL = ("numpy", "scipy", "numba")
 _PACKAGES = (
     "needle_analysis", "needle_bags", "needle_bringup", "needle_common", "needle_console",
     "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker",
@@ -43,7 +43,7 @@ def on_cluster(
     Parameters
     ----------
     address : str
-        The scheduler's, such as tcp://10.0.0.5:8786. Without workers their coming is waited for.
+        The scheduler's, such as tcp://10.0.0.5:8786. Without workers it waits for some.
     work : callable
         A function of a module, which workers can import.
     parts : sequence
@@ -57,7 +57,8 @@ def on_cluster(
     """
     if re.fullmatch(r"(tcp|tls)://[^\s/]+:\d+", address) is None:
         raise UserError(
-            f"--scheduler {address!r} is not tcp://HOST:PORT or tls://HOST:PORT, as it says itself"
+            f"--scheduler {address!r} is not tcp://HOST:PORT or tls://HOST:PORT, "
+            "as the scheduler prints it"
         )
     try:
         # An extra, and a second of imports that only studies on a cluster pay for.
@@ -66,7 +67,7 @@ def on_cluster(
         raise UserError(
             "--scheduler: Dask is not installed; scripts/dask --version installs it"
         ) from error
-    # What it has to say comes as an exception, too.
+    # All that it logs comes as an exception, too.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     run = functools.partial(_run, work, identity())
     # Results that have come before those of parts ahead of them.
@@ -114,7 +115,7 @@ def identity() -> Mapping[str, str]:
             for module in sorted(Path(place).rglob("*.py")):
                 code.update(f"{package}/{module.relative_to(place)}\n".encode())
                 code.update(module.read_bytes())
-    versions = {name: importlib.metadata.version(name) for name in _RECKONED_WITH}
+    versions = {name: importlib.metadata.version(name) for name in _NUMERICAL}
     python = ".".join(platform.python_version_tuple()[:2])
     return {"python": python, **versions, "code": code.hexdigest()[:12]}
 

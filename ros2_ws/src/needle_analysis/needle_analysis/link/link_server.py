@@ -62,7 +62,7 @@ class LinkServer:
         return len(self._listeners)
 
     def turn(self, now: float) -> None:
-        """Let come who wants to, read, send on, and let go who has gone or stopped reading.
+        """Accept clients, read, send, and drop those that have gone or stopped reading.
 
         Parameters
         ----------

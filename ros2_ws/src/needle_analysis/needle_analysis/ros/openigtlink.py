@@ -22,8 +22,8 @@ from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 
 HELP = """
-openigtlink: shows the needle to 3D Slicer and whatever else speaks OpenIGTLink, while somebody
-listens. It moves nothing, nothing waits for it, and what comes in at its port is thrown away.
+openigtlink: shows the needle to 3D Slicer and other OpenIGTLink clients, while one is connected.
+It moves nothing, nothing waits for it, and what comes in at its port is discarded.
 
 Subscribes  needle/tip_pose, needle/estimate, needle/controller_status, target_plane, joint_states
 Sends       TRANSFORM NeedleTipToRig, NeedleEstimateToRig, TargetPlaneToRig; POINT NeedleShaft,

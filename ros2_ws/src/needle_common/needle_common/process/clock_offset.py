@@ -25,7 +25,7 @@ class ClockOffset:
     within: float
 
     @property
-    def surely(self) -> float:
+    def least_difference(self) -> float:
         """Least difference of the two clocks [s]."""
         return max(abs(self.ahead) - self.within, 0.0)
 

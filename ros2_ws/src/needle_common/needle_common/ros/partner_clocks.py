@@ -87,7 +87,7 @@ def judge(offsets: Mapping[str, ClockOffset | None]) -> Diagnostic:
     for name, offset in sorted(offsets.items()):
         values[f"{name} ahead_s"] = "" if offset is None else f"{offset.ahead:.4f}"
         values[f"{name} within_s"] = "" if offset is None else f"{offset.within:.4f}"
-        if offset is not None and offset.surely > BOUND:
+        if offset is not None and offset.least_difference > BOUND:
             side = "ahead of" if offset.ahead > 0.0 else "behind"
             wrong.append(
                 f"the clock of {name} is {abs(offset.ahead):.3f} s (+-{offset.within:.3f} s) "

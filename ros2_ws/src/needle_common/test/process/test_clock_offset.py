@@ -21,7 +21,7 @@ def test_the_truth_is_within_whatever_the_ways_take(
     answered = asked + (there_ms + ahead_ms) * MS
     offset = clock_offset(asked, answered, asked + (there_ms + back_ms) * MS)
     assert abs(offset.ahead - ahead_ms * 1e-3) <= offset.within + 1e-12
-    assert offset.surely <= abs(ahead_ms) * 1e-3 + 1e-12
+    assert offset.least_difference <= abs(ahead_ms) * 1e-3 + 1e-12
 
 
 def test_the_narrowest_reading_counts_and_old_ones_do_not() -> None:

@@ -21,7 +21,7 @@ from websockets.http11 import Request, Response
 from needle_common.errors import UserError
 from needle_console.access.access import Access
 from needle_console.access.rate_limit import RateLimit
-from needle_console.hold.hold_desk import HoldDesk
+from needle_console.hold.hold_arbiter import HoldArbiter
 from needle_console.hold.hold_state import RELEASED, HoldState
 from needle_console.hold.page_message import LONGEST, GarbageError, read_token
 from needle_console.hold.refusals import Refusal, Refusals
@@ -75,7 +75,7 @@ class HoldServer:
         self._on_state = on_state
         self._on_notice = on_notice
         self._refusals = Refusals()
-        self._desk = HoldDesk(lambda: secrets.token_hex(8))
+        self._arbiter = HoldArbiter(lambda: secrets.token_hex(8))
         self._told = RELEASED
         self._connections = 0
         self._socket = _listen(access.address, port)
@@ -146,14 +146,14 @@ class HoldServer:
         while True:
             self._called.clear()
             now = time.monotonic()
-            period = PERIOD if self._desk.has_pages else ALONE_PERIOD
+            period = PERIOD if self._arbiter.has_pages else ALONE_PERIOD
             # Sooner than was meant where the first page has come.
             due = min(due, now + period)
-            if now >= due or (self._told.pressed and now > self._desk.until):
+            if now >= due or (self._told.pressed and now > self._arbiter.until):
                 self._tell()
                 while due <= now:
                     due += period
-            wait = min(due, max(self._desk.until, now) + _TICK) if self._told.pressed else due
+            wait = min(due, max(self._arbiter.until, now) + _TICK) if self._told.pressed else due
             # Its own timer, and no task for each wait: that was half of what an idle console cost.
             timer = self._loop.call_later(wait - now, self._called.set)
             await self._called.wait()
@@ -163,13 +163,13 @@ class HoldServer:
 
     def _tell(self) -> None:
         now = time.monotonic()
-        if self._desk.lapses(now):
+        if self._arbiter.lapses(now):
             self._refuse(Refusal.LOST, "no fresh word of the page; it takes a new press")
-        self._told = self._desk.state(now)
+        self._told = self._arbiter.state(now)
         self._on_state(self._told)
 
     def _tell_change(self) -> None:
-        if self._desk.state(time.monotonic()) != self._told:
+        if self._arbiter.state(time.monotonic()) != self._told:
             self._tell()
 
     def _refuse(self, refusal: Refusal, detail: str = "") -> None:
@@ -225,7 +225,7 @@ class HoldServer:
         return False
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        page = self._desk.open(time.monotonic())
+        page = self._arbiter.open(time.monotonic())
         if page is None:
             await self._close(connection, Refusal.PAGES)
             return
@@ -235,7 +235,7 @@ class HoldServer:
             await self._hear(connection, page)
         finally:
             # First of all: what a gone page held ends now.
-            self._desk.close(page)
+            self._arbiter.close(page)
             self._tell_change()
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
@@ -251,9 +251,9 @@ class HoldServer:
                 connection.transport.abort()
                 return
             # A silence that nobody watched is one all the same.
-            if self._desk.lapses(now):
+            if self._arbiter.lapses(now):
                 self._refuse(Refusal.LOST)
-            refusal = self._desk.receive(page, data, now)
+            refusal = self._arbiter.receive(page, data, now)
             if refusal is not None:
                 self._refuse(refusal)
             self._tell_change()
@@ -261,13 +261,13 @@ class HoldServer:
     async def _send_nonces(self, connection: ServerConnection, page: int) -> None:
         while True:
             now = time.monotonic()
-            if self._desk.is_silent(page, now):
+            if self._arbiter.is_silent(page, now):
                 self._refuse(Refusal.SILENT)
                 connection.transport.abort()
                 return
-            nonce = self._desk.issue(page, now)
+            nonce = self._arbiter.issue(page, now)
             if nonce is not None:
-                await connection.send(json.dumps({"nonce": nonce, **self._desk.tell(page, now)}))
+                await connection.send(json.dumps({"nonce": nonce, **self._arbiter.tell(page, now)}))
             await asyncio.sleep(PERIOD)
 
 

@@ -9,7 +9,7 @@ from nicegui import events, ui
 
 from needle_common.errors import UserError
 from needle_console.page.desk import Desk
-from needle_console.view.advice import Button, advise, sensible
+from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot
 from needle_console.view.targets import plane_pose, target_point
 
@@ -57,7 +57,7 @@ class Controls:
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
-        possible = sensible(snapshot)
+        possible = usable_buttons(snapshot)
         device = snapshot.device
         must_let_go = device is not None and device.press_again == self._desk.name
         for button, element in self._buttons.items():
@@ -95,13 +95,15 @@ class Controls:
             offset = _number("Plane offset [mm]", 3.0)
             tilt = _number("Tilt [deg]", 0.0)
             self._add_target(
-                "Set plane", lambda: self._desk.send_plane(plane_pose(_of(offset), _of(tilt)))
+                "Set plane",
+                lambda: self._desk.send_plane(plane_pose(_typed(offset), _typed(tilt))),
             )
         with ui.element("div").classes("targets point"):
             x, y = _number("Point x [mm]", 10.0), _number("y [mm]", -5.0)
             z = _number("z [mm]", 100.0)
             self._add_target(
-                "Set point", lambda: self._desk.send_point(target_point(_of(x), _of(y), _of(z)))
+                "Set point",
+                lambda: self._desk.send_point(target_point(_typed(x), _typed(y), _typed(z))),
             )
 
     def _add_button(self, button: Button) -> None:
@@ -132,7 +134,7 @@ def _number(label: str, value: float) -> ui.number:
     return ui.number(label, value=value, step=0.5).props("dense outlined").classes("number")
 
 
-def _of(field: ui.number) -> float:
+def _typed(field: ui.number) -> float:
     """Return what was typed; nothing is no number."""
     if field.value is None:
         raise UserError("a number is missing")

@@ -49,7 +49,7 @@ class Gate:
         if scope["type"] not in ("http", "websocket"):
             await self.app(scope, receive, send)
             return
-        send = _in_no_frame(send)
+        send = _forbid_framing(send)
         why = self._why_not(scope)
         if why:
             await _refuse(scope, send, 403, why)
@@ -94,8 +94,8 @@ class Gate:
         await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
 
 
-def _in_no_frame(send: _Send) -> _Send:
-    """Let no page be shown inside another one, which could lay it under a finger."""
+def _forbid_framing(send: _Send) -> _Send:
+    """Forbid showing a page inside another one, which could lay it under a finger."""
 
     async def send_so(message: MutableMapping[str, Any]) -> None:
         if message["type"] == "http.response.start":

@@ -80,7 +80,7 @@ class WebServer:
         self._thread.start()
 
     def close(self) -> None:
-        """End; pages that are open see that nobody answers."""
+        """Stop serving; open pages see that nobody answers."""
         self._server.should_exit = True
         if self._thread.is_alive():
             self._thread.join(_JOIN)

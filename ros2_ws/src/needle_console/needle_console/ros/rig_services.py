@@ -62,7 +62,7 @@ class RigServices:
         self._bell.trigger()
 
     def look(self, now: float) -> None:
-        """Give up what has not been answered."""
+        """Give up calls that have not been answered."""
         for future, (service, asked_at) in list(self._pending.items()):
             if now - asked_at > _PATIENCE:
                 del self._pending[future]
@@ -77,7 +77,7 @@ class RigServices:
                 return
             client = self._clients[service]
             if not client.service_is_ready():
-                self._tell(f"{service}: nobody is there who answers")
+                self._tell(f"{service}: no server is there")
                 continue
             request = Trigger.Request() if data is None else SetBool.Request(data=data)
             future = client.call_async(request)

@@ -81,8 +81,8 @@ def advise(snapshot: Snapshot, name: str) -> Advice:
     return way(snapshot, device)
 
 
-def sensible(snapshot: Snapshot) -> frozenset[Button]:
-    """Return the buttons that can do something in the present state; *Stop* always can."""
+def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
+    """Return the buttons that have an effect in the present state; *Stop* always has."""
     device, controller = snapshot.device, snapshot.controller
     if device is None:
         return frozenset()

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 
-from needle_console.view.advice import Button, advise, sensible
+from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.rig_state import ControllerState, DeviceState
 from needle_console.view.snapshot import Snapshot
 
@@ -39,7 +39,7 @@ def test_a_run_is_led_from_button_to_button(snapshot: Snapshot, button: Button |
     assert advice.button is button
     assert advice.headline
     assert advice.text
-    assert button is None or button in sensible(snapshot)
+    assert button is None or button in usable_buttons(snapshot)
 
 
 def test_a_fault_is_named() -> None:
@@ -64,7 +64,7 @@ def test_every_state_has_words_and_no_button_that_cannot_be_pressed() -> None:
         advice = advise(snapshot, "console")
         assert advice.headline
         assert advice.text
-        assert advice.button is None or advice.button in sensible(snapshot), snapshot
+        assert advice.button is None or advice.button in usable_buttons(snapshot), snapshot
 
 
 _STEERING = ("STEERING", "WAITING_FOR_TIP")

@@ -42,7 +42,7 @@ _BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
 
 @dataclasses.dataclass(frozen=True)
 class Violation:
-    """Something that must never be.
+    """One violation of an invariant.
 
     Attributes
     ----------

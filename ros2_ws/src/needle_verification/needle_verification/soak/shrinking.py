@@ -1,4 +1,4 @@
-"""The shortest schedule that still does what a longer one does."""
+"""Shortening of a schedule to the faults that a violation needs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from needle_verification.soak.faults import Fault
 
 
 def shrink(faults: Sequence[Fault], still: Callable[[list[Fault]], bool]) -> list[Fault]:
-    """Leave faults out, then make those that stay shorter, while it still happens.
+    """Drop faults, then shorten those that remain, as long as it still happens.
 
     Parameters
     ----------

@@ -78,7 +78,7 @@ class VirtualWorld:
         self.call_at(self.steady_ns + delay_ns, action)
 
     def run_until(self, end_ns: int, predicate: Callable[[], Any] = lambda: False) -> bool:
-        """Let all happen that is due by `end_ns` [ns], or until `predicate` holds.
+        """Run all that is due by `end_ns` [ns], or until `predicate` holds.
 
         Returns
         -------
@@ -153,7 +153,7 @@ class VirtualProcess:
         return self._stopped
 
     def do(self, action: Callable[[], None]) -> None:
-        """Do `action` as soon as the process comes to it."""
+        """Queue `action` for the process."""
         if self.alive:
             self._ready.append(action)
             self._plan_turn(0)
@@ -170,7 +170,7 @@ class VirtualProcess:
             action()
         self._plan_turn(0)
 
-    def do_beside(self, action: Callable[[], None]) -> None:
+    def do_concurrently(self, action: Callable[[], None]) -> None:
         """Do `action` at once, as another thread would; while it stands still, when it goes on."""
         if not self.alive:
             return
@@ -180,7 +180,7 @@ class VirtualProcess:
             action()
 
     def kill(self) -> None:
-        """Be gone from one moment to the next."""
+        """End at once, as after SIGKILL."""
         self.alive = False
         self._ready.clear()
 

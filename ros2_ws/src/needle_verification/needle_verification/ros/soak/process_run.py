@@ -1,4 +1,4 @@
-"""One run of the rig as real processes: some are killed or stopped, all is watched from outside."""
+"""One run of the rig as real processes: some are killed or stopped, and judged from outside."""
 
 from __future__ import annotations
 
@@ -151,7 +151,15 @@ def run_processes(seed: int, folder: Path) -> RunResult:
     ):
         _insert(witness, graph, faults)
         violations = tuple(witness.watch.violations)
-        return RunResult(seed, tuple(faults), violations, witness.now, of_processes=True)
+        happened = tuple(faults)
+        return RunResult(
+            seed,
+            happened,
+            violations,
+            witness.now,
+            of_processes=True,
+            told_by_moments=happened,
+        )
 
 
 def _insert(witness: Witness, graph: TrialProcesses, faults: Sequence[Fault]) -> None:

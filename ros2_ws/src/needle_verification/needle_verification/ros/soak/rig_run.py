@@ -44,7 +44,7 @@ class RunResult:
     faults : tuple of Fault
         What happened to it.
     violations : tuple of Violation
-        What must never be, and was.
+        Invariants that did not hold.
     simulated : float
         How long it took in its own time [s].
     of_processes : bool

@@ -24,24 +24,25 @@ from needle_verification.soak.invariants import Violation
 from needle_verification.soak.shrinking import shrink
 
 HELP = """\
-Run the whole rig many times in simulated time, under random faults; watch what must always hold.
+Run the whole rig many times in simulated time, under random faults, and check its invariants.
 
 Each run has all nodes of the rig in one process, on one clock and one seed: driver with emulated
 drives, controller, operator, a person, and up to six faults (nodes killed, stopped, slow; topics,
 services and bus lossy, late, silent; drives, cameras, clocks and people that fail). The same seed
-gives the same run. A run that violates an invariant is shrunk and kept as a file.
+gives the same run. The schedule of a run that violates an invariant is shortened, and kept as a
+file with --failures.
 
 With --processes, runs of real processes follow, in real time, one after the other: nodes are killed
-and stopped while a simulated needle is inserted. They want a machine with nothing else to do.
+and stopped while a simulated needle is inserted. They need an otherwise idle machine.
 """
 EXAMPLES = """\
 examples:
   scripts/soak --runs 300                300 runs
-  scripts/soak --runs 1 --seed 4711      that run again
-  scripts/soak --runs 300 --processes 3  and three of real processes, some 25 s each
-  scripts/soak --schedule FILE           what a file of an earlier run tells
+  scripts/soak --runs 1 --seed 4711      repeat the run of one seed
+  scripts/soak --runs 300 --processes 3  then three of real processes, some 25 s each
+  scripts/soak --schedule FILE           replay a schedule that an earlier run kept
 
-exit codes: 0 nothing was violated, 1 something was, 2 bad input, 130 interrupted.
+exit codes: 0 no invariant violated, 1 at least one violated, 2 bad input, 130 interrupted.
 """
 
 
@@ -57,14 +58,18 @@ def _options(arguments: list[str] | None) -> argparse.Namespace:
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--runs", type=int, default=300, metavar="N", help="how many (300)")
+    parser.add_argument("--runs", type=int, default=300, metavar="N", help="number of runs (300)")
     parser.add_argument(
-        "--processes", type=int, default=0, metavar="N", help="runs of real processes (0)"
+        "--processes", type=int, default=0, metavar="N", help="number of runs of real processes (0)"
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="of the first run (1)")
-    parser.add_argument("--schedule", type=Path, metavar="FILE", help="seed and faults of one run")
     parser.add_argument(
-        "--failures", type=Path, metavar="DIR", help="where schedules that violate are kept"
+        "--seed", type=int, default=1, metavar="S", help="seed of the first run (1)"
+    )
+    parser.add_argument(
+        "--schedule", type=Path, metavar="FILE", help="replay the seed and faults in this file"
+    )
+    parser.add_argument(
+        "--failures", type=Path, metavar="DIR", help="keep schedules that violate here"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON")
     return parser.parse_args(arguments)

@@ -129,7 +129,7 @@ class Sight(enum.Enum):
     LATE = "late"
 
 
-class TipTeller(VirtualNode):
+class TrackerStandIn(VirtualNode):
     """Stands in for the tracker: tells the tip of every exposure.
 
     Parameters

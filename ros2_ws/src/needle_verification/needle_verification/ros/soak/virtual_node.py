@@ -253,13 +253,13 @@ class VirtualNode(Node):
         subscription = VirtualSubscription(
             *self._at(topic), _qos(qos_profile), kind=msg_type, callback=callback, raw=raw
         )
-        subscription.careful = partial(self._carefully, subscription.topic_name)
+        subscription.careful = partial(self.run_guarded, subscription.topic_name)
         return subscription
 
     def create_service(self, srv_type: Any, srv_name: str, callback: Any, **_: Any) -> Any:
         """Make a service."""
         service = VirtualService(*self._at(srv_name), kind=srv_type, callback=callback)
-        service.careful = partial(self._carefully, service.srv_name)
+        service.careful = partial(self.run_guarded, service.srv_name)
         self._services.append(service)
         return service
 
@@ -306,8 +306,8 @@ class VirtualNode(Node):
     def _at(self, name: str) -> tuple[Any, ...]:
         return self._graph, self._process, self._full_name, self.resolve_topic_name(name)
 
-    def _carefully(self, source: str, act: Callable[[], None]) -> None:
-        """Do as `NodeExecutor` does: whatever a message leads to ends no node."""
+    def run_guarded(self, source: str, act: Callable[[], None]) -> None:
+        """Run a callback as `NodeExecutor` does: an exception in it does not end the node."""
         try:
             act()
         except UserError:

@@ -15,7 +15,7 @@ from needle_bringup.ros.operator import OperatorNode
 from needle_common.errors import UserError
 from needle_controller.ros.plane_controller import PlaneControllerNode
 from needle_device_driver.ros.device_driver import DeviceDriverNode
-from needle_verification.ros.soak.virtual_bench import TIP_NOISE, Bench, TipTeller
+from needle_verification.ros.soak.virtual_bench import TIP_NOISE, Bench, TrackerStandIn
 from needle_verification.ros.soak.virtual_can import VirtualCan, VirtualLink
 from needle_verification.ros.soak.virtual_node import Place, placed, virtual_nodes
 from needle_verification.ros.soak.virtual_person import (
@@ -40,7 +40,7 @@ _RESTART_NS = NANOSECONDS
 
 
 class VirtualRig:
-    """All that is there, from the needle to the person.
+    """The rig from the needle to the person.
 
     Parameters
     ----------
@@ -101,10 +101,10 @@ class VirtualRig:
         return person
 
     @property
-    def tracker(self) -> TipTeller | None:
+    def tracker(self) -> TrackerStandIn | None:
         """Source of tips, while it runs."""
         tracker = self.nodes.get("stereo_tracker")
-        return tracker if isinstance(tracker, TipTeller) else None
+        return tracker if isinstance(tracker, TrackerStandIn) else None
 
     def start(self, name: str) -> None:
         """Start a node that does not run."""
@@ -161,7 +161,7 @@ class VirtualRig:
             buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
             return {"source": "joy", **buttons}, OperatorNode
         if name == "stereo_tracker":
-            return {}, partial(TipTeller, self.bench)
+            return {}, partial(TrackerStandIn, self.bench)
         if name == "joy_node":
             return {}, partial(Joystick, self.hand)
         return {}, partial(Person, self.hand, lambda: self.bench.motors.insertion)
@@ -180,7 +180,7 @@ class VirtualRig:
 
 @contextlib.contextmanager
 def virtual_rig(seed: int, depth: float | None) -> Iterator[VirtualRig]:
-    """Have a rig, with its own clocks, until the end of the block; arguments as of it."""
+    """Run the block with a rig that has its own clocks; arguments as of `VirtualRig`."""
     # Nodes made of rings of references: collected here, not somewhere in the middle of a run.
     rig = None
     with virtual_nodes():

@@ -26,7 +26,7 @@ class _Page:
     why: Refusal | None = None
 
 
-class HoldDesk:
+class HoldArbiter:
     """Takes what pages say. `now` is everywhere the steady clock [s].
 
     The first page that presses owns the hold, until it is gone or has not pressed for `IDLE`: what

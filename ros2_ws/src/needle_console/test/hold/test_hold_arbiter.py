@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from needle_console.hold.hold_desk import IDLE, MOST_PAGES, SILENCE, HoldDesk
+from needle_console.hold.hold_arbiter import IDLE, MOST_PAGES, SILENCE, HoldArbiter
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.hold.nonces import Nonces
 from needle_console.hold.page_session import LIFETIME
@@ -24,22 +24,22 @@ def counting() -> Callable[[], str]:
 
 
 class Scene:
-    """A desk and its pages, in a time of their own."""
+    """An arbiter and its pages, in a time of their own."""
 
     def __init__(self) -> None:
-        self.desk = HoldDesk(counting())
+        self.arbiter = HoldArbiter(counting())
         self.now = 100.0
         self._sequences: dict[int, int] = {}
 
     def page(self) -> int:
-        page = self.desk.open(self.now)
+        page = self.arbiter.open(self.now)
         assert page is not None
         self._sequences[page] = 0
         return page
 
     def message(self, page: int, pressed: bool, nonce: str | None = None, **changes: Any) -> str:
         if nonce is None:
-            nonce = self.desk.issue(page, self.now)
+            nonce = self.arbiter.issue(page, self.now)
             assert nonce is not None
         self._sequences[page] += 1
         fields = {
@@ -52,7 +52,7 @@ class Scene:
         return json.dumps({**fields, **changes})
 
     def say(self, page: int, pressed: bool, **changes: Any) -> Refusal | None:
-        return self.desk.receive(page, self.message(page, pressed, **changes), self.now)
+        return self.arbiter.receive(page, self.message(page, pressed, **changes), self.now)
 
     def press(self, page: int) -> None:
         assert self.say(page, False) is None
@@ -64,20 +64,20 @@ class Scene:
 
     @property
     def pressed(self) -> bool:
-        return self.desk.state(self.now).pressed
+        return self.arbiter.state(self.now).pressed
 
 
 def test_a_press_after_a_release_counts_with_its_speed_and_mode() -> None:
     scene = Scene()
     page = scene.page()
-    assert scene.desk.state(scene.now) == RELEASED
+    assert scene.arbiter.state(scene.now) == RELEASED
     scene.say(page, False)
     assert scene.say(page, True, speed=0.25, mode="retract") is None
-    assert scene.desk.state(scene.now) == HoldState(True, 0.25, Mode.RETRACT)
+    assert scene.arbiter.state(scene.now) == HoldState(True, 0.25, Mode.RETRACT)
     assert scene.say(page, True, speed=0.75, mode="retract") is None
-    assert scene.desk.state(scene.now).speed == 0.75
+    assert scene.arbiter.state(scene.now).speed == 0.75
     assert scene.say(page, False) is None
-    assert scene.desk.state(scene.now) == RELEASED
+    assert scene.arbiter.state(scene.now) == RELEASED
 
 
 def test_a_page_that_comes_pressed_has_to_release_first() -> None:
@@ -98,8 +98,8 @@ def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence() -> None:
         assert scene.say(page, True) is None
     scene.wait(LIFETIME + 1e-6)
     assert not scene.pressed
-    assert scene.desk.lapses(scene.now)
-    assert not scene.desk.lapses(scene.now)
+    assert scene.arbiter.lapses(scene.now)
+    assert not scene.arbiter.lapses(scene.now)
     # The finger that is still there counts for nothing.
     for _ in range(10):
         assert scene.say(page, True) is Refusal.NEW_PRESS
@@ -115,7 +115,7 @@ def test_a_hold_counts_from_its_nonce_however_late_the_message_comes() -> None:
     scene.wait(0.05)
     late = scene.message(page, True)
     scene.wait(0.04)
-    assert scene.desk.receive(page, late, scene.now) is None
+    assert scene.arbiter.receive(page, late, scene.now) is None
     scene.wait(0.055)
     assert scene.pressed
     scene.wait(0.01)
@@ -133,7 +133,7 @@ def test_a_burst_after_a_stall_does_not_count() -> None:
     scene.wait(LIFETIME)
     assert not scene.pressed
     for data in held_up:
-        assert scene.desk.receive(page, data, scene.now) is not None
+        assert scene.arbiter.receive(page, data, scene.now) is not None
         assert not scene.pressed
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
@@ -144,8 +144,8 @@ def test_a_release_and_press_within_a_stall_do_not_count() -> None:
     scene.press(page)
     release, press = scene.message(page, False), scene.message(page, True)
     scene.wait(LIFETIME + 1e-6)
-    assert scene.desk.receive(page, release, scene.now) is Refusal.STALE
-    assert scene.desk.receive(page, press, scene.now) is Refusal.STALE
+    assert scene.arbiter.receive(page, release, scene.now) is Refusal.STALE
+    assert scene.arbiter.receive(page, press, scene.now) is Refusal.STALE
     assert scene.say(page, True) is Refusal.NEW_PRESS
     assert not scene.pressed
 
@@ -156,7 +156,7 @@ def test_a_press_that_is_too_old_when_it_comes_does_not_count_later() -> None:
     scene.say(page, False)
     press = scene.message(page, True)
     scene.wait(LIFETIME + 1e-6)
-    assert scene.desk.receive(page, press, scene.now) is Refusal.STALE
+    assert scene.arbiter.receive(page, press, scene.now) is Refusal.STALE
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
 
@@ -165,18 +165,18 @@ def test_replayed_messages_do_not_count() -> None:
     page = scene.page()
     release, press = scene.message(page, False), scene.message(page, True)
     for data in (release, press):
-        assert scene.desk.receive(page, data, scene.now) is None
+        assert scene.arbiter.receive(page, data, scene.now) is None
     assert scene.pressed
     scene.say(page, False)
-    assert scene.desk.receive(page, release, scene.now) is Refusal.REPEATED
-    assert scene.desk.receive(page, press, scene.now) is Refusal.REPEATED
+    assert scene.arbiter.receive(page, release, scene.now) is Refusal.REPEATED
+    assert scene.arbiter.receive(page, press, scene.now) is Refusal.REPEATED
     # With a higher number, but the nonce of an earlier one.
     again = json.dumps({**json.loads(press), "sequence": 1000})
-    assert scene.desk.receive(page, again, scene.now) is Refusal.NONCE
+    assert scene.arbiter.receive(page, again, scene.now) is Refusal.NONCE
     # To another page.
     other = scene.page()
-    assert scene.desk.receive(other, release, scene.now) is Refusal.NONCE
-    assert scene.desk.receive(other, press, scene.now) is Refusal.NONCE
+    assert scene.arbiter.receive(other, release, scene.now) is Refusal.NONCE
+    assert scene.arbiter.receive(other, press, scene.now) is Refusal.NONCE
     assert not scene.pressed
 
 
@@ -194,12 +194,12 @@ def test_garbage_ends_a_hold(data: str | bytes) -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
-    assert scene.desk.receive(page, data, scene.now) is Refusal.GARBAGE
+    assert scene.arbiter.receive(page, data, scene.now) is Refusal.GARBAGE
     assert not scene.pressed
     assert scene.say(page, True) is Refusal.NEW_PRESS
     # And what was heard before it.
     scene.say(page, False)
-    scene.desk.receive(page, data, scene.now)
+    scene.arbiter.receive(page, data, scene.now)
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
 
@@ -218,24 +218,24 @@ def test_one_page_owns_the_hold_until_it_is_gone_or_idle() -> None:
     first, second = scene.page(), scene.page()
     scene.press(first)
     scene.say(first, False)
-    assert scene.desk.tell(first, scene.now)["owner"] == "you"
-    assert scene.desk.tell(second, scene.now)["owner"] == "other"
+    assert scene.arbiter.tell(first, scene.now)["owner"] == "you"
+    assert scene.arbiter.tell(second, scene.now)["owner"] == "other"
     scene.say(second, False)
     assert scene.say(second, True) is Refusal.OTHER_PAGE
-    assert scene.desk.tell(second, scene.now)["why"] == "another page steers"
-    scene.desk.close(first)
+    assert scene.arbiter.tell(second, scene.now)["why"] == "another page steers"
+    scene.arbiter.close(first)
     # The finger that is still there counts for nothing.
     assert scene.say(second, True) is Refusal.NEW_PRESS
     scene.press(second)
     scene.say(second, False)
     third = scene.page()
     scene.wait(IDLE + 1e-6)
-    assert scene.desk.tell(third, scene.now)["owner"] == "nobody"
+    assert scene.arbiter.tell(third, scene.now)["owner"] == "nobody"
     scene.press(third)
-    assert scene.desk.tell(second, scene.now)["owner"] == "other"
+    assert scene.arbiter.tell(second, scene.now)["owner"] == "other"
     # What the earlier owner says or does is nothing to the hold.
     scene.say(second, False)
-    scene.desk.close(second)
+    scene.arbiter.close(second)
     assert scene.pressed
 
 
@@ -243,29 +243,29 @@ def test_a_page_that_goes_takes_its_hold_along() -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
-    scene.desk.close(page)
+    scene.arbiter.close(page)
     assert not scene.pressed
 
 
 def test_pages_are_few_and_not_silent() -> None:
     scene = Scene()
     pages = [scene.page() for _ in range(MOST_PAGES)]
-    assert scene.desk.open(scene.now) is None
-    scene.desk.close(pages[3])
+    assert scene.arbiter.open(scene.now) is None
+    scene.arbiter.close(pages[3])
     page = scene.page()
     scene.wait(SILENCE)
-    assert not scene.desk.is_silent(page, scene.now)
+    assert not scene.arbiter.is_silent(page, scene.now)
     scene.wait(1e-6)
-    assert scene.desk.is_silent(page, scene.now)
+    assert scene.arbiter.is_silent(page, scene.now)
     scene.say(page, False)
-    assert not scene.desk.is_silent(page, scene.now)
+    assert not scene.arbiter.is_silent(page, scene.now)
 
 
 def test_a_page_that_does_not_answer_is_sent_no_more_than_a_burst() -> None:
     scene = Scene()
     page = scene.page()
     for _ in range(3):
-        nonces = [scene.desk.issue(page, scene.now) for _ in range(2 * Nonces.MOST)]
+        nonces = [scene.arbiter.issue(page, scene.now) for _ in range(2 * Nonces.MOST)]
         assert sum(nonce is not None for nonce in nonces) == Nonces.MOST
         assert nonces[Nonces.MOST :] == [None] * Nonces.MOST
         scene.say(page, False, nonce=nonces[Nonces.MOST - 1])
@@ -307,7 +307,7 @@ class Witness(Scene):
         self._holder: int | None = None
 
     def write(self, page: int, pressed: bool) -> str | None:
-        nonce = self.desk.issue(page, self.now)
+        nonce = self.arbiter.issue(page, self.now)
         if nonce is None:
             return None
         self._sent[nonce] = page, self.now
@@ -325,12 +325,12 @@ class Witness(Scene):
             elif self.now - sent <= LIFETIME:
                 self._released[page] = self._event
         self._heard[page] = max(self._heard.get(page, -1), fields["sequence"])
-        self.desk.receive(page, data, self.now)
+        self.arbiter.receive(page, data, self.now)
         self.look()
 
     def look(self) -> None:
         """Look at the hold now, and judge it."""
-        holders = [page for page in self.pages if self.desk.tell(page, self.now)["held"]]
+        holders = [page for page in self.pages if self.arbiter.tell(page, self.now)["held"]]
         assert len(holders) == self.pressed
         holder = holders[0] if holders else None
         if holder is not None:
@@ -368,9 +368,9 @@ def test_nothing_resumes_by_itself_whatever_comes(
             if action == "renumber":
                 data = json.dumps({**json.loads(data), "sequence": 2 * len(scene.written)})
         elif action == "garbage":
-            scene.desk.receive(page, "{", scene.now)
+            scene.arbiter.receive(page, "{", scene.now)
         elif action == "reload":
-            scene.desk.close(page)
+            scene.arbiter.close(page)
             scene.pages[number] = scene.page()
         if data is not None:
             scene.deliver(scene.pages[number], data)
