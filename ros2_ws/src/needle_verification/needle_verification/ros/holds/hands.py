@@ -43,7 +43,7 @@ _JOY_PERIOD = 0.02
 _NEUTRAL, _AGAIN = 0.2, 2.0
 
 
-class Hand(Protocol):
+class HeldSource(Protocol):
     """Presses a source that can be lost."""
 
     def press(self) -> None:
@@ -128,19 +128,19 @@ class _Joystick:
         self._graph.end(OPERATOR)
 
 
-HANDS: Mapping[str, Callable[[Path, TrialProcesses, HoldWitness], Hand]] = {
+HANDS: Mapping[str, Callable[[Path, TrialProcesses, HoldWitness], HeldSource]] = {
     "pedal_unplugged": PedalFoot,
     "joy_silent": _Joystick,
     "operator_frozen": _FrozenOperator,
 }
 
 
-def hold_anew(hand: Hand, witness: HoldWitness) -> None:
+def hold_anew(hand: HeldSource, witness: HoldWitness) -> None:
     """Press anew until the needle moves: what was lost must be there and neutral first.
 
     Parameters
     ----------
-    hand : Hand
+    hand : HeldSource
         Who presses.
     witness : HoldWitness
         Sees the needle.

@@ -22,7 +22,7 @@ from needle_verification.ros.holds.hands import (
     LATEST,
     READY,
     RECENT,
-    Hand,
+    HeldSource,
     fast_insertion,
     hold_anew,
     until_deep,
@@ -70,7 +70,7 @@ def hold_trials(folder: Path, domain: int, trials: Iterable[Trial]) -> Outcomes:
                             graph.check()
 
 
-def _lose(hand: Hand, witness: HoldWitness, rng: random.Random) -> dict[str, Any]:
+def _lose(hand: HeldSource, witness: HoldWitness, rng: random.Random) -> dict[str, Any]:
     """Hold, lose the source at a random moment, get it back as it was, and watch."""
     hold_anew(hand, witness)
     witness.pause(rng.uniform(0.0, LATEST))
