@@ -7,9 +7,6 @@ nothing that is not joined to the entry is followed. Several paths are returned,
 of its own: which one is the needle, two views decide together.
 """
 
-# Compiled functions take plain numbers, one by one.
-# ruff: noqa: PLR0912, PLR0917
-
 from __future__ import annotations
 
 import dataclasses
@@ -19,22 +16,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled, inlined
+from needle_common.compiled import compiled
+from needle_tracker.image.best_paths import Ridge, Rows, best_paths
 from needle_tracker.image.search_grid import SearchGrid
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
-Ridge = NDArray[np.float32]
-Rows = NDArray[np.int64]
 
 _SLOPE = 1.0  # largest sideways step along a path, per step outwards (45 deg from the radius)
-_IMPOSSIBLE = np.float32(-1e6)
 _CUT_ROWS = 6
-_STRENGTH = 0.3  # a clear line counts for more than a faint one
 _SHADOW_SHARE, _WHOLE = 0.65, 0.7
 _NOISE_PITCH = 5
-_OWN_ROWS = 24  # near its end a path has its cells for itself, ...
-_OWN_WIDTH = 0.7e-3  # ... so far to either side [m]
+_OWN_WIDTH = 0.7e-3  # near its end a path has the cells so far to either side for itself [m]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +48,8 @@ class DetectionSettings:
         Shortest visible path that counts [m].
     min_coverage : float
         Least share of a path that looks like a needle.
+    longest_gap : float
+        Where so much of a path looks like none, it has ended [needle widths].
     """
 
     bright: bool | None = None
@@ -63,6 +58,7 @@ class DetectionSettings:
     noise_factor: float = 5.0
     min_length: float = 2.0e-3
     min_coverage: float = 0.5
+    longest_gap: float = math.inf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -203,11 +199,13 @@ def find_paths(
     ).astype(np.int64)
     widths = np.ceil(_OWN_WIDTH / (grid.distances[:rows] * grid.angle_pitch)).astype(np.int64)
     least = max(int(settings.min_length / grid.row_pitch), 2)
+    longest_gap = settings.longest_gap * settings.needle_width_px / grid.row_pitch_px
+    spent = np.float32(longest_gap * threshold)
     found = []
     for bright in (False, True) if settings.bright is None else (settings.bright,):
         sign = np.float32(1.0 if bright else -1.0)
-        cells, lengths, sums = _best_paths(
-            ridge, reachable, steps, widths, sign, np.float32(threshold), first_end, count
+        cells, lengths, sums = best_paths(
+            ridge, reachable, steps, widths, sign, np.float32(threshold), spent, first_end, count
         )
         for path_columns, end_row, evidence in zip(cells, lengths, sums, strict=True):
             if end_row + 1 < least:
@@ -279,99 +277,6 @@ def _appearance(
         values[i] = sign * ridge[i, columns[i]]
         over += values[i] > threshold
     return over / len(columns), float(np.median(values))
-
-
-@compiled
-def _accumulate(evidence: Ridge, steps: Rows, total: Ridge, first: int) -> None:
-    """Fill `total` from a row on with the largest sums of evidence of paths to each cell."""
-    rows, columns = evidence.shape
-    widest = columns + 2 * steps.max()
-    one, other = np.empty(widest, np.float32), np.empty(widest, np.float32)
-    for i in range(first, rows):
-        if i == 0:
-            total[i] = evidence[i]
-            continue
-        # The largest of two spans is that of one twice as long; each written to a place of its
-        # own, so that many cells are done at once.
-        step, span = steps[i], 1
-        length = columns + 2 * step
-        one[:step] = _IMPOSSIBLE
-        one[step : step + columns] = total[i - 1]
-        one[step + columns : length] = _IMPOSSIBLE
-        while 2 * span <= 2 * step + 1:
-            length -= span
-            _larger(one, one[span:], other[:length])
-            one, other = other, one
-            span *= 2
-        _larger(one, one[2 * step + 1 - span :], total[i])
-        total[i] += evidence[i]
-
-
-@inlined
-def _larger(some: Ridge, others: Ridge, result: Ridge) -> None:
-    for j in range(len(result)):
-        result[j] = max(some[j], others[j])
-
-
-@compiled
-def _best_paths(
-    ridge: Ridge,
-    reachable: NDArray[np.bool_],
-    steps: Rows,
-    widths: Rows,
-    sign: np.float32,
-    threshold: np.float32,
-    first_end: int,
-    count: int,
-) -> tuple[Rows, Rows, Array]:
-    """Return columns (count, rows), end rows and sums of the paths with the most evidence.
-
-    A path starts in the first row, ends in `first_end` or later and moves at most `steps[row]`
-    columns sideways from a row to the next. What one path has used near its end is worth nothing
-    to the next: where two lines cross, both are followed.
-    """
-    rows, columns = ridge.shape
-    evidence = np.empty((rows, columns), np.float32)
-    for i in range(rows):
-        for j in range(columns):
-            value = -threshold
-            if reachable[i, j]:
-                over = sign * ridge[i, j] - threshold
-                value = min(max(over, -threshold), 2.0 * threshold)
-                value += _STRENGTH * min(max(over - 2.0 * threshold, 0.0), 8.0 * threshold)
-            evidence[i, j] = value
-    total = np.empty((rows, columns), np.float32)
-    _accumulate(evidence, steps, total, 0)
-    fresh = max(first_end - _OWN_ROWS, 1)
-    cells = np.zeros((count, rows), np.int64)
-    lengths = np.zeros(count, np.int64)
-    sums = np.zeros(count)
-    for n in range(count):
-        if n:
-            _accumulate(evidence, steps, total, fresh)
-        end, column, largest = 0, 0, np.float32(0.0)
-        for i in range(first_end, rows):
-            for j in range(columns):
-                if total[i, j] > largest:
-                    end, column, largest = i, j, total[i, j]
-        if not largest > 0.0:
-            break
-        sums[n] = largest / threshold
-        lengths[n] = end
-        cells[n, end] = column
-        for i in range(end, 0, -1):
-            # Of equals the straightest: a flat stretch must not pull the path to one side.
-            chosen, best = column, total[i - 1, column]
-            for away in range(1, steps[i] + 1):
-                for k in (column - away, column + away):
-                    if 0 <= k < columns and total[i - 1, k] > best:
-                        chosen, best = k, total[i - 1, k]
-            column = chosen
-            cells[n, i - 1] = column
-        for i in range(fresh, end + 1):
-            place = cells[n, i]
-            evidence[i, max(place - widths[i], 0) : place + widths[i] + 1] = -threshold
-    return cells, lengths, sums
 
 
 def of_one_polarity(paths: list[list[Path]]) -> list[list[Path]]:

@@ -164,9 +164,14 @@ class MapLook:
         )
         drawn = self._draw(image, box, grid.tiles(rows, margin, tile_counts(image), TILE))
         least = max(int(sure.min_length / grid.row_pitch), 2, 0 if ends is None else ends[0])
+        # What follows a gap may be another thing, and then the way to it leaves the needle early:
+        # so first without gaps.
         paths = [
             part
-            for path in detection.find_paths(drawn, grid, sure, ends=ends)
+            for gap in (_GAP_WIDTHS, _HIDDEN_WIDTHS)
+            for path in detection.find_paths(
+                drawn, grid, dataclasses.replace(sure, longest_gap=gap), ends=ends
+            )
             for part in _parts(drawn, path, least, settings.needle_width_px)
         ]
         return sorted(paths, key=lambda path: -path.evidence)

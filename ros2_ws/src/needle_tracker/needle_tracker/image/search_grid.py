@@ -89,6 +89,12 @@ class SearchGrid:
         return float(self.distances[1] - self.distances[0])
 
     @property
+    def row_pitch_px(self) -> float:
+        """Distance between rows where the camera sees them, in the middle [px]."""
+        middle = self.pixels[:, self.pixels.shape[1] // 2]
+        return float(np.median(np.linalg.norm(np.diff(middle, axis=0), axis=1)))
+
+    @property
     def angle_pitch(self) -> float:
         """Angle between columns [rad]."""
         return float(self.angles[1] - self.angles[0])

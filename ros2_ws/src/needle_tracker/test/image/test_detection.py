@@ -121,6 +121,30 @@ def test_what_a_path_looks_like_is_its_median_and_its_share(
     assert path.coverage == pytest.approx(5 / 7)
 
 
+@pytest.mark.parametrize(("longest_gap", "end"), [(2.0, 30), (4.0, 30), (8.0, 59), (np.inf, 59)])
+def test_a_path_ends_before_a_gap_and_not_where_the_way_across_it_leaves_the_line(
+    monkeypatch: pytest.MonkeyPatch, longest_gap: float, end: int
+) -> None:
+    rows, columns = 60, 41
+    grid = small_grid(rows, columns, angle_pitch=0.2)  # one column a row
+    ridge = np.zeros((rows, columns), np.float32)
+    # A line from the entry to row 30, and a plainer one aside, from row 36 on.
+    ridge[:31, 20] = 40.0
+    ridge[36:, 32] = 60.0
+    monkeypatch.setattr("needle_tracker.image.detection._sampled_ridge", lambda *_: (ridge, 0.0))
+    settings = DetectionSettings(
+        bright=True,
+        needle_width_px=4.0,
+        min_contrast=10.0,
+        min_length=0.0,
+        min_coverage=0.0,
+        longest_gap=longest_gap,
+    )
+    path = find_paths(np.zeros((200, 200), np.uint8), grid, settings, count=1)[0]
+    assert path.rows[-1] == end
+    assert (path.columns[:31] == 20).all() == (end == 30)
+
+
 @pytest.mark.parametrize(("contrast", "found"), [(50.0, True), (8.0, False)])
 def test_a_line_is_measured_against_the_noise(
     views: Views, settings: TrackerSettings, contrast: float, *, found: bool
