@@ -1,4 +1,4 @@
-"""Paths in needle maps: where they may begin."""
+"""Paths and ends in needle maps: where they may begin and end, how sure a map must be."""
 
 from __future__ import annotations
 
@@ -77,3 +77,52 @@ def test_a_needle_has_come_where_there_was_none_of_it(
     assert (look.background.difference(image) is None) is not paper
     found = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
     assert (found is not None and found.come) is come
+
+
+def shown(
+    monkeypatch: pytest.MonkeyPatch, lines: list[tuple[np.ndarray, float]]
+) -> tuple[MapLook, np.ndarray]:
+    """Return a look whose map is drawn by hand: points in the image and how sure each line is."""
+    drawn = np.zeros(SHAPE, np.uint8)
+    for pixels, sure in lines:
+        corners = [np.round(16.0 * pixels).astype(np.int32)]
+        cv2.polylines(drawn, corners, False, round(255.0 * sure), 4, cv2.LINE_AA, 4)
+    monkeypatch.setattr(MapLook, "_draw", lambda *_: drawn)
+    return MapLook(WIDTH_PX, 0.0), np.zeros(SHAPE, np.uint8)
+
+
+def test_an_end_is_found_though_the_way_to_what_follows_leaves_the_needle_before_it(
+    views: tuple[RefractedCamera, RefractedCamera],
+    settings: TrackerSettings,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
+    aside = int(np.searchsorted(grid.angles, 4e-3 / grid.distances[84]))
+    middle = int(np.searchsorted(grid.angles, 0.0))
+    needle, track = grid.pixels[:81, middle], grid.pixels[84:, aside]
+    look, image = shown(monkeypatch, [(needle, 1.0), (track, 1.0)])
+    found = look.find_paths(image, grid, DetectionSettings(needle_width_px=WIDTH_PX), None)
+    off = [np.linalg.norm(each.pixels[-1] - needle[-1]) for each in found]
+    assert min(off) < 1.5 * WIDTH_PX
+
+
+@pytest.mark.parametrize(("sure", "seen"), [(1.0, True), (0.12, True), (0.02, False)])
+def test_a_map_that_is_as_unsure_of_all_of_a_needle_shows_its_end(
+    views: tuple[RefractedCamera, RefractedCamera],
+    settings: TrackerSettings,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    sure: float,
+    seen: bool,
+) -> None:
+    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
+    needle = grid.pixels[:81, int(np.searchsorted(grid.angles, 0.0))]
+    look, image = shown(monkeypatch, [(needle, sure)])
+    detection = DetectionSettings(needle_width_px=WIDTH_PX)
+    found = look.find_paths(image, grid, detection, None)
+    assert bool(found) is seen
+    direction = (needle[-1] - needle[-9]) / np.linalg.norm(needle[-1] - needle[-9])
+    tip = look.fit(image, Expected(needle[-1], direction, 100.0, 6, 0.0), True, detection)
+    assert (tip is not None and tip.clear) is seen
+    if tip is not None:
+        assert np.linalg.norm(tip.point - needle[-1]) < WIDTH_PX
