@@ -90,32 +90,16 @@ class LinkFaults:
         """Let the fault on a link end."""
         self._on.pop(name, None)
 
-<<<<<<< HEAD
-    def fates(self, name: str, data: bytes, way: Way) -> list[Fate]:
-        """Return all arrivals of a message that is sent now."""
-        fault = self._on.get(name)
-        if fault is None:
-            return [Fate(data)]
-        draw = way.faults.random
-        fates = []
-        for _ in range(2 if draw() < fault.duplicates else 1):
-            if draw() < fault.loss:
-                continue
-            late_ns = way.faults.randint(0, fault.late_ns)
-            fates.append(Fate(data, late_ns, fault.reorders))
-        return fates
-=======
-    def deliveries(self, name: str, data: bytes, world: VirtualWorld) -> list[Delivery]:
+    def deliveries(self, name: str, data: bytes, way: Way) -> list[Delivery]:
         """Return all arrivals of a message that is sent now."""
         fault = self._on.get(name)
         if fault is None:
             return [Delivery(data)]
-        draw = world.random.random
+        draw = way.faults.random
         deliveries = []
         for _ in range(2 if draw() < fault.duplicates else 1):
             if draw() < fault.loss:
                 continue
-            late_ns = world.random.randint(0, fault.late_ns)
+            late_ns = way.faults.randint(0, fault.late_ns)
             deliveries.append(Delivery(data, late_ns, fault.reorders))
         return deliveries
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)

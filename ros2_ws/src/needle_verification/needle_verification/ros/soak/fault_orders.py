@@ -209,19 +209,11 @@ class FaultOrders:
 
         def change_to(value: Any) -> None:
             change = partial(node.set_parameters, [Parameter(name, value=value)])
-            process.do(lambda: node._carefully("set_parameters", change))
+            process.do(lambda: node.run_guarded("set_parameters", change))
 
-<<<<<<< HEAD
         change_to(choice[name])
         # A name that it does not know was not taken.
         return partial(change_to, had) if had is not None else _nothing
-=======
-        def try_to_change() -> None:
-            node.run_guarded("set_parameters", change)
-
-        self._rig.processes["plane_controller"].do(try_to_change)
-        return _nothing
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)
 
     # ---- strangers ----------------------------------------------------------------------------
 

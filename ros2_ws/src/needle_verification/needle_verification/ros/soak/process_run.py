@@ -16,8 +16,8 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import HOLD, RELIABLE, values_of
-from needle_verification.ros.drive_hand import DriveHand
+from needle_common.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
+from needle_verification.ros.drive_hand import JOINTS, DriveHand
 from needle_verification.ros.listening_node import ros
 from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
 from needle_verification.ros.soak.virtual_person import OUT
@@ -41,6 +41,10 @@ _WITHOUT_SYNC = 0.1
 class Witness(DriveHand):
     """Hears holds, status and motors, and judges them; draws the needle out when it is asked to.
 
+    Times are those at which a message was sent, so that a witness who is late judges no other. It
+    judges motion from the first word of the person on: DDS may let it hear that later than the
+    driver does.
+
     Attributes
     ----------
     watch : Watch
@@ -49,20 +53,22 @@ class Witness(DriveHand):
 
     def __init__(self) -> None:
         self.watch = Watch(bounds_of_the_rig(), _RELEASE_BOUND)
-        self._begun = time.monotonic()
+        self._begun = time.time()
         self._moved_at = 0.0
+        self._hears_person = False
         super().__init__(steers=False)
         # Whose press it is that moves the needle.
         self._holder = PERSON
-        self.create_subscription(Joy, "device/hold", self._on_hold, HOLD)
+        self.create_subscription(JointState, "sim/drive_positions", self._on_places, JOINT_STATES)
+        self.create_subscription(Joy, "device/hold", self._on_hold, HOLDS_HEARD)
         self.create_subscription(
             JointTrajectory, "device/joint_trajectory", self._on_command, RELIABLE
         )
 
     @property
     def now(self) -> float:
-        """Steady time since it began [s]."""
-        return time.monotonic() - self._begun
+        """System time since it began [s]."""
+        return time.time() - self._begun
 
     def draw_out(self) -> None:
         """Mend what a person can mend, then hold until the needle is out.
@@ -91,23 +97,27 @@ class Witness(DriveHand):
             self.pause(0.2)
         self.release()
 
-    def _on_hold(self, message: Joy) -> None:
+    def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
         if message.header.frame_id == self._holder:
-            pressed = any(message.buttons)
-            self.watch.see_hand(self.now, holds=pressed)
+            self._hears_person = True
+            pressed, at = any(message.buttons), self._sent_at(info)
+            self.watch.see_hand(at, holds=pressed)
             if pressed:
-                self.watch.see_hold(self.now)
+                self.watch.see_hold(at)
 
     def _on_command(self, message: JointTrajectory) -> None:
         self.watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
 
-    def _on_positions(self, message: JointState) -> None:
-        super()._on_positions(message)
-        before, self._moved_at = self._moved_at, self.now
+    def _on_places(self, message: JointState, info: dict[str, int]) -> None:
+        before, self._moved_at = self._moved_at, self._sent_at(info)
         if self._moved_at - before > _WITHOUT_SYNC:
             self.watch.see_drives_go_on(self._moved_at)
-        at = self.motors[-1]
-        self.watch.see_motors(self._moved_at, at.insertion, at.rotation)
+        if self._hears_person:
+            at = dict(zip(message.name, message.position, strict=True))
+            self.watch.see_motors(self._moved_at, *(at[joint] for joint in JOINTS))
+
+    def _sent_at(self, info: dict[str, int]) -> float:
+        return info["source_timestamp"] * 1e-9 - self._begun
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         super()._on_status(message)

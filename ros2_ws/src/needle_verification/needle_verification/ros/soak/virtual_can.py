@@ -75,18 +75,9 @@ class VirtualCan:
 
     def send(self, identifier: int, data: bytes) -> None:
         """Put a frame of the computer's on the bus."""
-<<<<<<< HEAD
         for due_ns, arrived in self._arrivals(TO_DRIVES, identifier, data):
             frame = CanFrame(identifier, arrived)
             self._world.call_at(due_ns, partial(self._take, frame))
-=======
-        for delivery in self._faults.deliveries(TO_DRIVES, data, self._world):
-            frame = CanFrame(identifier, delivery.data)
-            self._world.call_at(
-                self._arrival(TO_DRIVES, delivery.late_ns, overtakes=delivery.overtakes),
-                lambda frame=frame: self._take(frame),  # type: ignore[misc]
-            )
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)
 
     def _take(self, frame: CanFrame) -> None:
         self.bus.receive(frame, self._world.steady)
@@ -96,23 +87,11 @@ class VirtualCan:
         self._hand_on(self.bus.poll(self._world.steady))
         self._world.call_after(_POLL_NS, self._poll)
 
-<<<<<<< HEAD
     def _hand_on(self, frames: list[CanFrame]) -> None:
         for frame in frames:
             for due_ns, arrived in self._arrivals(FROM_DRIVES, frame.identifier, frame.data):
                 message = can.Message(
                     arbitration_id=frame.identifier, data=arrived, is_extended_id=False
-=======
-    def _hand_on(self) -> None:
-        for frame in self.bus.poll(self._world.steady):
-            for delivery in self._faults.deliveries(FROM_DRIVES, frame.data, self._world):
-                message = can.Message(
-                    arbitration_id=frame.identifier, data=delivery.data, is_extended_id=False
-                )
-                self._world.call_at(
-                    self._arrival(FROM_DRIVES, delivery.late_ns, overtakes=delivery.overtakes),
-                    lambda message=message: self._arrive(message),  # type: ignore[misc]
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)
                 )
                 self._world.call_at(due_ns, partial(self._arrive, message))
 
@@ -126,12 +105,12 @@ class VirtualCan:
         if key not in self._ways:
             self._ways[key] = Way(self._world, _FRAME_NS, *key)
         way = self._ways[key]
-        for fate in self._faults.fates(link, data, way):
-            due_ns = self._world.steady_ns + way.takes_ns() + fate.late_ns
-            if not fate.overtakes:
+        for delivery in self._faults.deliveries(link, data, way):
+            due_ns = self._world.steady_ns + way.takes_ns() + delivery.late_ns
+            if not delivery.overtakes:
                 # A bus keeps the order.
                 due_ns = self._last_ns[link] = max(due_ns, self._last_ns[link])
-            yield due_ns, fate.data
+            yield due_ns, delivery.data
 
 
 class VirtualLink(CanLink):

@@ -83,9 +83,9 @@ class VirtualClient:
 
     def _pass(self, data: bytes, arrive: Callable[[bytes], None]) -> None:
         world = self._graph.world
-        for fate in self._graph.faults.fates(self.srv_name, data, self._way):
-            late_ns = self._way.takes_ns() + fate.late_ns
-            world.call_after(late_ns, lambda data=fate.data: arrive(data))  # type: ignore[misc]
+        for delivery in self._graph.faults.deliveries(self.srv_name, data, self._way):
+            late_ns = self._way.takes_ns() + delivery.late_ns
+            world.call_after(late_ns, lambda data=delivery.data: arrive(data))  # type: ignore[misc]
 
     def _servers(self) -> list[VirtualService]:
         servers = self._graph.services.get(self.srv_name, ())

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
 from needle_verification.soak.invariants import DISCOVERED_WITHIN
-from needle_verification.soak.link_faults import Fate, LinkFaults, Way
+from needle_verification.soak.link_faults import Delivery, LinkFaults, Way
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
 # From an endpoint's creation until another process knows it [ns], at least and at most.
@@ -239,21 +239,12 @@ class VirtualPublisher(Endpoint):
     def _put_on_link(self, subscription: VirtualSubscription, data: bytes, sent_ns: int) -> bool:
         """Send a message once; returns whether it arrives."""
         world = self.graph.world
-<<<<<<< HEAD
         way = self._way(subscription)
-        fates = self.graph.faults.fates(self.topic_name, data, way)
-        for fate in fates:
-            arrival = world.steady_ns + way.takes_ns() + fate.late_ns
-            if self._keeps_order(fate, subscription):
-                arrival = max(arrival, self._arrivals.get(subscription, 0))
-=======
-        deliveries = self.graph.faults.deliveries(self.topic_name, data, world)
+        deliveries = self.graph.faults.deliveries(self.topic_name, data, way)
         for delivery in deliveries:
-            arrival = world.steady_ns + self.graph.transport_ns() + delivery.late_ns
-            if not delivery.overtakes or self._is_reliable(subscription):
-                # One nanosecond later at least, since ties are drawn.
-                arrival = max(arrival, self._arrivals.get(subscription, 0) + 1)
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)
+            arrival = world.steady_ns + way.takes_ns() + delivery.late_ns
+            if self._keeps_order(delivery, subscription):
+                arrival = max(arrival, self._arrivals.get(subscription, 0))
                 self._arrivals[subscription] = arrival
 
             def arrive(data: bytes = delivery.data, sent_ns: int = sent_ns) -> None:
@@ -262,8 +253,8 @@ class VirtualPublisher(Endpoint):
             world.call_at(arrival, arrive)
         return bool(deliveries)
 
-    def _keeps_order(self, fate: Fate, subscription: VirtualSubscription) -> bool:
-        return not fate.overtakes or self._is_reliable(subscription)
+    def _keeps_order(self, delivery: Delivery, subscription: VirtualSubscription) -> bool:
+        return not delivery.overtakes or self._is_reliable(subscription)
 
     def _way(self, subscription: VirtualSubscription) -> Way:
         way = self._ways.get(subscription)
@@ -330,81 +321,6 @@ class VirtualSubscription(Endpoint):
         return {"source_timestamp": sent_ns, "received_timestamp": self.graph.world.system_ns}
 
 
-<<<<<<< HEAD
-=======
-class VirtualService(Endpoint):
-    """rclpy's Service, as far as the nodes use it."""
-
-    def __init__(self, *place: Any, kind: type[Any], callback: Any) -> None:
-        super().__init__(*place)
-        self.srv_type = kind
-        self.callback = callback
-        self.careful: Careful = _plainly
-        self.graph.services.setdefault(self.srv_name, []).append(self)
-
-    def answer(self, data: bytes, reply: Callable[[bytes], None]) -> None:
-        """Answer a request that has come."""
-
-        def act() -> None:
-            if self.gone_ns is None:
-                request = deserialize_message(data, self.srv_type.Request)
-                self.careful(lambda: self._reply(request, reply))
-
-        self.process.do(act)
-
-    def _reply(self, request: Any, reply: Callable[[bytes], None]) -> None:
-        reply(serialize_message(self.callback(request, self.srv_type.Response())))
-
-
-class VirtualClient:
-    """rclpy's Client, as far as the nodes use it."""
-
-    def __init__(
-        self, graph: VirtualGraph, process: VirtualProcess, kind: type[Any], name: str
-    ) -> None:
-        self._graph = graph
-        self._process = process
-        self.srv_type = kind
-        self.srv_name = name
-
-    def service_is_ready(self) -> bool:
-        """Return whether a server is known."""
-        return bool(self._servers())
-
-    def call_async(self, request: Any) -> Future[Any]:
-        """Send a request; where the server is gone no answer ever comes."""
-        graph, future = self._graph, Future()
-        data = serialize_message(request)
-        mark = f"{graph.world.steady_ns} {self._process.name} calls {self.srv_name} {request}\n"
-        graph.digest.update(mark.encode())
-
-        def take(answer: bytes) -> None:
-            self._process.do(
-                lambda: future.set_result(deserialize_message(answer, self.srv_type.Response))
-            )
-
-        def reply(answer: bytes) -> None:
-            self._pass(answer, take)
-
-        for server in self._servers():
-            self._pass(data, lambda there, server=server: server.answer(there, reply))  # type: ignore[misc]
-        return future
-
-    def remove_pending_request(self, _: Future[Any]) -> None:
-        """Forget a request; its answer changes nothing any more."""
-
-    def _pass(self, data: bytes, arrive: Callable[[bytes], None]) -> None:
-        world = self._graph.world
-        for delivery in self._graph.faults.deliveries(self.srv_name, data, world):
-            late_ns = self._graph.transport_ns() + delivery.late_ns
-            world.call_after(late_ns, lambda data=delivery.data: arrive(data))  # type: ignore[misc]
-
-    def _servers(self) -> list[VirtualService]:
-        servers = self._graph.services.get(self.srv_name, ())
-        return [server for server in servers if server.is_seen(self._process)]
-
-
->>>>>>> 23c41ea (Words of soak, console, live view and cluster as an engineer would write them)
 def _is_latched(qos: QoSProfile) -> bool:
     return bool(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL)
 
