@@ -10,7 +10,7 @@ import pytest
 
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.ros import conversions
-from needle_device_driver.cia402 import cia402_axis
+from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.ros.device_interface import DeviceInterface
@@ -149,7 +149,7 @@ def _blocked_axis_keeps_its_power(patch: pytest.MonkeyPatch) -> None:
 
 
 def _start_within_set_up_forgotten(patch: pytest.MonkeyPatch) -> None:
-    await_start = cia402_axis.await_start
+    await_start = drive_upkeep.await_start
 
     def forgetful(link: Any, monitor: Any, *others: Any) -> None:
         await_start(link, monitor, *others)

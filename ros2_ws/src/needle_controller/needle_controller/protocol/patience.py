@@ -38,7 +38,7 @@ class Patience:
             self._since = steady
         return steady - self._since
 
-    def listen(self, steady: float, timeout: float) -> list[Action]:
+    def notice_silence(self, steady: float, timeout: float) -> list[Action]:
         """Say, once, that the device has not been heard for so long [s].
 
         Nothing else follows: a simulation that a person pauses is as silent as a dead driver.

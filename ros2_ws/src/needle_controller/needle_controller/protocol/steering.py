@@ -244,7 +244,7 @@ class Steering:
                 "not move: the command or its answer is lost"
             )
             return self._leave(SteeringState.FAULT, why, "error")
-        return self.patience.listen(steady, timeout)
+        return self.patience.notice_silence(steady, timeout)
 
     def _take_abort(self, kind: str, name: str, text: str) -> list[Action]:
         """Go on from a command that was aborted, unless too many were in a row."""

@@ -243,5 +243,8 @@ def _recover(hand: DriveHand) -> str:
 
 
 def _retract(hand: DriveHand) -> None:
+    if hand.status.get("hold_owner") != hand.get_name():
+        # A busy machine lets a hold lapse.
+        hand.press()
     hand.insist("retract")
     hand.until(lambda: hand.status.get("activity") == "none", "retracted", 60.0)

@@ -27,7 +27,7 @@ class Kind(enum.Enum):
 
 
 class Moment(enum.Enum):
-    """What a fault may follow: what is heard of the rig."""
+    """A moment that a fault may follow, as it is heard of the rig."""
 
     START = "start"
     ADAPTER_OPENED = "adapter opened"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import Fault, Kind, Moment
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS, VirtualWorld
@@ -22,7 +24,11 @@ class Happening:
     def until(self, at: float) -> None:
         self.world.run_until(STEADY_START_NS + round(at * NANOSECONDS))
 
-    def _begin(self, fault: Fault) -> object:
+    @property
+    def state(self) -> tuple[bool, bool]:
+        return self.course.waits, self.course.is_under_way
+
+    def _begin(self, fault: Fault) -> Callable[[], None]:
         self._note(fault, "begins")
         return lambda: self._note(fault, "ends")
 
@@ -48,15 +54,14 @@ def test_a_fault_follows_the_moment_that_it_tells() -> None:
 
 def test_what_waits_and_what_is_under_way() -> None:
     run = Happening(SECOND_PRESS)
-    assert run.course.waits
+    assert run.state == (True, False)
     run.course.meet(Moment.PRESSED)
     run.course.meet(Moment.PRESSED)
-    assert not run.course.waits
-    assert run.course.is_under_way
+    assert run.state == (False, True)
     run.until(1.4)
-    assert run.course.is_under_way
+    assert run.state == (False, True)
     run.until(1.5)
-    assert not run.course.is_under_way
+    assert run.state == (False, False)
 
 
 def test_what_is_given_up_never_happens() -> None:
