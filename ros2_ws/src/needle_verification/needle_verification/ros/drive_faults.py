@@ -243,8 +243,13 @@ def _recover(hand: DriveHand) -> str:
 
 
 def _retract(hand: DriveHand) -> None:
-    if hand.status.get("hold_owner") != hand.get_name():
-        # A busy machine lets a hold lapse.
-        hand.press()
-    hand.insist("retract")
+    for _ in range(_STARVED):
+        if hand.call("retract")[0]:
+            break
+        # A busy machine lets a hold lapse; the status tells so.
+        hand.pause(_STILL)
+        if hand.status.get("hold_owner") != hand.get_name():
+            hand.press()
+    else:
+        hand.insist("retract")
     hand.until(lambda: hand.status.get("activity") == "none", "retracted", 60.0)
