@@ -17,7 +17,8 @@ with d and d' what the estimate is off the needle at both. Of the variance of d'
 there before, for no estimate is less certain than its tip; the rest is new.
 """
 
-# ruff: noqa: PLR0917 - compiled functions take no keywords
+# Compiled code takes keywords slowly or not at all.
+# ruff: noqa: PLR0917
 from __future__ import annotations
 
 import math
@@ -100,8 +101,6 @@ def take_tip(tile: Array, reading: Array, noises: Array, limits: Limits, work: A
     work[CHANGE : CHANGE + ERROR], work[OUTSIDE] = 0.0, 1.0
     work[LIKELIHOOD] = 1.0
     work[SHARE : SHARE + 3 * NOISES] = tile[NOISE : NOISE + 3 * NOISES]
-    is_uniform, is_normal = _is_there(tile, UNIFORM), _is_there(tile, NORMAL)
-    is_lasting = _is_there(tile, LASTING)
     for coordinate in range(3):
         _look(tile, reading, coordinate, limits, work)
         bound = reading[BOUND + coordinate]
@@ -109,13 +108,12 @@ def take_tip(tile: Array, reading: Array, noises: Array, limits: Limits, work: A
             _hand_on(tile, coordinate, work)
         for m in range(NOISES):
             own = coordinate * NOISES + m
-            if is_uniform and _is_thought(tile, m, UNIFORM):
+            if _is_thought(tile, m, UNIFORM):
                 _weigh_uniform(tile, own, bound, noises[UNIFORM, 0, m], work)
-            if is_normal and _is_thought(tile, m, NORMAL):
-                _weigh_normal(tile, own, NORMAL, bound, noises[NORMAL, 0, m], 0.0, limits, work)
-            if is_lasting and _is_thought(tile, own, LASTING):
-                multiple, lasting = noises[LASTING, 0, m], noises[LASTING, 2, m]
-                _weigh_normal(tile, own, LASTING, bound, multiple, lasting, limits, work)
+            for shape, row in ((NORMAL, m), (LASTING, own)):
+                if _is_thought(tile, row, shape):
+                    multiple, lasting = noises[shape, 0, m], noises[shape, 2, m]
+                    _weigh_normal(tile, own, shape, bound, multiple, lasting, limits, work)
         _decide(coordinate, work)
     _judge(tile, reading, noises, limits, work)
     _narrow(tile, work)
@@ -172,15 +170,6 @@ def _hand_on(tile: Array, coordinate: int, work: Array) -> None:
         for h in range(tile.shape[1]):
             own, before = work[SHARE + m, h], work[SHARE + m - NOISES, h]
             work[SHARE + m, h] = own if tile[SHAPE, h] == LASTING else before
-
-
-@inlined
-def _is_there(tile: Array, shape: int) -> bool:
-    """Return whether any estimate that has not ended thinks that noise has a shape."""
-    count = 0
-    for h in range(tile.shape[1]):
-        count += tile[WEIGHT, h] > 0.0 and tile[SHAPE, h] == shape
-    return count > 0
 
 
 @inlined

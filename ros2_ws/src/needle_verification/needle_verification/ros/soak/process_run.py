@@ -166,9 +166,9 @@ def run_processes(seed: int, folder: Path) -> RunResult:
             seed,
             happened,
             violations,
+            happened,
             witness.now,
             of_processes=True,
-            told_by_moments=happened,
         )
 
 

@@ -45,6 +45,9 @@ class RunResult:
         What happened to it.
     violations : tuple of Violation
         Invariants that did not hold.
+    told_by_moments : tuple of Fault
+        Those faults that happened, each told by the last moment that it met; of real processes as
+        they were drawn.
     simulated : float
         How long it took in its own time [s].
     of_processes : bool
@@ -56,19 +59,17 @@ class RunResult:
         Whether the controller was done once.
     log : tuple of str
         What the nodes logged, one line each.
-    told_by_moments : tuple of Fault
-        Those faults that happened, each told by the last moment that it met.
     """
 
     seed: int
     faults: tuple[Fault, ...]
     violations: tuple[Violation, ...]
+    told_by_moments: tuple[Fault, ...]
     simulated: float
     of_processes: bool = False
     digest: str = ""
     inserted: bool = False
     log: tuple[str, ...] = ()
-    told_by_moments: tuple[Fault, ...] = ()
 
 
 def schedule_of(seed: int) -> list[Fault]:
@@ -119,13 +120,13 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             seed,
             tuple(faults),
             tuple(watch.violations),
+            tuple(told_by_moments(course)),
             now,
             digest=rig.graph.digest.hexdigest(),
             inserted=rig.person.done,
             log=tuple(
                 f"{_seconds(at):9.3f} {name}: {level}: {text}" for at, name, level, text in rig.log
             ),
-            told_by_moments=tuple(told_by_moments(course)),
         )
 
 
