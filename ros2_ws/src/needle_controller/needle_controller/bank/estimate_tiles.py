@@ -39,12 +39,15 @@ REMAINDER = NOISE + 3 * NOISES
 """First row of the last tip minus what was then estimated of it [m]."""
 KIND, SHAPE, WEIGHT, EVIDENCE, OUTLIER = range(REMAINDER + 3, REMAINDER + 8)
 """Rows of the torsion hypothesis's number, the shape that noise is thought to have, and the
-weight; and, of the last tip, its likelihood and how likely it was an outlier."""
+weight; and, of the last tip, its likelihood and how likely it was an outlier (0 again where that
+brought a displaced estimate)."""
 ROWS = OUTLIER + 1
 _LOWER = np.tril_indices(ERROR)
 PLACE = np.zeros((ERROR, ERROR), dtype=np.int64)
 """Row of each element of the covariance."""
 PLACE[_LOWER] = PLACE[_LOWER[::-1]] = P + np.arange(PAIRS)
+# More room costs time with each tip; less turns displaced estimates away.
+_ESTIMATES_PER_SPARE = 4
 
 
 class Tiles(NamedTuple):
@@ -100,7 +103,11 @@ def set_rows(tiles: Tiles, first: int, values: Array) -> None:
 
 
 def tidied(tiles: Tiles) -> Tiles:
-    """Return the tiles with one estimate of weight 0 for each needle at most, its last."""
+    """Return the tiles without most estimates of weight 0.
+
+    Room for new ones stays: one of weight 0 for each needle, and one more for every fourth that has
+    a weight.
+    """
     picked, counts = np.empty_like(tiles.owner), np.zeros(len(tiles.first) - 1, dtype=np.int64)
     count = _pick(tiles, picked, counts)
     if count == tiles.first[-1]:
@@ -144,16 +151,17 @@ def _pick(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.in
     """Write which estimates stay, and how many of each needle; return how many in all."""
     count = 0
     for n in range(counts.size):
-        before, ended = count, -1
+        before = count
         for e in range(tiles.first[n], tiles.first[n + 1]):
             if tiles.state[e // LANES, WEIGHT, e % LANES] > 0.0:
                 picked[count] = e
                 count += 1
-            else:
-                ended = e
-        if ended >= 0:
-            picked[count] = ended
-            count += 1
+        spare = 1 + (count - before) // _ESTIMATES_PER_SPARE
+        for e in range(tiles.first[n], tiles.first[n + 1]):
+            if spare > 0 and tiles.state[e // LANES, WEIGHT, e % LANES] == 0.0:
+                picked[count] = e
+                count += 1
+                spare -= 1
         counts[n] = count - before
     return count
 

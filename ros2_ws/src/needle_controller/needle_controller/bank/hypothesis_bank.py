@@ -140,31 +140,33 @@ def _judge(bank: Bank, n: int, limits: Limits) -> None:
         tile[WEIGHT, h] = weight if weight > limits.smallest_weight else 0.0
     bank.refused[n] = refused
     bank.unexplained[n] += _NEWEST_SHARE * (refused - bank.unexplained[n])
-    share = limits.jump_share * refused
-    if share > limits.smallest_weight:
-        _suspect_jump(state, first, end, share, limits)
+    _suspect_jumps(state, first, end, limits)
 
 
 @compiled
-def _suspect_jump(state: Array, first: int, end: int, share: float, limits: Limits) -> None:
-    """Let an estimate that has ended be the likeliest one again, but displaced nobody knows where.
+def _suspect_jumps(state: Array, first: int, end: int, limits: Limits) -> None:
+    """Let estimates for which the tip was an outlier come back, displaced nobody knows where.
 
-    It weighs a share of what the likeliest does. If the needle was not displaced it will end soon;
-    if it was, the next tips will be where it expects them, and the others will end.
+    Each takes the place of one that has ended, likeliest first, and weighs the share of its own
+    that a jump has. If the needle was not displaced it will end soon; if it was, the next tips will
+    be where it expects them, and the others will end.
     """
-    likeliest = free = -1
-    for e in range(first, end):
-        weight = state[e // LANES, WEIGHT, e % LANES]
-        if weight == 1.0:
-            likeliest = e
-        if weight == 0.0:
-            free = e
-    if free < 0:
-        return
-    tile, h = state[free // LANES], free % LANES
-    for row in range(ROWS):
-        tile[row, h] = state[likeliest // LANES, row, likeliest % LANES]
-    tile[WEIGHT, h] = share
-    for axis in range(3):
-        tile[PLACE[axis, axis], h] += limits.jump_variance
-        tile[PLACE[E_TURN + axis, E_TURN + axis], h] += limits.jump_turn_variance
+    while True:
+        likeliest, most, free = -1, limits.smallest_weight, -1
+        for e in range(first, end):
+            tile, h = state[e // LANES], e % LANES
+            weight = limits.jump_share * tile[WEIGHT, h] * tile[OUTLIER, h]
+            if weight > most:
+                likeliest, most = e, weight
+            if tile[WEIGHT, h] == 0.0:
+                free = e
+        if likeliest < 0 or free < 0:
+            return
+        state[likeliest // LANES, OUTLIER, likeliest % LANES] = 0.0
+        tile, h = state[free // LANES], free % LANES
+        for row in range(ROWS):
+            tile[row, h] = state[likeliest // LANES, row, likeliest % LANES]
+        tile[WEIGHT, h] = most
+        for axis in range(3):
+            tile[PLACE[axis, axis], h] += limits.jump_variance
+            tile[PLACE[E_TURN + axis, E_TURN + axis], h] += limits.jump_turn_variance
