@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from needle_bringup.operator.joy_source import JoySource
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.ros import conversions
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
@@ -20,7 +21,6 @@ from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.ros.soak import rig_run
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
 from needle_verification.soak import invariants
 from needle_verification.soak.invariants import Watch
@@ -162,6 +162,15 @@ def _reliable_messages_overtake(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(VirtualPublisher, "_keeps_order", lambda *at: not at[1].overtakes)
 
 
+def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
+    take = JoySource.take
+
+    def unstamped(source: JoySource, axes: Any, buttons: Any, now: float, **_: float) -> None:
+        take(source, axes, buttons, now)
+
+    patch.setattr(JoySource, "take", unstamped)
+
+
 def _set(owner: Any, **values: Any) -> Plant:
     def plant(patch: pytest.MonkeyPatch) -> None:
         for name, value in values.items():
@@ -201,6 +210,6 @@ MENDED = {
     "a_rebooted_drive_is_homed_where_it_stands": MendedBug(
         "turns_as_commanded", _judge_forgets(_zero=0.0)
     ),
-    "a_late_hold": MendedBug("no_motion_without_hold", _set(rig_run, LATEST_MESSAGE=0.0)),
+    "an_overtaken_release": MendedBug("no_motion_by_itself", _overtaken_joystick_counts),
 }
 """By the schedule, in test/ros/soak/schedules, that found them."""

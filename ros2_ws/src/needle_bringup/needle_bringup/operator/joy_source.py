@@ -33,11 +33,28 @@ class JoySource:
         self._publishers = publishers
         self._axes: Sequence[float] = ()
         self._buttons: Sequence[int] = ()
-        self._arrival = -math.inf
+        self._arrival = self._stamp = -math.inf
 
-    def take(self, axes: Sequence[float], buttons: Sequence[int], now: float) -> None:
-        """Take a message that came at this time of the steady clock [s]."""
-        self._axes, self._buttons, self._arrival = axes, buttons, now
+    def take(
+        self, axes: Sequence[float], buttons: Sequence[int], now: float, *, stamp: float = 0.0
+    ) -> None:
+        """Take a message, unless a newer one was taken that still counts.
+
+        A release that is overtaken by the next press would make that press a fresh one again.
+
+        Parameters
+        ----------
+        axes, buttons : sequence
+            As in sensor_msgs/Joy.
+        now : float
+            When it came, by the steady clock [s].
+        stamp : float
+            When it was sent, by the sender's clock [s]; 0: it does not say.
+        """
+        overtaken = 0.0 < stamp < self._stamp
+        if overtaken and now - self._arrival <= LONGEST_SILENCE:
+            return
+        self._axes, self._buttons, self._arrival, self._stamp = axes, buttons, now, stamp
 
     def read(self, now: float) -> Reading:
         """Return what the hand does at this time of the steady clock [s]."""

@@ -30,7 +30,7 @@ from needle_common.ros.base_node import (
     run_node,
 )
 from needle_common.ros.bounded_subscription import listen
-from needle_common.ros.conversions import HOLD, LATCHED, values_of
+from needle_common.ros.conversions import HOLD, LATCHED, to_nanoseconds, values_of
 from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
@@ -101,7 +101,8 @@ class OperatorNode(WholeNode):
 
         def on_joy(messages: list[Joy]) -> None:
             last = messages[-1]
-            joy.take(last.axes, last.buttons, time.monotonic())
+            stamp = to_nanoseconds(last.header.stamp) / 1e9
+            joy.take(last.axes, last.buttons, time.monotonic(), stamp=stamp)
 
         # The newest alone: what waited behind a stall is no hand of now.
         topic = listen(self, Joy, "joy", on_joy, HOLD, refuse=self._diagnostics.refuse)

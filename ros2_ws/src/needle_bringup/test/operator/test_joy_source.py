@@ -28,6 +28,29 @@ def test_the_last_message_counts_while_it_is_fresh() -> None:
     assert source.read(6.0) == Hand(retract=True, speed=0.25)
 
 
+def test_a_message_that_was_overtaken_does_not_count() -> None:
+    source = Desk().source
+    source.take([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.00)
+    source.take([0.0, 1.0], [0, 0, 0], 5.05, stamp=99.98)
+    assert source.read(5.05) == Hand(insert=True, speed=0.5)
+    # It keeps nothing alive either.
+    assert isinstance(source.read(5.00 + 1.001 * LONGEST_SILENCE), Lost)
+    # A sender whose clock was set back is heard again after a silence.
+    source.take([0.0, 1.0], [0, 0, 0], 5.11, stamp=40.00)
+    assert source.read(5.11).is_neutral
+    source.take([0.0, 1.0], [1, 0, 0], 5.13, stamp=40.02)
+    assert source.read(5.13) == Hand(insert=True, speed=0.5)
+
+
+def test_messages_without_a_stamp_count_as_they_come() -> None:
+    source = Desk().source
+    source.take([0.0, 1.0], [1, 0, 0], 5.00, stamp=100.0)
+    source.take([0.0, 1.0], [0, 0, 0], 5.02)
+    assert source.read(5.02).is_neutral
+    source.take([0.0, 1.0], [1, 0, 0], 5.04, stamp=99.0)
+    assert source.read(5.04) == Hand(insert=True, speed=0.5)
+
+
 def test_of_two_that_talk_in_turn_none_counts() -> None:
     desk = Desk()
     desk.source.take([0.0, 1.0], [1, 0, 0], 5.0)

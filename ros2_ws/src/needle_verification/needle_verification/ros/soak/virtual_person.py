@@ -71,7 +71,9 @@ class Joystick(VirtualNode):
 
     def _tell(self) -> None:
         hand = self._hand
-        self._joy.publish(Joy(buttons=[int(hand.insert), int(hand.retract), int(hand.stop)]))
+        joy = Joy(buttons=[int(hand.insert), int(hand.retract), int(hand.stop)])
+        joy.header.stamp = self.get_clock().now().to_msg()
+        self._joy.publish(joy)
 
 
 class Person(VirtualNode):
