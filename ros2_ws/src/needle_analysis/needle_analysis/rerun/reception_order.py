@@ -1,4 +1,4 @@
-"""A bag's messages in the order in which the controller heard them, and those that it did not.
+"""The messages of a bag that the controller heard, in the order in which it heard them.
 
 needle/controller_status tells what the controller had heard since the status before, message by
 message (`needle_controller.protocol.heard_messages`).
@@ -7,12 +7,11 @@ message (`needle_controller.protocol.heard_messages`).
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
 
-from needle_bags.reading.bag_order import SentMessage, raw_as_sent
+from needle_bags.reading.bag_order import SentMessage
 from needle_controller.protocol.heard_messages import HeardMessage, heard_messages
 
 _STATUS = "needle/controller_status"
@@ -35,7 +34,8 @@ def in_reception_order(
     -------
     list of tuple
         Time [ns] and message: that of sending, or the least later one that keeps the order of
-        hearing. Topics that no status tells of count as heard when they were sent.
+        hearing. Topics that no status tells of count as heard when they were sent. What was sent
+        before the last of its topic that was heard, and is told by no status, is left out.
     """
     ordered = sorted(messages, key=lambda m: (m.time, m.log_time))
     heard_at: dict[tuple[str, int], int] = {}
@@ -47,34 +47,18 @@ def in_reception_order(
             heard_at.setdefault((namespace + topic, sent_ns), time)
         # A status comes after what it tells of.
         time = heard_at[status.topic, status.time] = max(time + 1, status.time)
+    last: dict[str, int] = {}
+    for topic, sent_ns in heard_at:
+        last[topic] = max(sent_ns, last.get(topic, 0))
     # What no status tells of any more was heard after the last one.
-    rest = {namespace + topic: time + 1 for _, heard in told for topic, _ in heard}
+    rest = dict.fromkeys(last, time + 1)
     timed = [
-        (heard_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m) for m in ordered
+        (heard_at.get((m.topic, m.time)) or max(m.time, rest.get(m.topic, 0)), m)
+        for m in ordered
+        if (m.topic, m.time) in heard_at or m.time >= last.get(m.topic, 0)
     ]
     # Equal times keep the order of sending.
     return sorted(timed, key=lambda pair: pair[0])
-
-
-def unheard_messages(path: Path, namespace: str) -> frozenset[HeardMessage]:
-    """Return what the controller never heard, topics by their relative names.
-
-    What was sent after the last of its topic that was heard may have been.
-
-    Raises
-    ------
-    UserError
-        If the bag is broken.
-    """
-    statuses = raw_as_sent(path, (namespace + _STATUS).__eq__, lambda _: False)
-    heard = {message for _, told in _told(statuses, namespace) for message in told}
-    last: dict[str, int] = {}
-    for topic, sent_ns in heard:
-        last[namespace + topic] = max(sent_ns, last.get(namespace + topic, 0))
-    sent = raw_as_sent(path, last.__contains__, lambda _: False)
-    early = (m for m in sent if m.time < last[m.topic])
-    names = (HeardMessage(m.topic.removeprefix(namespace), m.time) for m in early)
-    return frozenset(names) - heard
 
 
 def _told(

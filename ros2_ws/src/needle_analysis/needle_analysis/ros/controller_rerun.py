@@ -14,7 +14,6 @@ from needle_bags.ros.parameter_snapshots import plain_value
 from needle_common.errors import UserError
 from needle_common.ros.conversions import to_nanoseconds, values_of
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import HeardMessage
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SteeringState
 from needle_controller.ros.conversions import TARGET_PLANE, TARGET_POINT, to_joint_sample
@@ -40,8 +39,6 @@ class ControllerStage:
         The node's full name in the bag, whose changes of parameters are taken over.
     ends : mapping of int to JointSample
         Stamp of a command [ns] to where it led (`step_ends`).
-    unheard : frozenset of HeardMessage
-        What the recorded controller did not hear (`reception_order.unheard_messages`).
 
     Attributes
     ----------
@@ -54,18 +51,13 @@ class ControllerStage:
     """
 
     def __init__(
-        self,
-        settings: SteeringSettings,
-        node: str,
-        ends: Mapping[int, JointSample],
-        unheard: frozenset[HeardMessage],
+        self, settings: SteeringSettings, node: str, ends: Mapping[int, JointSample]
     ) -> None:
         self._node = node
         self.name = settings.controller
         self._messages = SteeringMessages(settings)
         self._steering = self._messages.steering
         self._ends = ends
-        self._unheard = unheard
         self._steady = 0.0
         self._recorded_trips = 0
         self._recorded_state = ""
@@ -87,8 +79,6 @@ class ControllerStage:
 
     def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Take a message of a topic, by its relative name; return what it led to."""
-        if HeardMessage(topic, sent.time) in self._unheard:
-            return []
         outputs = []
         for action in self._takers[topic](message, sent.time):
             if isinstance(action, Log):

@@ -17,7 +17,6 @@ from needle_analysis.rerun.bag_pass import (
     run_tips,
 )
 from needle_analysis.rerun.comparison import compare
-from needle_analysis.rerun.reception_order import unheard_messages
 from needle_analysis.rerun.rerun_bag import write_rerun
 from needle_analysis.rerun.rerun_text import describe, errors_text, flat, tolerance_table
 from needle_analysis.ros.controller_rerun import ControllerStage, step_ends
@@ -33,6 +32,7 @@ from needle_common.ros.parameters import OF_EVERY_NODE
 from needle_common.settings.parameter_files import read_parameters
 from needle_controller.presets.own_parts import GROUPS
 from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
+from needle_controller.protocol.joint_history import JointSample
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
 
@@ -124,7 +124,8 @@ def _run(words: Sequence[str]) -> int:
     controller_node = _node(run, CONTROLLER, changes)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
     tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
-    controller = _controller(run, controller_node)
+    ends = step_ends(run.path, run.namespace)
+    controller = _controller(controller_node, ends)
     rerun = run_again(run, tracker, controller)
     comparison = compare(rerun.recorded, rerun.today)
 
@@ -134,7 +135,7 @@ def _run(words: Sequence[str]) -> int:
         outputs = rerun.outputs
         answers = [output for output in outputs if output.topic in TIP_TOPICS]
         if answers:
-            outputs = [*answers, *run_tips(run, _controller(run, controller_node), answers)]
+            outputs = [*answers, *run_tips(run, _controller(controller_node, ends), answers)]
         nodes = [node for node in (tracker_node, controller_node) if node is not None]
         used = {node.name: node.values for node in nodes}
         write_rerun(run, given.output, outputs, used, calibration)
@@ -228,11 +229,8 @@ def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
     return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
 
 
-def _controller(run: Run, node: Node) -> ControllerStage:
-    parameters = node.parameters(SteeringSettings)
-    ends = step_ends(run.path, run.namespace)
-    unheard = unheard_messages(run.path, run.namespace)
-    return ControllerStage(parameters, node.name, ends, unheard)
+def _controller(node: Node, ends: Mapping[int, JointSample]) -> ControllerStage:
+    return ControllerStage(node.parameters(SteeringSettings), node.name, ends)
 
 
 def _summary(tracker: TrackerStage | None, controller: ControllerStage) -> str:

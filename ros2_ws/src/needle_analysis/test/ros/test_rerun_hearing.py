@@ -72,7 +72,7 @@ class LateController:
     """Hears a bag's messages late, and writes what it does to a copy of the bag."""
 
     def __init__(self) -> None:
-        self.stage = ControllerStage(settings(), "/plane_controller", ends(), frozenset())
+        self.stage = ControllerStage(settings(), "/plane_controller", ends())
         self.heard = HeardMessages()
         self.said: Any = None
         self.sent: list[tuple[int, str, bytes]] = []
