@@ -1,10 +1,11 @@
 """Gains of the law (10) and of the observer (9) from LQG weights ([KC09] III-B).
 
-Both are designed on the system (8) in inserted length, as in the paper, with continuous Riccati
-equations: the weights then mean the same whatever the step. The law's gain is used as it is, after
+Both are designed on the system (8) in inserted length, as in the paper, for continuous time: the
+weights then mean the same whatever the step. As (8) is a chain of integrators, the roots of a cubic
+solve the Riccati equations. The law's gain is used as it is, after
 a check that holding the input over one step keeps the loop stable. The observer is sampled exactly
 in its error: over any inserted length l its error poles are exp(lambda_i l), lambda_i being those
-of A - L C. A discrete Riccati equation would give a gain for one step length only, while steps are
+of A - L C. A discrete design would give a gain for one step length only, while steps are
 shortened, aborted and resumed.
 """
 
@@ -15,11 +16,10 @@ import functools
 
 import numpy as np
 import numpy.typing as npt
-from scipy import linalg
 
 from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
-from needle_controller.model.feedback_linearization import A, B, C, transition
+from needle_controller.model.feedback_linearization import A, C, transition
 
 _SAME_LENGTH = 12
 """Digits to which lengths of steps agree."""
@@ -191,32 +191,30 @@ def checked_weights(name: str, weights: npt.ArrayLike) -> Array:
     return matrix
 
 
-# Riccati equations are solved in this unit of length: in metres their entries span ten decades.
-_UNIT = 0.02
-_SCALE = np.array([1.0 / _UNIT, 1.0, _UNIT])
-
-
 def _feedback_gain(weights: Array, input_weight: float) -> Array:
     """Return K of (10) for the cost s^T weights s + input_weight v^2 per inserted length."""
-    scaled = weights / _SCALE[:, None] / _SCALE * (_UNIT**4 / input_weight)
-    gain = _riccati_gain(A, B, scaled, "state_weights, input_weight")
-    return np.asarray(gain * _SCALE / _UNIT**2)
+    poles = _optimal_poles(weights / input_weight, "state_weights, input_weight")
+    return np.real(np.poly(poles))[:0:-1]
 
 
 def _observer_gain(process_noise: Array, measurement_density: float) -> Array:
     """Return L of (9), the steady Kalman gain for white process and measurement noise."""
-    scaled = process_noise * _SCALE[:, None] * _SCALE * (_UNIT**4 / measurement_density)
-    gain = _riccati_gain(A.T, C.T, scaled, "process_noise, measurement_std")
-    return np.asarray(gain / _SCALE / _UNIT**2)
+    # The dual problem: the same chain of integrators, with its states in reverse.
+    ratio = process_noise[::-1, ::-1] / measurement_density
+    poles = _optimal_poles(ratio, "process_noise, measurement_std")
+    return np.real(np.poly(poles))[1:]
 
 
-def _riccati_gain(a: Array, b: Array, weights: Array, names: str) -> Array:
-    try:
-        solution = linalg.solve_continuous_are(a, b, weights, np.eye(1))
-    except (np.linalg.LinAlgError, ValueError) as error:
-        raise UserError(f"{names} give no stabilising gain: {error}") from error
-    gain = np.asarray((b.T @ solution)[0], dtype=float)
-    worst = float(np.max(np.linalg.eigvals(a - b @ gain[None, :]).real))
+def _optimal_poles(weights: Array, names: str) -> npt.NDArray[np.complex128]:
+    """Return the stable half of the symmetric root locus of the triple integrator, shape (3,).
+
+    By Kalman's equality, the closed loop's p(s) p(-s) is -s^6 + phi(-s)^T weights phi(s), with
+    phi(s) = (1, s, s^2) and input weight 1: a cubic in s^2.
+    """
+    (q11, _, q13), (_, q22, _), (_, _, q33) = weights
+    squares = np.roots([1.0, -q33, q22 - 2.0 * q13, -q11])
+    poles: npt.NDArray[np.complex128] = -np.sqrt(squares.astype(complex))
+    worst = float(np.max(poles.real))
     if not worst < 0.0:
         raise UserError(f"{names} give no stabilising gain (eigenvalue {worst:g}, wants < 0)")
-    return gain
+    return poles

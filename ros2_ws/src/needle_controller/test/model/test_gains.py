@@ -53,6 +53,24 @@ def test_poles_are_the_stable_ones_of_the_hamiltonian() -> None:
     )
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_gains_are_those_of_the_riccati_equations(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-0.5, 0.5, (3, 1))
+    # Weights and noise that are not diagonal; rows in the units of s and of ds/dl.
+    state_weights = (root @ root.T) * np.outer([1e3, 30.0, 0.3], [1e3, 30.0, 0.3])
+    process_noise = (root @ root.T) * np.outer([3e-4, 0.03, 1.0], [3e-4, 0.03, 1.0])
+    found = gains(state_weights=state_weights, process_noise=process_noise)
+    # In units of 20 mm, so that the solver's matrices are well scaled.
+    units = np.array([50.0, 1.0, 0.02])
+    scaled = state_weights / np.outer(units, units) * 0.02**4 / WEIGHTS["input_weight"]
+    cost = linalg.solve_continuous_are(A, B, scaled, np.eye(1))
+    np.testing.assert_allclose(found.feedback, cost[2] * units / 0.02**2, rtol=1e-9)
+    scaled = process_noise * np.outer(units, units) * 0.02**4 / (STD**2 * 0.001)
+    covariance = linalg.solve_continuous_are(A.T, C.T, scaled, np.eye(1))
+    np.testing.assert_allclose(found.observer, covariance[0] / units / 0.02**2, rtol=1e-9)
+
+
 def test_observer_is_near_the_discrete_kalman_gain() -> None:
     """For slow poles, sampling the continuous design and designing for the samples agree."""
     slow = gains(process_noise=np.diag([1e-9, 1e-6, 1e-3]))
