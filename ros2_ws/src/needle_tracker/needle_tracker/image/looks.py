@@ -243,7 +243,8 @@ class MapLook:
             sigma_along=math.hypot(hidden, _END_SYSTEMATIC * width) if clear else HIDDEN_END_PX,
             sigma_angle=math.hypot(angle, _LINE_SYSTEMATIC / LINE_WIDTHS),
             contrast=255.0 * sure,
-            visibility=sure,
+            # How sure a map is depends on what lies behind the needle, in each view another thing.
+            visibility=1.0,
             clear=clear,
             bright=True,
             allowance=_ALLOWANCE * width,

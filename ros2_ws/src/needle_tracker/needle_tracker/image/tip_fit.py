@@ -45,7 +45,7 @@ class ImageTip:
     contrast : float
         Needle against its surroundings [grey levels].
     visibility : float
-        The same over the brighter of the two: as much in good light as in bad.
+        The same over the brighter of the two: as much in good light as in bad. A map does not say.
     clear : bool
         Whether the end itself is seen; otherwise only the shaft is.
     bright : bool

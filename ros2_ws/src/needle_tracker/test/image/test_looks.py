@@ -126,3 +126,21 @@ def test_a_map_that_is_as_unsure_of_all_of_a_needle_shows_its_end(
     assert (tip is not None and tip.clear) is seen
     if tip is not None:
         assert np.linalg.norm(tip.point - needle[-1]) < WIDTH_PX
+
+
+def test_how_sure_two_maps_are_does_not_tell_two_needles_apart(
+    views: tuple[RefractedCamera, RefractedCamera],
+    settings: TrackerSettings,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
+    needle = grid.pixels[:81, int(np.searchsorted(grid.angles, 0.0))]
+    direction = (needle[-1] - needle[-9]) / np.linalg.norm(needle[-1] - needle[-9])
+    expected, tips = Expected(needle[-1], direction, 100.0, 6, 0.0), []
+    for sure in (1.0, 0.6):
+        look, image = shown(monkeypatch, [(needle, sure)])
+        tip = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
+        assert tip is not None
+        tips.append(tip)
+    assert tips[1].contrast < 0.8 * tips[0].contrast
+    assert tips[1].visibility == tips[0].visibility
