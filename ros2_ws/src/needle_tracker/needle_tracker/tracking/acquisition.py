@@ -202,6 +202,7 @@ class Acquisition:
             if paths[0][pair[0]].bright is paths[1][pair[1]].bright
         ]
         pairs.sort(key=lambda pair: -paths[0][pair[0]].evidence - paths[1][pair[1]].evidence)
+        best: Measurement | None = None
         first: Measurement | None = None
         for pair in pairs:
             for i in range(2):
@@ -219,10 +220,14 @@ class Acquisition:
                 (left_path, right_path), (left, right), insertion, last, on_way=on_way
             )
             if measured.tip is not None:
-                return measured
+                if measured.contested is not None or not self._track.is_open(insertion):
+                    return measured
+                # It may stand still for good: what else may be the needle is noted, too.
+                best = best or measured
             first = first or measured
-        if first is not None:
-            return first
+        best = best or first
+        if best is not None:
+            return best
         # Where something crosses the needle in one view, the other's end may lead to it.
         alone = tuple(max(filter(None, tips.values()), key=leads, default=None) for tips in fitted)
         reason: str = NoTip.NO_COMMON_POINT

@@ -195,6 +195,24 @@ class Anchor:
     known: bool = False
     unseen: float = 0.0
 
+    def is_about(self, tip: SpatialTip, miss: float, surprise: float, turned: float) -> bool:
+        """Return whether a tip is where and points as the insertion says, to so much.
+
+        Parameters
+        ----------
+        tip : SpatialTip
+            As measured.
+        miss : float
+            Distance that it is nearer than [m].
+        surprise, turned : float
+            Square of how far it is off in place and direction, over its covariance, less than which
+            it is.
+        """
+        if not self.known or self.motion.direction_surprise(tip) > turned:
+            return False
+        off = float(np.linalg.norm(tip.position - self.motion.position))
+        return off < miss and self.motion.surprise(tip) < surprise
+
 
 @dataclasses.dataclass(frozen=True)
 class Sights:

@@ -184,7 +184,10 @@ class Track:
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
             self._agreeing = agreeing
         self._misses = self._hidden = 0
-        self._rival = self._next_rival = None
+        if self.state is TrackState.TRACKING:
+            self._rival = self._next_rival = None
+        else:
+            self.pass_on()
         if anew and (predicted is None or not self._is_on_way(tip, predicted)):
             self._sights, self._is_sure, self._passed = 0, False, []
         self._sights += seen
@@ -235,6 +238,10 @@ class Track:
         """Whether there was a believed tip."""
         return self.state in (TrackState.TRACKING, TrackState.LOST)
 
+    def is_open(self, insertion: float | None) -> bool:
+        """Return whether whatever moves may be the needle: none is believed, nor told of."""
+        return insertion is None and not self.has_begun
+
     @property
     def is_established(self) -> bool:
         """Whether the needle was seen well so often that it cannot be elsewhere."""
@@ -284,14 +291,15 @@ class Track:
         """Return whether a tip is where it must be, by a prediction that is certain."""
         if not (on_way or self.is_certain(insertion)):
             return False
-        return _is_about(tip, self.predict(insertion), _NEAR, _NO_SURPRISE)
+        predicted = self.predict(insertion)
+        return predicted is not None and predicted.is_about(tip, _NEAR, _NO_SURPRISE, _NO_SURPRISE)
 
     def expects(self, tip: SpatialTip, insertion: float | None) -> bool:
         """Return whether a tip is where it is most likely, and that is known about."""
         predicted = self.predict(insertion)
         if predicted is None or predicted.motion.sigma > _WORST_PREDICTION:
             return False
-        return _is_about(tip, predicted, _FAR, _EXPECTED)
+        return predicted.is_about(tip, _FAR, _EXPECTED, _NO_SURPRISE)
 
     def surprise(self, tip: SpatialTip, insertion: float | None) -> float:
         """Return how far a tip is from its prediction, squared, over the covariance of both."""
@@ -388,13 +396,3 @@ class Track:
     def _room(self, way: float) -> float:
         bend = 0.5 * self._curvature * way * way
         return self._settings.step_margin + _HEADING_TOLERANCE * abs(way) + bend
-
-
-def _is_about(tip: SpatialTip, predicted: Anchor | None, miss: float, surprise: float) -> bool:
-    """Return whether a tip is nearer to its prediction than both [m, squared over covariance]."""
-    if predicted is None or not predicted.known:
-        return False
-    if predicted.motion.direction_surprise(tip) > _NO_SURPRISE:
-        return False
-    off = float(np.linalg.norm(tip.position - predicted.motion.position))
-    return off < miss and predicted.motion.surprise(tip) < surprise

@@ -174,10 +174,12 @@ class StereoTracker:
             )
             return Measurement(tip, self.track.state, "")
         measured = self._follow(images, insertion)
-        if measured is None or measured.reason == NoTip.STANDS:
-            # Beside what stands still, the needle may come.
+        if measured is None or measured.reason == NoTip.STANDS or self.track.is_open(insertion):
+            # Beside what stands still, or is not believed yet, the needle may come.
             searched = self._acquisition.look(images, insertion, self._last)
-            measured = searched if measured is None or searched.tip is not None else measured
+            won = searched.tip is not None and searched.contested is not None
+            if measured is None or won or (measured.tip is None and searched.tip is not None):
+                measured = searched
         if measured.tip is None:
             return self._missed(measured, images, insertion)
         return self._taken(measured, measured.tip, insertion)

@@ -163,6 +163,20 @@ def test_a_rival_that_stands_still_wins_only_with_the_insertion(gates: GateSetti
     assert track.contest(tip(x=-2e-3), None, 1, come=True)
 
 
+def test_a_rival_is_remembered_beside_what_is_not_believed_yet(gates: GateSettings) -> None:
+    track = Track(gates)
+    won = []
+    for i in range(3):
+        assert track.is_open(None)
+        assert not track.is_open(0.05)
+        won.append(track.contest(tip(x=7e-3, z=0.05 + 1e-3 * i), None, 3))
+        track.accept(tip(), None)
+    assert won == [False, False, True]
+    track.accept(tip(z=0.051), None)
+    assert not track.is_open(None)
+    assert not track.contest(tip(x=7e-3, z=0.053), None, 2)
+
+
 def test_without_the_insertion_it_still_goes_its_headings_way(gates: GateSettings) -> None:
     track = Track(gates)
     track.accept(tip(), None, come=True)

@@ -215,7 +215,19 @@ def test_without_an_encoder_a_needle_is_found_beside_an_old_track_that_stands(
         reasons.append(str(answer.reason))
         if answer.tip is not None:
             assert np.linalg.norm(answer.tip.position - path[-1]) < 1e-4
-    assert reasons == ["not confirmed yet"] * 3 + ["not moved yet", "not confirmed yet", "", "", ""]
+    assert reasons == ["not confirmed yet"] * 3 + ["not moved yet", "", "", "", ""]
+
+
+def test_without_an_encoder_an_old_track_does_not_delay_a_needle_that_moves(
+    tracker: StereoTracker, draw_pair: Drawer, make_arc: MakeArc
+) -> None:
+    old = make_arc(0.06, 5.0, 0.5)
+    for mm in range(40, 44):
+        path = make_arc(1e-3 * mm, 6.0, 2.6)
+        (left, right), (old_left, old_right) = (draw_pair(each, seed=mm) for each in (path, old))
+        answer = tracker.process(np.minimum(left, old_left), np.minimum(right, old_right), None)
+    assert answer.tip is not None
+    assert np.linalg.norm(answer.tip.position - path[-1]) < 1e-4
 
 
 def test_images_of_two_exposures_are_refused(
