@@ -1,4 +1,4 @@
-"""A part of a study that ends its first worker, and one that ends the scheduler."""
+"""Parts that end their first worker, or each, and one that ends the scheduler."""
 
 from __future__ import annotations
 
@@ -7,16 +7,29 @@ import os
 import signal
 from pathlib import Path
 
+from needle_verification.ros.soak.many_runs import run_part as run_seeds
+from needle_verification.ros.soak.rig_run import RunResult
 from needle_verification.studies.cluster_study import ClusterPart, PartDone, run_part
 
 
 def end_the_first(asked: tuple[Path, ClusterPart]) -> PartDone:
     """Do a part; the first worker that would is killed in the midst of it."""
     mark, part = asked
+    _end_once(mark)
+    return run_part(part)
+
+
+def end_the_first_soak(asked: tuple[Path, range]) -> list[RunResult]:
+    """Do some runs of the soak, likewise."""
+    mark, seeds = asked
+    _end_once(mark)
+    return run_seeds(seeds)
+
+
+def _end_once(mark: Path) -> None:
     with contextlib.suppress(FileExistsError):
         mark.touch(exist_ok=False)
         os.kill(os.getpid(), signal.SIGKILL)
-    return run_part(part)
 
 
 def end_every(_: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -50,6 +51,29 @@ def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
         return receive(hold, message, now, counting=counting)
 
     patch.setattr(Hold, "receive", armed)
+
+
+def _hold_handed_on(patch: pytest.MonkeyPatch) -> None:
+    receive = Hold.receive
+
+    def handing_on(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
+        owned = hold.owner == message.sender
+        rule = receive(hold, message, now, counting=counting)
+        if owned and hold.owner is None:
+            pressing = (name for name, one in hold._senders.items() if hold._presses(one, now))
+            hold._owner = next(pressing, None)
+            hold._speed_scale = 1.0
+        return rule
+
+    patch.setattr(Hold, "receive", handing_on)
+
+
+def _anybody_keeps_a_hold_fresh(patch: pytest.MonkeyPatch) -> None:
+    def youngest(hold: Hold, now: float) -> float:
+        ages = [now - one.arrival for one in hold._senders.values() if hold._presses(one, now)]
+        return min(ages, default=math.inf)
+
+    patch.setattr(Hold, "age", youngest)
 
 
 def _screw_of_twice_the_lead(patch: pytest.MonkeyPatch) -> None:
@@ -121,6 +145,8 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 66),
+    "a hold handed on": PlantedBug("no_motion_by_another", _hold_handed_on, 0),
+    "a hold that anybody keeps": PlantedBug("no_motion_by_another", _anybody_keeps_a_hold_fresh, 0),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 7),

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import io
 import json
-import os
 import socket
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from dask_cluster import NEEDED, Cluster
 from dying_part import end_every, end_process, end_the_first
 from needle_common.errors import UserError
 from needle_verification import cluster
@@ -26,45 +24,8 @@ from needle_verification.studies.monte_carlo import main
 from needle_verification.studies.monte_carlo_options import parse
 from needle_verification.studies.study_parts import parts_of
 
-SHARED = Path(__file__).resolve().parents[4] / "tests" / "shared"
-NEEDED = pytest.mark.skipif(
-    importlib.util.find_spec("distributed") is None,
-    reason="the cluster's lock is not installed: scripts/dask",
-)
 STUDY = ("--draws", "3", "--depth-mm", "4", "--seed", "5")
 PARTS = parts_of(parse(STUDY))
-ENDS = 60.0
-
-
-class Cluster:
-    """A scheduler and its workers on this machine."""
-
-    def __init__(self, folder: Path, workers: int, *options: str) -> None:
-        # Dask's processes find the parts that die as they find all else.
-        paths = os.pathsep.join([str(SHARED), os.environ.get("PYTHONPATH", "")])
-        self._environment = {**os.environ, "PYTHONPATH": paths}
-        self.scheduler = self._start(
-            subprocess.PIPE, "scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard"
-        )
-        assert self.scheduler.stderr is not None
-        said = iter(self.scheduler.stderr.readline, "")
-        self.address = next(line.split()[-1] for line in said if "Scheduler at:" in line)
-        self.workers = self._start(
-            subprocess.DEVNULL, "worker", self.address, "--nworkers", str(workers),
-            "--nthreads", "1", "--no-dashboard", "--local-directory", str(folder), *options,
-        )  # fmt: skip
-
-    def _start(self, errors: int, *words: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "dask", *words]
-        return subprocess.Popen(command, env=self._environment, stderr=errors, text=True)
-
-    def end(self) -> None:
-        """End all of it, workers first."""
-        for process in (self.workers, self.scheduler):
-            process.terminate()
-            process.wait(ENDS)
-        assert self.scheduler.stderr is not None
-        self.scheduler.stderr.close()
 
 
 @pytest.fixture(scope="module")

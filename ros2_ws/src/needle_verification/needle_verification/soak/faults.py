@@ -71,6 +71,9 @@ BUS, ADAPTER, CAMERAS, CLOCK, PERSON, PARAMETERS = (
     "person",
     "parameters",
 )
+SECOND_PERSON = "second person"
+"""At a joystick and an operator of their own: keeps it pressed, draws out, presses and lets go at
+random, loses the joystick while pressing."""
 DRIVES = ("insertion drive", "rotation drive")
 STRANGER = "stranger on "
 """Begins the name of a part where a foreign node publishes or calls what is not its own."""
@@ -84,7 +87,7 @@ STRANGE_TOPICS = (
 )
 _STRANGE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
 
-VOCABULARY: dict[str, tuple[Kind, ...]] = {
+_DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
     **dict.fromkeys(PROCESSES, (Kind.OFF, Kind.STUCK, Kind.SLOW)),
     **dict.fromkeys(TOPICS, _LINK_KINDS),
     **dict.fromkeys(SERVICES, (Kind.OFF, Kind.SLOW, Kind.DUPLICATED)),
@@ -98,6 +101,10 @@ VOCABULARY: dict[str, tuple[Kind, ...]] = {
     **{STRANGER + name: (Kind.WRONG, Kind.GARBAGE) for name in STRANGE_TOPICS},
     **{STRANGER + name: (Kind.WRONG,) for name in _STRANGE_SERVICES},
 }
+_DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
+    SECOND_PERSON: (Kind.STUCK, Kind.WRONG, Kind.INTERMITTENT, Kind.OFF),
+}
+VOCABULARY = {**_DRAWN_TOGETHER, **_DRAWN_ALONE}
 """What can go wrong with each part."""
 
 _LATEST, _SHORTEST, _LONGEST = 6.0, 0.02, 4.0
@@ -105,6 +112,8 @@ _LATEST, _SHORTEST, _LONGEST = 6.0, 0.02, 4.0
 _SOONEST_AFTER, _LATEST_AFTER = 0.001, 1.0
 _TIMES = (1, 1, 2, 3)
 _MOST = 6
+# How often a part goes wrong that is drawn alone.
+_ALONE = 1.0 / 8.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -144,27 +153,39 @@ class Fault:
         return f"{what}, {when}, for {self.lasts:.3f} s"
 
 
-def draw_schedule(generator: random.Random) -> list[Fault]:
-    """Draw up to six faults; half of them follow the start, the others anything that may come."""
+def draw_schedule(seed: int) -> list[Fault]:
+    """Draw up to six faults of the parts that were there first, and of each later one its own.
+
+    Half of them follow the start, the others anything that may come. What is drawn alone has a
+    chance of its own, so that a part more changes no schedule but by its own fault.
+    """
+    generator = random.Random(f"faults of {seed}")
     faults = []
     for _ in range(generator.randint(1, _MOST)):
-        part = generator.choice(tuple(VOCABULARY))
-        fault = Fault(
-            part,
-            generator.choice(VOCABULARY[part]),
-            generator.uniform(0.0, _LATEST),
-            _as_often_short_as_long(generator, _SHORTEST, _LONGEST),
-            generator.random(),
-        )
-        if generator.random() < 0.5:
-            fault = dataclasses.replace(
-                fault,
-                at=_as_often_short_as_long(generator, _SOONEST_AFTER, _LATEST_AFTER),
-                after=generator.choice(tuple(Moment)),
-                nth=generator.choice(_TIMES),
-            )
-        faults.append(fault)
+        faults.append(_draw(generator, generator.choice(tuple(_DRAWN_TOGETHER))))
+    for part in _DRAWN_ALONE:
+        own = random.Random(f"{part} of {seed}")
+        if own.random() < _ALONE:
+            faults.append(_draw(own, part))
     return faults
+
+
+def _draw(generator: random.Random, part: str) -> Fault:
+    fault = Fault(
+        part,
+        generator.choice(VOCABULARY[part]),
+        generator.uniform(0.0, _LATEST),
+        _as_often_short_as_long(generator, _SHORTEST, _LONGEST),
+        generator.random(),
+    )
+    if generator.random() >= 0.5:
+        return fault
+    return dataclasses.replace(
+        fault,
+        at=_as_often_short_as_long(generator, _SOONEST_AFTER, _LATEST_AFTER),
+        after=generator.choice(tuple(Moment)),
+        nth=generator.choice(_TIMES),
+    )
 
 
 def _as_often_short_as_long(generator: random.Random, shortest: float, longest: float) -> float:

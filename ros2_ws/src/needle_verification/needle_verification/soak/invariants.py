@@ -6,6 +6,8 @@ import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
 
+from needle_verification.soak.hold_witness import HoldWitness
+
 # Speeds are judged over so many ticks, 0.1 s.
 _SPEED_TICKS = 20
 # A motor that goes no farther in a tick rests [m], [rad].
@@ -95,12 +97,15 @@ class Watch:
     ----------
     violations : list of Violation
         The first of each kind.
+    witness : HoldWitness
+        Of the holds that reach the device; it is asked where it hears any.
     """
 
     def __init__(self, bounds: Bounds, release_bound: float = RELEASE_BOUND) -> None:
         self._bounds = bounds
         self._release_bound = release_bound
         self.violations: list[Violation] = []
+        self.witness = HoldWitness()
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
@@ -162,6 +167,7 @@ class Watch:
                 # The rotation is homed where it stands.
                 self._zero = self._before[2]
         self._status, self._status_at = values, at
+        self.witness.see_owner(at, values.get("hold_owner", ""))
 
     def see_command(self, points: Sequence[tuple[float, float]]) -> None:
         """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
@@ -175,6 +181,7 @@ class Watch:
         """Take whether the driver runs and hears its drives: else it cannot know better."""
         self._silent_since = None if speaks else self._silent_since or at
         if not speaks:
+            self.witness.forget()
             # Who starts anew has not heard it; it starts disabled.
             self._estop_since = None
 
@@ -274,6 +281,13 @@ class Watch:
                 "no_motion_without_hold",
                 at,
                 f"motion {idle:.3f} s after the last moment in which anybody held and said so",
+            )
+        by_others = self.witness.idle(at) if self.witness.hears else 0.0
+        if by_others > RELEASE_BOUND and at > self._ends_until:
+            self.violate(
+                "no_motion_by_another",
+                at,
+                f"motion {by_others:.3f} s after the last press of an owner reached the device",
             )
         since = max(self._pressed_since, self._other_since)
         if begins and since < self._must_press_after:

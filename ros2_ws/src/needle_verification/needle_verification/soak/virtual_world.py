@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import heapq
 import random
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -96,11 +97,17 @@ class VirtualWorld:
 
     @contextlib.contextmanager
     def own_clocks(self) -> Iterator[None]:
-        """Make `time.monotonic`, `time.time` and `time.time_ns` read this world's clocks."""
+        """Make `time.monotonic`, `time.time` and `time.time_ns` read this world's clocks.
+
+        Other threads, such as those of a worker of a cluster, go on to read the real ones.
+        """
         before = time.monotonic, time.time, time.time_ns
-        time.monotonic = lambda: self.steady
-        time.time = lambda: self.system_ns / NANOSECONDS
-        time.time_ns = lambda: self.system_ns
+        real_monotonic, real_time, real_time_ns = before
+        this, thread = threading.get_ident(), threading.get_ident
+
+        time.monotonic = lambda: self.steady if thread() == this else real_monotonic()
+        time.time = lambda: self.system_ns / NANOSECONDS if thread() == this else real_time()
+        time.time_ns = lambda: self.system_ns if thread() == this else real_time_ns()
         try:
             yield
         finally:

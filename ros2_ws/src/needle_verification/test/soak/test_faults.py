@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import random
 from pathlib import Path
 
 import pytest
 
 from needle_common.errors import UserError
+from needle_verification.soak import faults
 from needle_verification.soak.faults import (
+    SECOND_PERSON,
     VOCABULARY,
     Fault,
     Kind,
@@ -20,18 +21,23 @@ from needle_verification.soak.shrinking import shrink
 
 
 def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
-    drawn = {
-        (fault.part, fault.kind)
-        for seed in range(2000)
-        for fault in draw_schedule(random.Random(seed))
-    }
+    drawn = {(fault.part, fault.kind) for seed in range(2000) for fault in draw_schedule(seed)}
     assert drawn == {(part, kind) for part, kinds in VOCABULARY.items() for kind in kinds}
 
 
+def test_a_part_more_shifts_no_fault_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_all = [draw_schedule(seed) for seed in range(200)]
+    monkeypatch.setattr(faults, "_DRAWN_ALONE", {})
+    assert any(with_all[seed] != draw_schedule(seed) for seed in range(200))
+    for seed, drawn in enumerate(with_all):
+        without = [fault for fault in drawn if fault.part != SECOND_PERSON]
+        assert without == draw_schedule(seed)
+
+
 def test_a_schedule_is_read_as_it_was_written(tmp_path: Path) -> None:
-    faults = draw_schedule(random.Random(3))
-    write_schedule(tmp_path / "one.json", 3, faults, "because")
-    assert read_schedule(tmp_path / "one.json") == (3, faults)
+    drawn = draw_schedule(3)
+    write_schedule(tmp_path / "one.json", 3, drawn, "because")
+    assert read_schedule(tmp_path / "one.json") == (3, drawn)
 
 
 @pytest.mark.parametrize(
@@ -44,7 +50,7 @@ def test_what_is_no_schedule_is_refused(tmp_path: Path, text: str) -> None:
 
 
 def test_faults_that_do_not_matter_are_left_out() -> None:
-    faults = [Fault(part, Kind.OFF, 1.0, 2.0, 0.5) for part in ("operator", "/joy", "bus")]
-    kept = shrink(faults, lambda some: {"operator", "bus"} <= {fault.part for fault in some})
+    drawn = [Fault(part, Kind.OFF, 1.0, 2.0, 0.5) for part in ("operator", "/joy", "bus")]
+    kept = shrink(drawn, lambda some: {"operator", "bus"} <= {fault.part for fault in some})
     assert [fault.part for fault in kept] == ["operator", "bus"]
     assert [fault.lasts for fault in kept] == [1.0, 1.0]

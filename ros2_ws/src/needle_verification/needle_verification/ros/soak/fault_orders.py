@@ -18,7 +18,7 @@ from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp
 from needle_verification.ros.soak.virtual_bench import Sight
 from needle_verification.ros.soak.virtual_can import LINKS
 from needle_verification.ros.soak.virtual_node import Place, VirtualNode, placed
-from needle_verification.ros.soak.virtual_rig import VirtualRig
+from needle_verification.ros.soak.virtual_rig import SECOND_JOYSTICK, SECOND_OPERATOR, VirtualRig
 from needle_verification.soak import faults
 from needle_verification.soak.course import Undo
 from needle_verification.soak.faults import Fault, Kind
@@ -35,6 +35,7 @@ _JUMP_NS = 20 * NANOSECONDS
 _DRIFT_NS, _DRIFT_PERIOD_NS = 2_000_000, 20_000_000
 # Seconds between two changes of mind of a hand that trembles.
 _TREMBLING = (0.03, 0.3)
+_WAVERING = ((True, False), (False, False), (False, True), (True, True))
 _MOTION_ERROR = 0x5530
 _SIGHTS = {
     Kind.OFF: Sight.BLACK,
@@ -70,6 +71,7 @@ class FaultOrders:
             faults.CAMERAS: self._spoil_cameras,
             faults.CLOCK: self._spoil_clock,
             faults.PERSON: self._confuse_person,
+            faults.SECOND_PERSON: self._let_second_person_in,
             faults.PARAMETERS: self._change_parameters,
         }
 
@@ -190,6 +192,33 @@ class FaultOrders:
             person.absent = hand.stop = False
 
         return end
+
+    def _let_second_person_in(self, fault: Fault) -> Undo:
+        rig, hand = self._rig, self._rig.second_hand
+        for name in (SECOND_JOYSTICK, SECOND_OPERATOR):
+            rig.start(name)
+        chance, world = self._chance_of(fault), self._world
+        end_ns = world.steady_ns + round(fault.lasts * NANOSECONDS)
+
+        def let_go() -> None:
+            hand.insert = hand.retract = False
+
+        def waver() -> None:
+            if world.steady_ns < end_ns:
+                hand.insert, hand.retract = chance.choice(_WAVERING)
+                world.call_after(round(chance.uniform(*_TREMBLING) * NANOSECONDS), waver)
+
+        if fault.kind is Kind.INTERMITTENT:
+            waver()
+            return let_go
+        hand.insert, hand.retract = fault.kind is not Kind.WRONG, fault.kind is Kind.WRONG
+        if fault.kind is not Kind.OFF:
+            return let_go
+
+        def lose() -> None:
+            rig.kill(SECOND_JOYSTICK if fault.size < 0.5 else SECOND_OPERATOR)
+
+        return lose
 
     def _change_parameters(self, fault: Fault) -> Undo:
         node = self._rig.nodes.get("plane_controller")

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import random
+import math
 from collections.abc import Sequence
 from typing import Any
+
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import Joy
 
 from needle_common.ros.conversions import values_of
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -15,7 +18,7 @@ from needle_verification.ros.soak.virtual_bench import Motors
 from needle_verification.ros.soak.virtual_person import OUT, Wish
 from needle_verification.ros.soak.virtual_rig import VirtualRig, virtual_rig
 from needle_verification.soak.course import Course, told_by_moments
-from needle_verification.soak.faults import STRANGER, Fault, Kind, draw_schedule
+from needle_verification.soak.faults import SECOND_PERSON, STRANGER, Fault, Kind, draw_schedule
 from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 
@@ -28,6 +31,8 @@ _GO_ON, _DRAW_OUT = 60.0, 60.0
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 # The way of a press to the driver.
 _HOLD_LINKS = ("/joy", "/device/hold")
+# Who else may hold.
+_OTHER_HANDS = (SECOND_PERSON, f"{STRANGER}/device/hold")
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller, or give it others.
 _JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_controller")
@@ -74,7 +79,7 @@ class RunResult:
 
 def schedule_of(seed: int) -> list[Fault]:
     """Return the faults of a seed; every hundredth run has none."""
-    return draw_schedule(random.Random(f"faults of {seed}")) if seed % 100 else []
+    return draw_schedule(seed) if seed % 100 else []
 
 
 def bounds_of_the_rig() -> Bounds:
@@ -170,7 +175,13 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
 
     def see_hold(node: str, message: Any) -> None:
         if any(message.buttons):
-            (watch.see_other_hold if node == "/stranger" else watch.see_hold)(now())
+            (watch.see_hold if node == "/operator" else watch.see_other_hold)(now())
+
+    def hear_hold(data: bytes) -> None:
+        message = deserialize_message(data, Joy)
+        speed, lifetime = (*message.axes, math.inf)[:2]
+        pressed = bool(message.buttons[0]) and 0.0 <= speed <= 1.0
+        watch.witness.hear(now(), message.header.frame_id, pressed=pressed, lifetime=lifetime)
 
     rig.bench.watchers.append(see_motors)
     rig.graph.watch("/device/status", see_device)
@@ -178,6 +189,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     rig.graph.watch("/device/joint_trajectory", see_command)
     rig.graph.watch("/device/estop", see_estop)
     rig.graph.watch("/device/hold", see_hold)
+    if any(fault.part in _OTHER_HANDS for fault in faults):
+        rig.graph.listen_at("/device_driver", "/device/hold", hear_hold)
     return watch
 
 

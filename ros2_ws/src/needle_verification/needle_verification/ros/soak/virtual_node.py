@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import Any
 
@@ -46,6 +46,10 @@ class Place:
         As of its command line.
     log : callable
         Takes the node's name, the level and the text of what it logs.
+    name : str
+        The node's name in place of its own; empty: its own.
+    topics : mapping of str to str
+        Topics by other names.
     """
 
     graph: VirtualGraph
@@ -53,6 +57,8 @@ class Place:
     domain_id: int
     parameters: dict[str, Any]
     log: Callable[[str, str, str], None]
+    name: str = ""
+    topics: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
 
 _places: list[Place] = []
@@ -189,7 +195,7 @@ class VirtualNode(Node):
         self.place = place = _places[-1]
         self._process = place.process
         self._graph = place.graph
-        self._full_name = f"/{node_name}"
+        self._full_name = f"/{place.name or node_name}"
         self._context = VirtualContext(place.domain_id)
         self._parameters: dict[str, Any] = {}
         self._descriptors: dict[str, Any] = {}
@@ -227,6 +233,7 @@ class VirtualNode(Node):
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
         """Return a topic's full name."""
         del only_expand
+        topic = self.place.topics.get(topic, topic)
         if topic.startswith("~/"):
             return f"{self._full_name}/{topic[2:]}"
         return topic if topic.startswith("/") else f"/{topic}"

@@ -32,6 +32,8 @@ from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, 
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 PERSON = "person"
+SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
+_SECOND_JOY = {"joy": "second_joy"}
 _DEPTHS = (0.003, 0.008)
 _PRESETS = ("best", "paper")
 _INSERTIONS = ("stepwise", "continuous")
@@ -61,8 +63,8 @@ class VirtualRig:
         Drives and needle.
     can : VirtualCan
         The bus.
-    hand : Hand
-        The person's.
+    hand, second_hand : Hand
+        The person's, and that of a second one.
     processes : dict of str to VirtualProcess
         By the name of the node in it.
     nodes : dict of str to Node
@@ -79,7 +81,7 @@ class VirtualRig:
         self.graph = VirtualGraph(self.world, self.faults)
         self.bench = Bench(self.world)
         self.can = VirtualCan(self.world, self.bench.bus, self.faults)
-        self.hand = Hand()
+        self.hand, self.second_hand = Hand(), Hand()
         self.processes: dict[str, VirtualProcess] = {}
         self.nodes: dict[str, Node] = {}
         self.log: list[tuple[int, str, str, str]] = []
@@ -113,7 +115,9 @@ class VirtualRig:
         process = VirtualProcess(self.world, name, partial(self._on_end, name))
         self.processes[name] = process
         parameters, create = self._plan(name, process)
-        place = Place(self.graph, process, _own_domain(), parameters, self._tell)
+        topics = _SECOND_JOY if name in (SECOND_OPERATOR, SECOND_JOYSTICK) else {}
+        own_domain = _own_domain()
+        place = Place(self.graph, process, own_domain, parameters, self._tell, name, topics)
         with placed(place):
             try:
                 self.nodes[name] = create()
@@ -157,13 +161,14 @@ class VirtualRig:
                 "tip_noise_bound": TIP_NOISE,
             }
             return steering, PlaneControllerNode
-        if name == "operator":
+        if name in ("operator", SECOND_OPERATOR):
             buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
             return {"source": "joy", **buttons}, OperatorNode
         if name == "stereo_tracker":
             return {}, partial(TrackerStandIn, self.bench)
-        if name == "joy_node":
-            return {}, partial(Joystick, self.hand)
+        if name in ("joy_node", SECOND_JOYSTICK):
+            hand = self.hand if name == "joy_node" else self.second_hand
+            return {}, partial(Joystick, hand)
         return {}, partial(Person, self.hand, lambda: self.bench.motors.insertion)
 
     def _on_end(self, name: str, why: str) -> None:

@@ -28,6 +28,7 @@ _LEASE_NS = 8_000_000_000
 
 
 Watcher = Callable[[str, Any], None]
+Listener = Callable[[bytes], None]
 Careful = Callable[[Callable[[], None]], None]
 """Calls back; a node sets its own, which knows what to do with a failure."""
 
@@ -113,6 +114,7 @@ class VirtualGraph:
         self.world = world
         self.faults = faults
         self.digest = hashlib.sha256()
+        self._listeners: dict[tuple[str, str], Listener] = {}
         self._watchers: dict[str, list[Watcher]] = {}
         self.publishers: dict[str, list[VirtualPublisher]] = {}
         self.subscriptions: dict[str, list[VirtualSubscription]] = {}
@@ -121,6 +123,16 @@ class VirtualGraph:
     def watch(self, topic: str, watcher: Watcher) -> None:
         """Call `watcher` with the node's full name and the message, whenever one is published."""
         self._watchers.setdefault(topic, []).append(watcher)
+
+    def listen_at(self, node_name: str, topic: str, listener: Listener) -> None:
+        """Call `listener` with the bytes of each message of a topic when a node takes it."""
+        self._listeners[node_name, topic] = listener
+
+    def take(self, node_name: str, topic: str, data: bytes) -> None:
+        """Show a message that a node takes."""
+        listener = self._listeners.get((node_name, topic))
+        if listener is not None:
+            listener(data)
 
     def show(self, topic: str, node_name: str, message: Any) -> None:
         """Show a message to who watches its topic."""
@@ -306,16 +318,21 @@ class VirtualSubscription(Endpoint):
         assert raw
         if not self._queue:
             return None
-        data, sent_ns = self._queue.popleft()
+        data, sent_ns = self._take()
         return data, self._info(sent_ns)
 
     def _take_next(self) -> None:
         if not self._queue or self.gone_ns is not None:
             return
-        data, sent_ns = self._queue.popleft()
+        data, sent_ns = self._take()
         message = data if self._raw else deserialize_message(data, self.msg_type)
         arguments = (message, self._info(sent_ns)) if self._with_info else (message,)
         self.careful(lambda: self.callback(*arguments))
+
+    def _take(self) -> tuple[bytes, int]:
+        data, sent_ns = self._queue.popleft()
+        self.graph.take(self.node_name, self.topic_name, data)
+        return data, sent_ns
 
     def _info(self, sent_ns: int) -> dict[str, int]:
         return {"source_timestamp": sent_ns, "received_timestamp": self.graph.world.system_ns}

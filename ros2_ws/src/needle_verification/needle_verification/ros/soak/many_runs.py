@@ -1,0 +1,72 @@
+"""Runs of many seeds, on all cores of this machine or on a cluster: the same results in order."""
+
+from __future__ import annotations
+
+import functools
+import gc
+import itertools
+import multiprocessing
+import os
+import shutil
+import signal
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from needle_verification.cluster import on_cluster
+from needle_verification.ros.soak.process_run import run_processes
+from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
+
+# Runs that a worker of a cluster does at once: some ten seconds.
+_PART = 10
+
+
+def results_here(seeds: range) -> Iterator[RunResult]:
+    """Yield the results of seeds, run by as many processes as this machine has cores."""
+    if not seeds:
+        return
+    # Fresh interpreters: a fork would share what numerical libraries keep for their threads.
+    workers = min(len(seeds), os.cpu_count() or 1)
+    with multiprocessing.get_context("spawn").Pool(workers, _begin_worker) as pool:
+        yield from pool.imap(_run_seed, seeds)
+
+
+def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
+    """Yield the results of seeds, run by the workers of a scheduler; `on_cluster` says more."""
+    parts = [seeds[first : first + _PART] for first in range(0, len(seeds), _PART)]
+    yield from itertools.chain.from_iterable(on_cluster(address, run_part, parts))
+
+
+def run_part(seeds: range) -> list[RunResult]:
+    """Run some seeds, on a worker."""
+    _freeze_once()
+    return [_run_seed(seed) for seed in seeds]
+
+
+def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
+    """Yield the results of runs of real processes; what they leave is kept if they violate."""
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
+            result = run_processes(seed, Path(name))
+            if result.violations and folder is not None:
+                shutil.copytree(name, folder / f"processes_{seed}", dirs_exist_ok=True)
+            yield result
+
+
+def _begin_worker() -> None:
+    os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Each run is collected at its end; what is imported stays, and need not be looked at.
+    gc.freeze()
+    gc.disable()
+
+
+@functools.lru_cache(maxsize=1)
+def _freeze_once() -> None:
+    """Look no more at what a worker has imported; the worker's own garbage goes on to be found."""
+    gc.freeze()
+
+
+def _run_seed(seed: int) -> RunResult:
+    return run(seed, schedule_of(seed))
