@@ -24,6 +24,7 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
 from needle_verification.soak import invariants
+from needle_verification.soak.faults import Fault, Kind, Moment
 from needle_verification.soak.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
@@ -53,19 +54,17 @@ def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Hold, "receive", armed)
 
 
-def _hold_handed_on(patch: pytest.MonkeyPatch) -> None:
+def _press_beside_the_owner_waits(patch: pytest.MonkeyPatch) -> None:
     receive = Hold.receive
 
-    def handing_on(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
-        owned = hold.owner == message.sender
+    def waiting(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
+        beside = hold.owner not in (None, message.sender)
         rule = receive(hold, message, now, counting=counting)
-        if owned and hold.owner is None:
-            pressing = (name for name, one in hold._senders.items() if hold._presses(one, now))
-            hold._owner = next(pressing, None)
-            hold._speed_scale = 1.0
+        if beside and message.sender in hold._senders:
+            hold._senders[message.sender].armed = True
         return rule
 
-    patch.setattr(Hold, "receive", handing_on)
+    patch.setattr(Hold, "receive", waiting)
 
 
 def _anybody_keeps_a_hold_fresh(patch: pytest.MonkeyPatch) -> None:
@@ -145,7 +144,9 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 66),
-    "a hold handed on": PlantedBug("no_motion_by_another", _hold_handed_on, 0),
+    "a press beside the owner waits": PlantedBug(
+        "no_motion_by_another", _press_beside_the_owner_waits, 0
+    ),
     "a hold that anybody keeps": PlantedBug("no_motion_by_another", _anybody_keeps_a_hold_fresh, 0),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
@@ -156,6 +157,20 @@ PLANTED = {
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
     "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
 }
+
+
+_SECOND = Fault("second person", Kind.STUCK, 0.1, 3.0, 0.5, Moment.MOVING, 1)
+BESIDE = {
+    "a press beside the owner waits": (
+        _press_beside_the_owner_waits,
+        (_SECOND, Fault("person", Kind.OFF, 0.2, 2.0, 0.5, Moment.MOVING, 2)),
+    ),
+    "a hold that anybody keeps": (
+        _anybody_keeps_a_hold_fresh,
+        (_SECOND, Fault("operator", Kind.OFF, 0.5, 2.0, 0.5, Moment.MOVING, 2)),
+    ),
+}
+"""Bugs of the hold's owner, by a schedule that was written to find them."""
 
 
 class MendedBug(NamedTuple):

@@ -195,8 +195,6 @@ class FaultOrders:
 
     def _let_second_person_in(self, fault: Fault) -> Undo:
         rig, hand = self._rig, self._rig.second_hand
-        for name in (SECOND_JOYSTICK, SECOND_OPERATOR):
-            rig.start(name)
         chance, world = self._chance_of(fault), self._world
         end_ns = world.steady_ns + round(fault.lasts * NANOSECONDS)
 

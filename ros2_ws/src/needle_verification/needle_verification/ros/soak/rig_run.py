@@ -16,7 +16,12 @@ from needle_verification.ros.soak.fault_orders import LATEST_MESSAGE, FaultOrder
 from needle_verification.ros.soak.moment_watch import watch_moments
 from needle_verification.ros.soak.virtual_bench import Motors
 from needle_verification.ros.soak.virtual_person import OUT, Wish
-from needle_verification.ros.soak.virtual_rig import VirtualRig, virtual_rig
+from needle_verification.ros.soak.virtual_rig import (
+    SECOND_JOYSTICK,
+    SECOND_OPERATOR,
+    VirtualRig,
+    virtual_rig,
+)
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import SECOND_PERSON, STRANGER, Fault, Kind, draw_schedule
 from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
@@ -99,6 +104,10 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         What goes wrong meanwhile.
     """
     with virtual_rig(seed, None if faults else UNDISTURBED_DEPTH) as rig:
+        if any(fault.part == SECOND_PERSON for fault in faults):
+            # Their hand must be seen neutral before it counts.
+            rig.start(SECOND_JOYSTICK)
+            rig.start(SECOND_OPERATOR)
         watch = _watched(rig, faults)
         course = Course(rig.world, faults, FaultOrders(rig).begin)
         watch_moments(rig, course.meet)
