@@ -48,7 +48,7 @@ class Tally:
 
     @property
     def progress(self) -> str:
-        """How far it is, as a person reads it."""
+        """Progress, as a person reads it."""
         done = self._runs + self._processes
         return f"{done} of {self._asked} runs, {self.violations} violate"
 
