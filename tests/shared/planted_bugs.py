@@ -144,10 +144,6 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 66),
-    "a press beside the owner waits": PlantedBug(
-        "no_motion_by_another", _press_beside_the_owner_waits, 0
-    ),
-    "a hold that anybody keeps": PlantedBug("no_motion_by_another", _anybody_keeps_a_hold_fresh, 0),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 7),
@@ -159,6 +155,7 @@ PLANTED = {
 }
 
 
+# Written, not drawn: no seed that was tried finds them.
 _SECOND = Fault("second person", Kind.STUCK, 0.1, 3.0, 0.5, Moment.MOVING, 1)
 BESIDE = {
     "a press beside the owner waits": (
