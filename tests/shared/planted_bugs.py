@@ -24,7 +24,6 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
 from needle_verification.soak import invariants
-from needle_verification.soak.faults import Fault, Kind, Moment
 from needle_verification.soak.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
@@ -143,7 +142,13 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
 
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
-    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 66),
+    "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 143),
+    "a press beside the owner waits": PlantedBug(
+        "no_motion_by_another", _press_beside_the_owner_waits, 268
+    ),
+    "a hold that anybody keeps": PlantedBug(
+        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 268
+    ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 7),
@@ -153,21 +158,6 @@ PLANTED = {
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
     "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
 }
-
-
-# Written, not drawn: no seed that was tried finds them.
-_SECOND = Fault("second person", Kind.STUCK, 0.1, 3.0, 0.5, Moment.MOVING, 1)
-BESIDE = {
-    "a press beside the owner waits": (
-        _press_beside_the_owner_waits,
-        (_SECOND, Fault("person", Kind.OFF, 0.2, 2.0, 0.5, Moment.MOVING, 2)),
-    ),
-    "a hold that anybody keeps": (
-        _anybody_keeps_a_hold_fresh,
-        (_SECOND, Fault("operator", Kind.OFF, 0.5, 2.0, 0.5, Moment.MOVING, 2)),
-    ),
-}
-"""Bugs of the hold's owner, by a schedule that was written to find them."""
 
 
 class MendedBug(NamedTuple):
