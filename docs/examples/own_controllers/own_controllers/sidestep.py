@@ -2,7 +2,8 @@
 
 import numpy as np
 
-CLEAR = 0.006  # how far beside an obstacle's surface the needle is led [m]
+# How far beside an obstacle's surface it leads [m]; from farther it may not bend back in time.
+CLEAR = 0.002
 
 
 class Sidestep:
