@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import json
 import shutil
@@ -52,7 +53,7 @@ class Laboratory:
         return read_run(bag)
 
     def study(self, name: str, *arguments: str) -> tuple[dict[str, JsonValue], Columns]:
-        """Run a Monte Carlo study; return its figures, and its runs column by column.
+        """Run a Monte Carlo study; return its figures, and its runs' columns of numbers.
 
         Raises
         ------
@@ -66,10 +67,8 @@ class Laboratory:
         with runs.open(encoding="utf-8", newline="") as stream:
             reader = csv.reader(stream)
             head = next(reader)
-            rows = [[float(cell) if cell else np.nan for cell in row] for row in reader]
-        table = np.array(rows)
-        columns = {name: table[:, k] for k, name in enumerate(head)}
-        return dict(json.loads(figures.read_text("utf-8"))), columns
+            columns = dict(zip(head, zip(*reader, strict=True), strict=True))
+        return dict(json.loads(figures.read_text("utf-8"))), _numbers(columns)
 
     def identify(self, name: str, bag: str, *arguments: str) -> dict[str, JsonValue]:
         """Find the curvature in a trial's bag with `identify_curvature`; return what it found.
@@ -85,6 +84,15 @@ class Laboratory:
             command += [str(self._folder / bag), *arguments, "--json", str(figures)]
             _run(name, command, (EXIT_DONE,))
         return dict(json.loads(figures.read_text("utf-8")))
+
+
+def _numbers(columns: Mapping[str, Sequence[str]]) -> Columns:
+    """Return the columns of numbers, NaN where a cell is empty; what has words is left out."""
+    numbers = {}
+    for name, cells in columns.items():
+        with contextlib.suppress(ValueError):
+            numbers[name] = np.array([float(cell) if cell else np.nan for cell in cells])
+    return numbers
 
 
 def _run(name: str, command: Sequence[str], good: Sequence[int]) -> None:

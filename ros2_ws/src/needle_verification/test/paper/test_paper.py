@@ -61,6 +61,14 @@ def test_a_study_that_is_there_is_not_run_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(runs["settle_mm"], [2.0, np.nan])
 
 
+def test_the_numbers_of_a_study_are_read_whatever_else_it_writes(tmp_path: Path) -> None:
+    options = ("--controller", "paper", "--depth-mm", "3")
+    figures, runs = Laboratory(["/nowhere"], tmp_path).study("few", *options)
+    assert len(runs["r1_final_mm"]) == figures["runs"]
+    assert np.all(np.isfinite(runs["r1_final_mm"]))
+    assert "controller" not in runs
+
+
 def test_a_trial_that_does_not_run_is_one_line(tmp_path: Path) -> None:
     simulate = [sys.executable, "-c", "import sys; print('no rig', file=sys.stderr); sys.exit(2)"]
     with pytest.raises(UserError, match=r"trial_1: .*code 2: no rig"):
