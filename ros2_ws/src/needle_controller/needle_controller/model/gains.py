@@ -2,11 +2,10 @@
 
 Both are designed on the system (8) in inserted length, as in the paper, for continuous time: the
 weights then mean the same whatever the step. As (8) is a chain of integrators, the roots of a cubic
-solve the Riccati equations. The law's gain is used as it is, after
-a check that holding the input over one step keeps the loop stable. The observer is sampled exactly
-in its error: over any inserted length l its error poles are exp(lambda_i l), lambda_i being those
-of A - L C. A discrete design would give a gain for one step length only, while steps are
-shortened, aborted and resumed.
+solve the Riccati equations. The law's gain is used as it is, after a check that holding the input
+over one step keeps the loop stable. The observer is sampled exactly in its error: over any inserted
+length l its error poles are exp(lambda_i l), lambda_i being those of A - L C. A discrete design
+would give a gain for one step length only, while steps are shortened, aborted and resumed.
 """
 
 from __future__ import annotations

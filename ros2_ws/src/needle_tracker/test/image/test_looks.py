@@ -11,7 +11,7 @@ import pytest
 from needle_tracker.image.background import Background
 from needle_tracker.image.detection import DetectionSettings
 from needle_tracker.image.looks import MapLook
-from needle_tracker.image.search_grid import make_search_grid
+from needle_tracker.image.search_grid import SearchGrid, make_search_grid
 from needle_tracker.image.tip_fit import Expected
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -91,15 +91,27 @@ def shown(
     return MapLook(WIDTH_PX, 0.0), np.zeros(SHAPE, np.uint8)
 
 
+@pytest.fixture
+def grid(views: tuple[RefractedCamera, RefractedCamera], settings: TrackerSettings) -> SearchGrid:
+    return make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
+
+
+def straight(grid: SearchGrid) -> np.ndarray:
+    """Return the pixels of a needle that goes straight on."""
+    return grid.pixels[:81, int(np.searchsorted(grid.angles, 0.0))]
+
+
+def end_of(needle: np.ndarray) -> Expected:
+    direction = (needle[-1] - needle[-9]) / np.linalg.norm(needle[-1] - needle[-9])
+    return Expected(needle[-1], direction, 100.0, 6, 0.0)
+
+
 def test_an_end_is_found_though_the_way_to_what_follows_leaves_the_needle_before_it(
-    views: tuple[RefractedCamera, RefractedCamera],
-    settings: TrackerSettings,
+    grid: SearchGrid,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
     aside = int(np.searchsorted(grid.angles, 4e-3 / grid.distances[84]))
-    middle = int(np.searchsorted(grid.angles, 0.0))
-    needle, track = grid.pixels[:81, middle], grid.pixels[84:, aside]
+    needle, track = straight(grid), grid.pixels[84:, aside]
     look, image = shown(monkeypatch, [(needle, 1.0), (track, 1.0)])
     found = look.find_paths(image, grid, DetectionSettings(needle_width_px=WIDTH_PX), None)
     off = [np.linalg.norm(each.pixels[-1] - needle[-1]) for each in found]
@@ -108,35 +120,29 @@ def test_an_end_is_found_though_the_way_to_what_follows_leaves_the_needle_before
 
 @pytest.mark.parametrize(("sure", "seen"), [(1.0, True), (0.12, True), (0.02, False)])
 def test_a_map_that_is_as_unsure_of_all_of_a_needle_shows_its_end(
-    views: tuple[RefractedCamera, RefractedCamera],
-    settings: TrackerSettings,
+    grid: SearchGrid,
     monkeypatch: pytest.MonkeyPatch,
     *,
     sure: float,
     seen: bool,
 ) -> None:
-    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
-    needle = grid.pixels[:81, int(np.searchsorted(grid.angles, 0.0))]
+    needle = straight(grid)
     look, image = shown(monkeypatch, [(needle, sure)])
     detection = DetectionSettings(needle_width_px=WIDTH_PX)
     found = look.find_paths(image, grid, detection, None)
     assert bool(found) is seen
-    direction = (needle[-1] - needle[-9]) / np.linalg.norm(needle[-1] - needle[-9])
-    tip = look.fit(image, Expected(needle[-1], direction, 100.0, 6, 0.0), True, detection)
+    tip = look.fit(image, end_of(needle), True, detection)
     assert (tip is not None and tip.clear) is seen
     if tip is not None:
         assert np.linalg.norm(tip.point - needle[-1]) < WIDTH_PX
 
 
 def test_how_sure_two_maps_are_does_not_tell_two_needles_apart(
-    views: tuple[RefractedCamera, RefractedCamera],
-    settings: TrackerSettings,
+    grid: SearchGrid,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    grid = make_search_grid(views[0], settings.gates.reach, first_distance=4e-3)
-    needle = grid.pixels[:81, int(np.searchsorted(grid.angles, 0.0))]
-    direction = (needle[-1] - needle[-9]) / np.linalg.norm(needle[-1] - needle[-9])
-    expected, tips = Expected(needle[-1], direction, 100.0, 6, 0.0), []
+    needle = straight(grid)
+    expected, tips = end_of(needle), []
     for sure in (1.0, 0.6):
         look, image = shown(monkeypatch, [(needle, sure)])
         tip = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
