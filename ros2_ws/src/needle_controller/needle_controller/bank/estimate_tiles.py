@@ -1,9 +1,10 @@
 """Memory layout of many needles' estimates: tiles, side by side, one row for each number.
 
-Estimates follow one another, needle by needle, and fill tiles of `LANES`. What is done to one
-estimate is done to all of a tile in the same instructions, whichever needle each belongs to, and
-the order of operations does not depend on how many needles there are: a node and a study get the
-same bits. What fills the last tile has weight 0, as has an estimate that has ended.
+Estimates fill tiles of `LANES`. What is done to one estimate is done to all of a tile in the same
+instructions, whichever needle each belongs to, and the order of operations on a needle does not
+depend on how many needles there are: a node and a study get the same bits. Those that think noise
+of the same shape possible lie side by side, since what is reckoned for one lane is reckoned for
+all. What fills the last tile has weight 0, as has an estimate that has ended.
 """
 
 from __future__ import annotations
@@ -56,15 +57,18 @@ class Tiles(NamedTuple):
     Attributes
     ----------
     state : ndarray, shape (tiles, ROWS, LANES)
-        The numbers; estimate e is in tile e // LANES, lane e % LANES.
+        The numbers; slot s is lane s % LANES of tile s // LANES.
     first : ndarray of int, shape (N + 1,)
         Each needle's first estimate, and the end of the last's.
+    slot : ndarray of int, shape (first[-1],)
+        Where each estimate lies.
     owner : ndarray of int, shape (tiles * LANES,)
-        Each estimate's needle.
+        Whose needle's estimate lies in each slot.
     """
 
     state: Array
     first: npt.NDArray[np.int64]
+    slot: npt.NDArray[np.int64]
     owner: npt.NDArray[np.int64]
 
 
@@ -78,28 +82,21 @@ def tiles_of(numbers: Array, counts: npt.NDArray[np.int64]) -> Tiles:
     counts : ndarray of int, shape (N,)
         How many each needle has, at least 1.
     """
-    first = np.concatenate([[0], np.cumsum(counts)])
     filling = -len(numbers) % LANES
     filled = np.concatenate([numbers, np.repeat(numbers[-1:], filling, axis=0)])
-    filled[len(numbers) :, WEIGHT] = 0.0
-    owner = np.repeat(np.arange(len(counts)), counts)
-    return Tiles(
-        np.ascontiguousarray(filled.reshape(-1, LANES, ROWS).transpose(0, 2, 1)),
-        first,
-        np.concatenate([owner, np.repeat(owner[-1:], filling)]),
-    )
+    state = np.ascontiguousarray(filled.reshape(-1, LANES, ROWS).transpose(0, 2, 1))
+    return _picked(state, np.arange(len(numbers)), counts)
 
 
 def rows(tiles: Tiles, first: int, count: int) -> Array:
     """Return some rows of all estimates, shape (M, count), the filling left out."""
     picked = tiles.state[:, first : first + count].transpose(0, 2, 1).reshape(-1, count)
-    return np.asarray(picked[: tiles.first[-1]])
+    return np.asarray(picked[tiles.slot])
 
 
 def set_rows(tiles: Tiles, first: int, values: Array) -> None:
     """Write rows of all estimates: the inverse of `rows`, values of shape (M, count)."""
-    every = np.arange(tiles.first[-1])
-    tiles.state[every // LANES, first : first + values.shape[1], every % LANES] = values
+    tiles.state[tiles.slot // LANES, first : first + values.shape[1], tiles.slot % LANES] = values
 
 
 def tidied(tiles: Tiles) -> Tiles:
@@ -108,28 +105,31 @@ def tidied(tiles: Tiles) -> Tiles:
     Room for new ones stays: one of weight 0 for each needle, and one more for every fourth that has
     a weight.
     """
-    picked, counts = np.empty_like(tiles.owner), np.zeros(len(tiles.first) - 1, dtype=np.int64)
+    picked, counts = np.empty_like(tiles.slot), np.zeros(len(tiles.first) - 1, dtype=np.int64)
     count = _pick(tiles, picked, counts)
     if count == tiles.first[-1]:
         return tiles
-    return _picked(tiles, picked[:count], counts)
+    return _picked(tiles.state, picked[:count], counts)
 
 
 def repeated(tiles: Tiles, needles: int) -> Tiles:
     """Return the estimates of the only needle as those of so many."""
     count = int(tiles.first[-1])
-    return _picked(tiles, np.tile(np.arange(count), needles), np.full(needles, count))
+    return _picked(tiles.state, np.tile(tiles.slot, needles), np.full(needles, count))
 
 
-def _picked(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> Tiles:
-    """Return some estimates, (M,), as those of needles that have so many each, (N,)."""
-    filling = -len(picked) % LANES
-    owner = np.repeat(np.arange(len(counts)), counts)
-    picked, owner = (np.concatenate([of, np.repeat(of[-1:], filling)]) for of in (picked, owner))
-    state = np.empty((len(picked) // LANES, ROWS, LANES))
-    _gather(tiles.state, picked, state)
-    state[-1, WEIGHT, LANES - filling :] = 0.0
-    return Tiles(state, np.concatenate([[0], np.cumsum(counts)]), owner)
+def _picked(state: Array, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> Tiles:
+    """Return what lies in some slots, (M,), as estimates of needles with so many each, (N,)."""
+    order = np.argsort(state[picked // LANES, SHAPE, picked % LANES], kind="stable")
+    slot = np.empty_like(order)
+    slot[order] = np.arange(len(order))
+    filling = -len(order) % LANES
+    order = np.concatenate([order, np.repeat(order[-1:], filling)])
+    gathered = np.empty((len(order) // LANES, ROWS, LANES))
+    _gather(state, picked[order], gathered)
+    gathered[-1, WEIGHT, LANES - filling :] = 0.0
+    first = np.concatenate([[0], np.cumsum(counts)])
+    return Tiles(gathered, first, slot, np.repeat(np.arange(len(counts)), counts)[order])
 
 
 def covariances(tiles: Tiles) -> Array:
@@ -148,18 +148,18 @@ def lower_half(covariance: Array) -> Array:
 
 @compiled
 def _pick(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.int64]) -> int:
-    """Write which estimates stay, and how many of each needle; return how many in all."""
+    """Write the slots of what stays, and how many of each needle do; return how many in all."""
     count = 0
     for n in range(counts.size):
         before = count
-        for e in range(tiles.first[n], tiles.first[n + 1]):
-            if tiles.state[e // LANES, WEIGHT, e % LANES] > 0.0:
-                picked[count] = e
+        for s in tiles.slot[tiles.first[n] : tiles.first[n + 1]]:
+            if tiles.state[s // LANES, WEIGHT, s % LANES] > 0.0:
+                picked[count] = s
                 count += 1
         spare = 1 + (count - before) // _ESTIMATES_PER_SPARE
-        for e in range(tiles.first[n], tiles.first[n + 1]):
-            if spare > 0 and tiles.state[e // LANES, WEIGHT, e % LANES] == 0.0:
-                picked[count] = e
+        for s in tiles.slot[tiles.first[n] : tiles.first[n + 1]]:
+            if spare > 0 and tiles.state[s // LANES, WEIGHT, s % LANES] == 0.0:
+                picked[count] = s
                 count += 1
                 spare -= 1
         counts[n] = count - before

@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
@@ -124,27 +125,30 @@ def correct_bank(
 @compiled
 def _judge(bank: Bank, n: int, limits: Limits) -> None:
     """Weigh a needle's hypotheses by its tip; end what is unlikely."""
-    state, first, end = bank.tiles.state, bank.tiles.first[n], bank.tiles.first[n + 1]
+    state = bank.tiles.state
+    slots = bank.tiles.slot[bank.tiles.first[n] : bank.tiles.first[n + 1]]
     whole = largest = refused = 0.0
-    for e in range(first, end):
-        tile, h = state[e // LANES], e % LANES
+    for s in slots:
+        tile, h = state[s // LANES], s % LANES
         weight = tile[WEIGHT, h] * tile[EVIDENCE, h]
         tile[WEIGHT, h] = weight
         whole += weight
         largest = max(largest, weight)
         refused += weight * tile[OUTLIER, h]
     refused /= whole
-    for e in range(first, end):
-        tile, h = state[e // LANES], e % LANES
+    for s in slots:
+        tile, h = state[s // LANES], s % LANES
         weight = tile[WEIGHT, h] / largest
         tile[WEIGHT, h] = weight if weight > limits.smallest_weight else 0.0
     bank.refused[n] = refused
     bank.unexplained[n] += _NEWEST_SHARE * (refused - bank.unexplained[n])
-    _suspect_jumps(state, first, end, limits)
+    # None of them has more than all have.
+    if limits.jump_share * refused * whole / largest > limits.smallest_weight:
+        _suspect_jumps(state, slots, limits)
 
 
 @compiled
-def _suspect_jumps(state: Array, first: int, end: int, limits: Limits) -> None:
+def _suspect_jumps(state: Array, slots: npt.NDArray[np.int64], limits: Limits) -> None:
     """Let estimates for which the tip was an outlier come back, displaced nobody knows where.
 
     Each takes the place of one that has ended, likeliest first, and weighs the share of its own
@@ -153,13 +157,13 @@ def _suspect_jumps(state: Array, first: int, end: int, limits: Limits) -> None:
     """
     while True:
         likeliest, most, free = -1, limits.smallest_weight, -1
-        for e in range(first, end):
-            tile, h = state[e // LANES], e % LANES
+        for s in slots:
+            tile, h = state[s // LANES], s % LANES
             weight = limits.jump_share * tile[WEIGHT, h] * tile[OUTLIER, h]
             if weight > most:
-                likeliest, most = e, weight
+                likeliest, most = s, weight
             if tile[WEIGHT, h] == 0.0:
-                free = e
+                free = s
         if likeliest < 0 or free < 0:
             return
         state[likeliest // LANES, OUTLIER, likeliest % LANES] = 0.0

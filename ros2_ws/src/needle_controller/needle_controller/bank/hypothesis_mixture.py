@@ -8,6 +8,7 @@ import dataclasses
 import math
 
 import numpy as np
+import numpy.typing as npt
 
 from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
@@ -133,20 +134,20 @@ def mixture(
     """
     sums = np.empty(SUMS)
     for n in range(tiles.first.size - 1):
-        first, end = tiles.first[n], tiles.first[n + 1]
+        slots = tiles.slot[tiles.first[n] : tiles.first[n + 1]]
         sums[:] = 0.0
         whole = heaviest = 0.0
-        best = first
-        for e in range(first, end):
-            tile, h = tiles.state[e // LANES], e % LANES
+        best = slots[0]
+        for s in slots:
+            tile, h = tiles.state[s // LANES], s % LANES
             whole += tile[WEIGHT, h]
             if tile[WEIGHT, h] > heaviest:
-                heaviest, best = tile[WEIGHT, h], e
-        for e in range(first, end):
-            tile, h = tiles.state[e // LANES], e % LANES
+                heaviest, best = tile[WEIGHT, h], s
+        for s in slots:
+            tile, h = tiles.state[s // LANES], s % LANES
             if tile[WEIGHT, h] > 0.0:
                 _add_estimate(tile, h, tile[WEIGHT, h] / whole, sums)
-        _fill_table(tiles.state, first, end, whole, table[n])
+        _fill_table(tiles.state, slots, whole, table[n])
         x, sin_pitch = sums[S_POSITION], sums[S_HEADING]
         linearized[n, 0], linearized[n, 1], linearized[n, 2] = x, sin_pitch, sums[S_BEND]
         learned[n, L_CURVATURE], learned[n, L_SCALE] = sums[S_CURVATURE], sums[S_SCALE]
@@ -154,7 +155,7 @@ def mixture(
         uncertainty[n, 0] = sums[S_X_X] - x * x
         uncertainty[n, 1] = sums[S_X_PITCH] - x * sin_pitch
         uncertainty[n, 2] = sums[S_PITCH_PITCH] - sin_pitch * sin_pitch
-        ambiguous[n] = _elsewhere(tiles.state, first, end, best) / whole
+        ambiguous[n] = _elsewhere(tiles.state, slots, best) / whole
         side = sums[S_SIDE : S_SIDE + 3]
         if side[0] * side[0] + side[1] * side[1] + side[2] * side[2] < _NO_MEAN_ROLL**2:
             for k in range(3):
@@ -199,11 +200,11 @@ def _noise_size(tile: Array, h: int, noises: Array) -> float:
 
 
 @compiled
-def _fill_table(state: Array, first: int, end: int, whole: float, table: Array) -> None:
+def _fill_table(state: Array, slots: npt.NDArray[np.int64], whole: float, table: Array) -> None:
     """Write the means of every torsion hypothesis."""
     table[:] = 0.0
-    for e in range(first, end):
-        tile, h = state[e // LANES], e % LANES
+    for s in slots:
+        tile, h = state[s // LANES], s % LANES
         weight = tile[WEIGHT, h]
         if weight == 0.0:
             continue
@@ -230,12 +231,12 @@ def _fill_table(state: Array, first: int, end: int, whole: float, table: Array) 
 
 
 @compiled
-def _elsewhere(state: Array, first: int, end: int, best: int) -> float:
+def _elsewhere(state: Array, slots: npt.NDArray[np.int64], best: int) -> float:
     """Return the weight of hypotheses whose roll is more than 60 deg from one's."""
     top, i = state[best // LANES], best % LANES
     weight = 0.0
-    for e in range(first, end):
-        tile, h = state[e // LANES], e % LANES
+    for s in slots:
+        tile, h = state[s // LANES], s % LANES
         along = 0.0
         for k in range(3):
             along += top[R + 3 * k, i] * tile[R + 3 * k, h]
@@ -272,7 +273,7 @@ def mixture_covariance(tiles: Tiles, coordinates: Array) -> Array:
     ndarray, shape (N, 6, 6)
         Of x, y, z, yaw, pitch, roll; singular coordinates at pitch +-pi/2.
     """
-    owner, firsts = tiles.owner[: tiles.first[-1]], tiles.first[:-1]
+    owner, firsts = tiles.owner[tiles.slot], tiles.first[:-1]
     weights = rows(tiles, WEIGHT, 1)[:, 0]
     weights = weights / np.add.reduceat(weights, firsts)[owner]
     rotation = rotation_from_angles(coordinates[owner, 3:])

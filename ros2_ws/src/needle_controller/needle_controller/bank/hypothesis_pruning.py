@@ -33,6 +33,8 @@ from needle_controller.bank.tip_update import rotate
 from needle_controller.model.arrays import Array
 
 _SAME_LAG = 0.001
+_SHAPES = 3.0
+_ENDED = -1.0
 _X_X = PLACE[0, 0]
 
 
@@ -48,22 +50,27 @@ def merge(tiles: Tiles, angle: float) -> None:
         Between rolls that count as the same [rad].
     """
     cosine, difference = math.cos(angle), np.empty(ERROR)
+    kind = np.empty(int(np.max(np.diff(tiles.first))))
     for n in range(tiles.first.size - 1):
-        for first in range(tiles.first[n], tiles.first[n + 1]):
-            a, i = tiles.state[first // LANES], first % LANES
-            if a[WEIGHT, i] == 0.0:
-                continue
-            for second in range(first + 1, tiles.first[n + 1]):
-                b, j = tiles.state[second // LANES], second % LANES
-                if b[WEIGHT, j] > 0.0 and _same(a, i, b, j, cosine, angle):
+        slots = tiles.slot[tiles.first[n] : tiles.first[n + 1]]
+        for k, s in enumerate(slots):
+            tile, h = tiles.state[s // LANES], s % LANES
+            has_ended = tile[WEIGHT, h] == 0.0
+            kind[k] = _ENDED if has_ended else tile[KIND, h] * _SHAPES + tile[SHAPE, h]
+        for first in range(slots.size):
+            a, i = tiles.state[slots[first] // LANES], slots[first] % LANES
+            for second in range(first + 1, slots.size):
+                if kind[second] != kind[first] or kind[first] == _ENDED:
+                    continue
+                b, j = tiles.state[slots[second] // LANES], slots[second] % LANES
+                if _same(a, i, b, j, cosine, angle):
                     _join(a, i, b, j, difference)
+                    kind[second] = _ENDED
 
 
 @compiled
 def _same(a: Array, i: int, b: Array, j: int, cosine: float, angle: float) -> bool:
-    """Return whether two hypotheses are one: rolls, pitches and sizes of the torsion are near."""
-    if a[KIND, i] != b[KIND, j] or a[SHAPE, i] != b[SHAPE, j]:
-        return False
+    """Return whether two of a kind are one: rolls, pitches and sizes of the torsion are near."""
     along = a[R, i] * b[R, j] + a[R + 1, i] * b[R + 1, j] + a[R + 2, i] * b[R + 2, j]
     return bool(
         along > cosine

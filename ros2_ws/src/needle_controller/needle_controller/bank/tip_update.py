@@ -190,9 +190,11 @@ def _weigh_uniform(tile: Array, m: int, bound: Array, multiple: float, work: Arr
         mass, mean, variance = truncated_moments(
             (innovation - limit) * per_deviation, (innovation + limit) * per_deviation
         )
-        is_own = tile[SHAPE, h] == UNIFORM
-        weight = work[SHARE + m, h] * mass / multiple if is_own else 0.0
-        work[SHARE + m, h] = weight if is_own else work[SHARE + m, h]
+        # Read for all: read for some only, the compiler would write under a mask, at triple cost.
+        is_own, others = tile[SHAPE, h] == UNIFORM, work[SHARE + m, h]
+        weighed = others * mass / multiple
+        weight = weighed if is_own else 0.0
+        work[SHARE + m, h] = weighed if is_own else others
         work[MASS, h] += weight
         work[MEAN, h] += weight * mean
         work[SQUARE, h] += weight * (variance + mean * mean)
@@ -226,9 +228,10 @@ def _weigh_normal(
         per_variance = 1.0 / variance
         bell = falling_exponential(-0.5 * innovation * innovation * per_variance)
         density = _DENSITY * bound[h] * math.sqrt(per_variance) * bell
-        is_own = tile[SHAPE, h] == shape
-        weight = work[SHARE + m, h] * density if is_own else 0.0
-        work[SHARE + m, h] = weight if is_own else work[SHARE + m, h]
+        is_own, others = tile[SHAPE, h] == shape, work[SHARE + m, h]
+        weighed = others * density
+        weight = weighed if is_own else 0.0
+        work[SHARE + m, h] = weighed if is_own else others
         relied = max(measured, bound[h] * bound[h] / 3.0)
         variance = known + (1.0 - lasting * lasting) * relied
         gain = (expected - lasting * before) / (work[DEVIATION, h] * variance)

@@ -10,6 +10,7 @@ from needle_controller.bank.estimate_tiles import (
     PAIRS,
     PLACE,
     ROWS,
+    SHAPE,
     WEIGHT,
     P,
     R,
@@ -26,19 +27,30 @@ COUNTS = np.array([LANES - 3, 9, 2 * LANES])
 
 
 def numbers(seed: int = 1) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(0.1, 1.0, (int(np.sum(COUNTS)), ROWS))
+    rng = np.random.default_rng(seed)
+    written = rng.uniform(0.1, 1.0, (int(np.sum(COUNTS)), ROWS))
+    written[:, SHAPE] = rng.integers(0, 3, len(written))
+    return written
 
 
 def test_rows_come_back() -> None:
     written = numbers()
     tiles = tiles_of(written, COUNTS)
     np.testing.assert_array_equal(rows(tiles, X, 3), written[:, X : X + 3])
-    # The second needle's fourth estimate: the second tile's first lane.
-    e = tiles.first[1] + 3
-    assert tiles.state[1, R + 5, 0] == written[e, R + 5]
-    assert tiles.owner[e] == 1
+    for n, k in ((0, 0), (1, 3), (2, LANES)):
+        e = tiles.first[n] + k
+        slot = tiles.slot[e]
+        assert tiles.state[slot // LANES, R + 5, slot % LANES] == written[e, R + 5]
+        assert tiles.owner[slot] == n
     set_rows(tiles, R, -written[:, R : R + 9])
     np.testing.assert_array_equal(rows(tiles, R, 9), -written[:, R : R + 9])
+
+
+def test_those_of_one_shape_of_noise_lie_side_by_side() -> None:
+    tiles = tiles_of(numbers(), COUNTS)
+    assert np.all(np.diff(tiles.state[:, SHAPE].ravel()) >= 0.0)
+    # All are there, each once.
+    np.testing.assert_array_equal(np.sort(tiles.slot), np.arange(np.sum(COUNTS)))
 
 
 def test_what_fills_the_last_tile_has_no_weight() -> None:
@@ -56,7 +68,9 @@ def test_covariances_come_back_whole() -> None:
     written[:, P : P + PAIRS] = lower_half(wanted)
     tiles = tiles_of(written, COUNTS)
     np.testing.assert_allclose(covariances(tiles), wanted)
-    assert tiles.state[0, PLACE[3, 7], 5] == tiles.state[0, PLACE[7, 3], 5] == wanted[5, 7, 3]
+    tile, lane = divmod(tiles.slot[5], LANES)
+    assert tiles.state[tile, PLACE[3, 7], lane] == wanted[5, 7, 3]
+    assert PLACE[7, 3] == PLACE[3, 7]
 
 
 def test_what_has_ended_goes_but_for_some_room() -> None:
@@ -74,5 +88,6 @@ def test_what_has_ended_goes_but_for_some_room() -> None:
         ended = COUNTS[n] - len(going)
         assert len(kept) == len(going) + min(1 + len(going) // 4, ended)
         np.testing.assert_array_equal(kept[len(going) :, WEIGHT], 0.0)
-        np.testing.assert_array_equal(tiles.owner[tiles.first[n] : tiles.first[n + 1]], n)
+        slots = tiles.slot[tiles.first[n] : tiles.first[n + 1]]
+        np.testing.assert_array_equal(tiles.owner[slots], n)
     np.testing.assert_array_equal(tiles.state[:, WEIGHT].ravel()[tiles.first[-1] :], 0.0)
