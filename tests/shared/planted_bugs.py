@@ -24,6 +24,7 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
 from needle_verification.soak import invariants
+from needle_verification.soak.hold_witness import HoldWitness
 from needle_verification.soak.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
@@ -239,5 +240,8 @@ MENDED = {
         "turns_as_commanded", _judge_forgets(_zero=0.0)
     ),
     "an_overtaken_release": MendedBug("no_motion_by_itself", _overtaken_joystick_counts),
+    "a_driver_killed_under_a_press": MendedBug(
+        "no_motion_by_another", _set(HoldWitness, forget=lambda at, _: at._presses.clear())
+    ),
 }
 """By the schedule, in test/ros/soak/schedules, that found them."""

@@ -73,9 +73,14 @@ class HoldWitness:
                 self._ended = at
             press.spent = True
 
-    def forget(self) -> None:
-        """Begin anew, as the device does that was started again."""
-        self._presses.clear()
+    def forget(self, at: float) -> None:
+        """Begin anew, as the device does that was started again.
+
+        What was under way when it ended may end by the drives' own watchdog.
+        """
+        self._end_lapsed(at)
+        for sender in tuple(self._presses):
+            self._end(sender, at)
 
     def idle(self, at: float) -> float:
         """Return the time since the last moment in which a press could move the needle [s]."""

@@ -181,7 +181,7 @@ class Watch:
         """Take whether the driver runs and hears its drives: else it cannot know better."""
         self._silent_since = None if speaks else self._silent_since or at
         if not speaks:
-            self.witness.forget()
+            self.witness.forget(at)
             # Who starts anew has not heard it; it starts disabled.
             self._estop_since = None
 
