@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -182,16 +181,9 @@ def _look(node: Any, noted: Noted) -> None:
     module.TransformPublishers(_Unmade(node, noted), kind)
 
 
-def _console(_: ModuleType) -> Node:
+def _console(module: ModuleType) -> Node:
     """Make the console without its page: that wants NiceGUI and ports."""
-    pages = ("hold.hold_server", "page.console_page", "page.web_server")
-    stand_ins = {f"needle_console.{page}": mock.MagicMock() for page in pages}
-    name = "needle_console.ros.console_node"
-    with mock.patch.dict(sys.modules, stand_ins):
-        sys.modules.pop(name, None)
-        node: Node = importlib.import_module(name).ConsoleNode()
-    # It knows the stand-ins only.
-    sys.modules.pop(name, None)
+    node: Node = module.ConsoleNode(mock.MagicMock(), mock.MagicMock())
     return node
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
 import http
 import ipaddress
-import json
 import logging
 import secrets
 import socket
@@ -20,26 +20,15 @@ from websockets.http11 import Request, Response
 
 from needle_common.errors import UserError
 from needle_console.access.access import Access
-from needle_console.access.rate_limit import RateLimit
-from needle_console.hold.hold_arbiter import HoldArbiter
-from needle_console.hold.hold_state import RELEASED, HoldState
+from needle_console.hold.hold_state import HoldState
+from needle_console.hold.hold_talk import PERIOD, HoldTalk
 from needle_console.hold.page_message import LONGEST, GarbageError, read_token
-from needle_console.hold.refusals import Refusal, Refusals
-
-PERIOD = 0.02
-"""Nonces go to every page, and the hold's state to its taker, so often [s]."""
-
-ALONE_PERIOD = 0.08
-"""Without a page nobody can press: the release is only repeated, above 10 times a second [s]."""
+from needle_console.hold.refusals import Refusal
 
 PATH = "/hold"
 _MOST_CONNECTIONS = 32
 # From TCP's first packet to a request, and from there to a token [s].
 _PATIENCE = 1.0
-# By so much later than a hold's end it is looked at [s].
-_TICK = 1e-4
-# A page answers 50 times a second, and when its button changes.
-_RATE, _BURST = 100.0, 50
 _POLICY_VIOLATION, _TOO_BIG = 1008, 1009
 
 
@@ -52,11 +41,8 @@ class HoldServer:
         Who may connect.
     port : int
         Port to listen on; 0 takes any that is free.
-    on_state : callable
-        Takes the hold every `PERIOD`, without a page every `ALONE_PERIOD`, and at once when it
-        changes; called by the hold's thread, which must not be kept waiting.
-    on_notice : callable
-        Takes a line that is worth a warning; called by the hold's thread.
+    on_state, on_notice : callable
+        As of `HoldTalk`; called by the hold's thread, which must not be kept waiting.
 
     Raises
     ------
@@ -72,11 +58,8 @@ class HoldServer:
         on_notice: Callable[[str], None],
     ) -> None:
         self._access = access
-        self._on_state = on_state
-        self._on_notice = on_notice
-        self._refusals = Refusals()
-        self._arbiter = HoldArbiter(lambda: secrets.token_hex(8))
-        self._told = RELEASED
+        make_nonce = functools.partial(secrets.token_hex, 8)
+        self._talk = HoldTalk(make_nonce, on_state, on_notice, time.monotonic())
         self._connections = 0
         self._socket = _listen(access.address, port)
         self._loop = asyncio.new_event_loop()
@@ -110,7 +93,7 @@ class HoldServer:
 
     def counts(self) -> dict[str, int]:
         """Return how often what was refused or lost."""
-        return self._refusals.counts()
+        return self._talk.refusals.counts()
 
     # ---- the thread ---------------------------------------------------------------------------
 
@@ -142,39 +125,16 @@ class HoldServer:
 
     async def _hand_on(self) -> None:
         """Hand on the hold once at least, until the end: at fixed times, and when it runs out."""
-        due = time.monotonic()
         while True:
             self._called.clear()
             now = time.monotonic()
-            period = PERIOD if self._arbiter.has_pages else ALONE_PERIOD
-            # Sooner than was meant where the first page has come.
-            due = min(due, now + period)
-            if now >= due or (self._told.pressed and now > self._arbiter.until):
-                self._tell()
-                while due <= now:
-                    due += period
-            wait = min(due, max(self._arbiter.until, now) + _TICK) if self._told.pressed else due
+            again = self._talk.look(now)
             # Its own timer, and no task for each wait: that was half of what an idle console cost.
-            timer = self._loop.call_later(wait - now, self._called.set)
+            timer = self._loop.call_later(again - now, self._called.set)
             await self._called.wait()
             timer.cancel()
             if self._is_ended:
                 return
-
-    def _tell(self) -> None:
-        now = time.monotonic()
-        if self._arbiter.lapses(now):
-            self._refuse(Refusal.LOST, "no fresh word of the page; it takes a new press")
-        self._told = self._arbiter.state(now)
-        self._on_state(self._told)
-
-    def _tell_change(self) -> None:
-        if self._arbiter.state(time.monotonic()) != self._told:
-            self._tell()
-
-    def _refuse(self, refusal: Refusal, detail: str = "") -> None:
-        if self._refusals.count(refusal):
-            self._on_notice(f"hold: {refusal.value}" + (f" ({detail})" if detail else ""))
 
     # ---- a connection -------------------------------------------------------------------------
 
@@ -193,7 +153,7 @@ class HoldServer:
             refusal = Refusal.CONNECTIONS
         if refusal is None:
             return None
-        self._refuse(refusal)
+        self._talk.refuse(refusal)
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal.value}\n")
 
     async def _serve_connection(self, connection: ServerConnection) -> None:
@@ -203,7 +163,7 @@ class HoldServer:
                 await self._serve_page(connection)
         except ConnectionClosed as closed:
             if closed.sent is not None and closed.sent.code == _TOO_BIG:
-                self._refuse(Refusal.SIZE)
+                self._talk.refuse(Refusal.SIZE)
         finally:
             self._connections -= 1
 
@@ -220,12 +180,12 @@ class HoldServer:
 
     async def _close(self, connection: ServerConnection, refusal: Refusal) -> bool:
         """Close a connection for a reason; returns False."""
-        self._refuse(refusal)
+        self._talk.refuse(refusal)
         await connection.close(_POLICY_VIOLATION, refusal.value)
         return False
 
     async def _serve_page(self, connection: ServerConnection) -> None:
-        page = self._arbiter.open(time.monotonic())
+        page = self._talk.open(time.monotonic())
         if page is None:
             await self._close(connection, Refusal.PAGES)
             return
@@ -235,39 +195,27 @@ class HoldServer:
             await self._hear(connection, page)
         finally:
             # First of all: what a gone page held ends now.
-            self._arbiter.close(page)
-            self._tell_change()
+            self._talk.close(page, time.monotonic())
             sending.cancel()
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await sending
 
     async def _hear(self, connection: ServerConnection, page: int) -> None:
-        limit = RateLimit(_RATE, _BURST)
         async for data in connection:
-            now = time.monotonic()
-            if not limit.lets_through(now):
-                self._refuse(Refusal.RATE)
+            if not self._talk.hear(page, data, time.monotonic()):
                 # Whoever floods is not waited for.
                 connection.transport.abort()
                 return
-            # A silence that nobody watched is one all the same.
-            if self._arbiter.lapses(now):
-                self._refuse(Refusal.LOST)
-            refusal = self._arbiter.receive(page, data, now)
-            if refusal is not None:
-                self._refuse(refusal)
-            self._tell_change()
 
     async def _send_nonces(self, connection: ServerConnection, page: int) -> None:
         while True:
             now = time.monotonic()
-            if self._arbiter.is_silent(page, now):
-                self._refuse(Refusal.SILENT)
+            if self._talk.has_lost(page, now):
                 connection.transport.abort()
                 return
-            nonce = self._arbiter.issue(page, now)
-            if nonce is not None:
-                await connection.send(json.dumps({"nonce": nonce, **self._arbiter.tell(page, now)}))
+            word = self._talk.word_for(page, now)
+            if word is not None:
+                await connection.send(word)
             await asyncio.sleep(PERIOD)
 
 

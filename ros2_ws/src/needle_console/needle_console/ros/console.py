@@ -4,10 +4,16 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from functools import partial
+
+from rclpy.node import Node
 
 from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import executor_of, run_node
+from needle_console.access.access import Access
+from needle_console.page.desk import Desk
+from needle_console.ros.console_node import ConsoleNode
 from needle_console.ros.console_parameters import ConsoleParameters
 
 # What cannot wait has threads of its own: a signal is seen so late at most [s].
@@ -29,16 +35,28 @@ def main() -> int:
         print("error: NiceGUI is not installed; scripts/console installs it", file=sys.stderr)
         return EXIT_BAD_INPUT
     # What cannot be imported without NiceGUI is imported where it is there.
-    from needle_console.ros.console_node import ConsoleNode  # noqa: PLC0415
+    from needle_console.hold.hold_server import HoldServer  # noqa: PLC0415
+    from needle_console.page.console_page import HoldLink  # noqa: PLC0415
+    from needle_console.page.web_server import WebServer  # noqa: PLC0415
 
-    def spin(node: ConsoleNode, end: EndRequest) -> int:
-        with executor_of(node) as executor:
-            while not end.wanted:
-                executor.spin_once(timeout_sec=_LOOK_PERIOD)
-            node.close()
-        return EXIT_DONE
+    def make_page(
+        desk: Desk, access: Access, parameters: ConsoleParameters, token: str
+    ) -> WebServer:
+        at = parameters
+        hold = HoldLink(at.hold_port, token)
+        return WebServer(desk, access, address=at.address, port=at.port, hold=hold)
 
-    return run_node(ConsoleNode, help_text=HELP, parameters=ConsoleParameters, spin=spin)
+    create = partial(ConsoleNode, HoldServer, make_page)
+    return run_node(create, help_text=HELP, parameters=ConsoleParameters, spin=_spin)
+
+
+def _spin(node: Node, end: EndRequest) -> int:
+    assert isinstance(node, ConsoleNode)
+    with executor_of(node) as executor:
+        while not end.wanted:
+            executor.spin_once(timeout_sec=_LOOK_PERIOD)
+        node.close()
+    return EXIT_DONE
 
 
 if __name__ == "__main__":

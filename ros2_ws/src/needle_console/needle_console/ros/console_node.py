@@ -7,7 +7,7 @@ import queue
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from geometry_msgs.msg import PointStamped, PoseStamped
 
@@ -21,12 +21,9 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_console.access.access import Access
-from needle_console.hold.hold_server import HoldServer
 from needle_console.hold.hold_state import OWNER, HoldState
 from needle_console.hold.retraction import Retraction
-from needle_console.page.console_page import HoldLink
 from needle_console.page.desk import Desk
-from needle_console.page.web_server import WebServer
 from needle_console.ros.console_parameters import ConsoleParameters
 from needle_console.ros.rig_services import OF_BUTTON, STOP, RigServices
 from needle_console.ros.rig_topics import RigTopics
@@ -41,6 +38,34 @@ _LOOK_PERIOD = 0.2
 _HEALTH_PERIOD = 1.0
 
 
+class Served(Protocol):
+    """A server with a thread of its own."""
+
+    def start(self) -> None:
+        """Begin to serve."""
+
+    def close(self) -> None:
+        """End."""
+
+
+class HoldServed(Served, Protocol):
+    """Server of the hold."""
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the hold is served."""
+
+    def counts(self) -> dict[str, int]:
+        """Return how often what was refused or lost."""
+
+
+MakeHold = Callable[[Access, int, Callable[[HoldState], None], Callable[[str], None]], HoldServed]
+"""Makes the hold's server: who may connect, its port, what takes the hold, and a notice."""
+
+MakePage = Callable[[Desk, Access, ConsoleParameters, str], Served]
+"""Makes the page's server: what pages do, who may open one, the parameters, the hold's token."""
+
+
 class ConsoleNode(WholeNode):
     """Page, hold and rig, tied together.
 
@@ -50,6 +75,10 @@ class ConsoleNode(WholeNode):
 
     Parameters
     ----------
+    make_hold : MakeHold
+        Makes the server of the hold.
+    make_page : MakePage
+        Makes the server of the page.
     node_arguments : dict
         Passed on to rclpy's Node (a context of its own, parameter overrides).
 
@@ -59,7 +88,7 @@ class ConsoleNode(WholeNode):
         A parameter that cannot be, or a port that is taken.
     """
 
-    def __init__(self, **node_arguments: Any) -> None:
+    def __init__(self, make_hold: MakeHold, make_page: MakePage, **node_arguments: Any) -> None:
         super().__init__("console", **node_arguments)
         values = NodeParameters(self, ConsoleParameters).values
         self._picture = RigPicture()
@@ -76,14 +105,8 @@ class ConsoleNode(WholeNode):
         token = _token(values.token_file)
         hosts = [host for host in values.hosts if host]
         access = Access(values.address, values.port, token, hosts)
-        self._hold = HoldServer(access, values.hold_port, self._on_hold, self._on_notice)
-        self._web = WebServer(
-            self._desk(),
-            access,
-            address=values.address,
-            port=values.port,
-            hold=HoldLink(values.hold_port, token),
-        )
+        self._hold = make_hold(access, values.hold_port, self._on_hold, self._on_notice)
+        self._web = make_page(self._desk(), access, values, token)
         self.create_timer(_LOOK_PERIOD, self._look, clock=STEADY_CLOCK)
         self.create_timer(_HEALTH_PERIOD, self._tell_health, clock=STEADY_CLOCK)
         self._life = LifeSigns(

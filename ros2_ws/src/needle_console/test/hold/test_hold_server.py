@@ -22,7 +22,7 @@ pytest.importorskip("websockets", reason="the console's lock is not installed: s
 from websockets.exceptions import ConnectionClosed, InvalidMessage, InvalidStatus
 from websockets.sync.client import connect
 
-from needle_console.hold import hold_server
+from needle_console.hold import hold_talk
 from needle_console.hold.hold_server import HoldServer
 
 PAGE_PORT = 8080
@@ -187,7 +187,7 @@ def test_an_end_before_the_first_word_hands_on_a_release_all_the_same() -> None:
 def test_without_a_page_the_release_is_only_repeated_and_the_first_page_wakes_the_server(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(hold_server, "ALONE_PERIOD", 3600.0)
+    monkeypatch.setattr(hold_talk, "ALONE_PERIOD", 3600.0)
     rig = Rig()
     try:
         # Who says no token is no page; to find that out takes the time of 50 words.
