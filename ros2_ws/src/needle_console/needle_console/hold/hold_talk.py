@@ -1,4 +1,4 @@
-"""What is said between pages and the taker of their hold, and when."""
+"""The talk between pages and the taker of their hold: what is said, and when."""
 
 from __future__ import annotations
 
