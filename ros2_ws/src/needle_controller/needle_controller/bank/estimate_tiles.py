@@ -168,7 +168,8 @@ def _pick(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.in
 
 @compiled
 def _gather(state: Array, picked: npt.NDArray[np.int64], target: Array) -> None:
-    for e in range(picked.size):
-        source, lane = state[picked[e] // LANES], picked[e] % LANES
+    for t in range(target.shape[0]):
+        of_tile = picked[t * LANES : (t + 1) * LANES]
         for row in range(ROWS):
-            target[e // LANES, row, e % LANES] = source[row, lane]
+            for h in range(LANES):
+                target[t, row, h] = state[of_tile[h] // LANES, row, of_tile[h] % LANES]

@@ -132,21 +132,23 @@ def mixture(
     table : ndarray, shape (N, K, 8), written
         See `Hypotheses`; likewise `uncertainty`, shape (N, 3).
     """
-    sums = np.empty(SUMS)
+    sums, going_on = np.empty(SUMS), np.empty_like(tiles.slot)
     for n in range(tiles.first.size - 1):
-        slots = tiles.slot[tiles.first[n] : tiles.first[n + 1]]
         sums[:] = 0.0
         whole = heaviest = 0.0
-        best = slots[0]
+        count = best = 0
+        for s in tiles.slot[tiles.first[n] : tiles.first[n + 1]]:
+            weight = tiles.state[s // LANES, WEIGHT, s % LANES]
+            if weight > 0.0:
+                going_on[count] = s
+                count += 1
+                whole += weight
+            if weight > heaviest:
+                heaviest, best = weight, s
+        slots = going_on[:count]
         for s in slots:
             tile, h = tiles.state[s // LANES], s % LANES
-            whole += tile[WEIGHT, h]
-            if tile[WEIGHT, h] > heaviest:
-                heaviest, best = tile[WEIGHT, h], s
-        for s in slots:
-            tile, h = tiles.state[s // LANES], s % LANES
-            if tile[WEIGHT, h] > 0.0:
-                _add_estimate(tile, h, tile[WEIGHT, h] / whole, sums)
+            _add_estimate(tile, h, tile[WEIGHT, h] / whole, sums)
         _fill_table(tiles.state, slots, whole, table[n])
         x, sin_pitch = sums[S_POSITION], sums[S_HEADING]
         linearized[n, 0], linearized[n, 1], linearized[n, 2] = x, sin_pitch, sums[S_BEND]
@@ -206,8 +208,6 @@ def _fill_table(state: Array, slots: npt.NDArray[np.int64], whole: float, table:
     for s in slots:
         tile, h = state[s // LANES], s % LANES
         weight = tile[WEIGHT, h]
-        if weight == 0.0:
-            continue
         row = table[int(tile[KIND, h])]
         r00, r01 = tile[R, h], tile[R + 1, h]
         across = weight / math.sqrt(r00 * r00 + r01 * r01)
