@@ -145,10 +145,10 @@ PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 143),
     "a press beside the owner waits": PlantedBug(
-        "no_motion_by_another", _press_beside_the_owner_waits, 268
+        "no_motion_by_another", _press_beside_the_owner_waits, 362
     ),
     "a hold that anybody keeps": PlantedBug(
-        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 268
+        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 466
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
@@ -241,7 +241,7 @@ MENDED = {
     ),
     "an_overtaken_release": MendedBug("no_motion_by_itself", _overtaken_joystick_counts),
     "a_driver_killed_under_a_press": MendedBug(
-        "no_motion_by_another", _set(HoldWitness, forget=lambda at, _: at._presses.clear())
+        "no_motion_by_another", _set(HoldWitness, lose_device=lambda *_: None)
     ),
 }
 """By the schedule, in test/ros/soak/schedules, that found them."""

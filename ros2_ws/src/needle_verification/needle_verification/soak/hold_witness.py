@@ -73,14 +73,15 @@ class HoldWitness:
                 self._ended = at
             press.spent = True
 
-    def forget(self, at: float) -> None:
-        """Begin anew, as the device does that was started again.
-
-        What was under way when it ended may end by the drives' own watchdog.
-        """
+    def lose_device(self, at: float) -> None:
+        """Take that the device ended: by its drives' own watchdog what was under way may last."""
         self._end_lapsed(at)
         for sender in tuple(self._presses):
             self._end(sender, at)
+
+    def forget(self) -> None:
+        """Begin anew, as the device does that was started again."""
+        self._presses.clear()
 
     def idle(self, at: float) -> float:
         """Return the time since the last moment in which a press could move the needle [s]."""

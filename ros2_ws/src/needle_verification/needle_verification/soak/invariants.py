@@ -179,9 +179,11 @@ class Watch:
 
     def see_driver(self, at: float, *, speaks: bool) -> None:
         """Take whether the driver runs and hears its drives: else it cannot know better."""
+        if not speaks and self._silent_since is None:
+            self.witness.lose_device(at)
         self._silent_since = None if speaks else self._silent_since or at
         if not speaks:
-            self.witness.forget(at)
+            self.witness.forget()
             # Who starts anew has not heard it; it starts disabled.
             self._estop_since = None
 

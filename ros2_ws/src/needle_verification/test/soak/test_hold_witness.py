@@ -60,7 +60,7 @@ def test_a_stop_takes_the_hold_from_who_presses_on(beside: HoldWitness) -> None:
 
 def test_a_device_that_was_started_again_knows_nobody(beside: HoldWitness) -> None:
     beside.see_owner(1.02, "")
-    beside.forget(1.02)
+    beside.forget()
     hold(beside, OTHER, 1.5, 2.0)
     assert beside.idle(2.0) == 0.0
 
@@ -68,6 +68,6 @@ def test_a_device_that_was_started_again_knows_nobody(beside: HoldWitness) -> No
 def test_a_press_by_which_it_moved_when_the_device_ended_counts_until_then(
     beside: HoldWitness,
 ) -> None:
-    beside.forget(1.02)
+    beside.lose_device(1.02)
     beside.see_owner(1.5, "")
     assert beside.idle(1.1) == pytest.approx(0.08)
