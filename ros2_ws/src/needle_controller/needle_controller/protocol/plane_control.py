@@ -8,6 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from needle_controller.bank.hypothesis_filter import TIDY_EVERY
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import X, rotation_from_angles
@@ -292,12 +293,13 @@ class PlaneControl:
         estimator.correct(position, covariance)
 
     def _warm_up(self) -> None:
-        """Run once what an update runs: compiled code is made here, not at the first tip."""
+        """Run what updates run: compiled code is made here, not while a needle waits for it."""
         settings, length = self._settings, self._settings.step_length
         estimator, law = make_controller(settings, np.eye(3))
         estimator.reset(np.zeros(3), np.zeros(2))
-        estimator.advance(length, 0.0)
-        estimator.correct([0.0, 0.0, length], settings.configured_covariance())
+        for tips in range(1, TIDY_EVERY + 1):
+            estimator.advance(length, 0.0)
+            estimator.correct([0.0, 0.0, tips * length], settings.configured_covariance())
         estimate = estimator.estimate()
         law(estimate, length)
         if settings.steers_to_points:
