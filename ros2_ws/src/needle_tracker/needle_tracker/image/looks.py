@@ -137,18 +137,32 @@ class MapLook:
         return background.beyond_seam(point)
 
     def _has_come(self, image: Image, point: Array, direction: Array, width: float) -> bool:
-        """Return whether there was nothing like the needle's end in an earlier image."""
+        """Return whether there was nothing like the needle's end in an earlier image.
+
+        What else is new, elsewhere in the image, does not matter.
+        """
         background = self.background
         if background is None:
             return False
-        if background.difference(image) is not None:
-            return background.beyond_seam(point) > width
+        difference = background.difference(image)
+        if difference is not None and background.is_empty:
+            return True
         begin = point - LEAST_NEW * width * direction
         low, high = np.minimum(begin, point) - width, np.maximum(begin, point) + width + 1.0
         box = (int(low[0]), int(low[1]), int(high[0]) + 1, int(high[1]) + 1)
         before = self._map_before.draw(background.before, box)
-        there = before[max(box[1], 0) : box[3], max(box[0], 0) : box[2]]
-        return bool(there.max(initial=0) < 255.0 * _SURE_ENOUGH)
+        if difference is None:
+            there = before[max(box[1], 0) : box[3], max(box[0], 0) : box[2]]
+            return bool(there.max(initial=0) < 255.0 * _SURE_ENOUGH)
+        # Up to a width before the end, where it may fade.
+        ways = np.arange(width, LEAST_NEW * width + 1.0)[:, None]
+        columns, rows = np.rint(point - ways * direction).astype(np.int64).T
+        last_row, last_column = image.shape[0] - 1, image.shape[1] - 1
+        shaft = np.clip(rows, 0, last_row), np.clip(columns, 0, last_column)
+        new = self._map_of_difference.draw(difference, box)[shaft].mean()
+        # What the image before showed better is a needle that has gone.
+        now = self._map.draw(image, box)[shaft].mean()
+        return bool(new > SURE and now > before[shaft].mean())
 
     def find_paths(
         self,

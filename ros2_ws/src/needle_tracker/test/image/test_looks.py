@@ -79,6 +79,18 @@ def test_a_needle_has_come_where_there_was_none_of_it(
     assert (found is not None and found.come) is come
 
 
+def test_a_needle_has_come_whatever_else_is_new_beyond_it() -> None:
+    look = MapLook(WIDTH_PX, 0.0)
+    look.background = Background(drawn(0, 1, paper=True), np.array([0.0, 121.0]), 3.0 * WIDTH_PX)
+    image = drawn(160, 2, paper=True)
+    cv2.line(image, (205, 70), (240, 66), 20, 5, cv2.LINE_AA)
+    expected = Expected(np.array([160.0, 121.0]), np.array([1.0, 0.0]), 90.0, 60, 0.0, 0.0)
+    found = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
+    assert found is not None
+    assert abs(found.point[0] - 160.0) < WIDTH_PX
+    assert found.come
+
+
 def shown(
     monkeypatch: pytest.MonkeyPatch, lines: list[tuple[np.ndarray, float]]
 ) -> tuple[MapLook, np.ndarray]:
