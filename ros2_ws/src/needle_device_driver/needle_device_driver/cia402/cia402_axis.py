@@ -77,9 +77,8 @@ class Cia402Axis(Axis):
         self._watchdog = watchdog
         self.monitor = DriveMonitor(link, settings.node_id)
         self.missing_optional_objects: tuple[str, ...] = ()
-        self._machine = DriveMachine(
-            settings.magnitude(settings.tolerance), period, self.monitor.feedback
-        )
+        rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
+        self._machine = DriveMachine(rest, period, stop_time, self.monitor.feedback)
         self._homing: HomingRun | None = None
         self._configured = False
         self._opening = 0
@@ -149,11 +148,12 @@ class Cia402Axis(Axis):
             raise AxisError(f"{self.name} axis is not ready to move")
         settings = self._settings
         counts = settings.counts(target)
-        lower, upper = settings.limits_counts
-        if self._homed and not lower <= counts <= upper:
+        lower, upper = settings.limits_counts if self._homed else od.NO_LIMITS[0]
+        if not lower <= counts <= upper:
+            # How a drive goes on beyond its last count is its own: on, back all the way, or not.
             raise AxisError(
-                f"{self.name} axis: target {target:.6g} is outside the drive's limits "
-                f"[{settings.lower:.6g}, {settings.upper:.6g}]",
+                f"{self.name} axis: target {target:.6g} is outside the drive's "
+                f"{settings.limits if self._homed else 'counter; home it, or set it nearer 0'}",
                 Rule.SOFTWARE_LIMITS,
             )
         step = abs(counts - self._machine.target)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     POWERED,
@@ -17,9 +19,12 @@ from needle_device_driver.cia402.cia402 import (
 from needle_device_driver.cia402.drive_monitor import Feedback
 
 # In cycles: how long an axis must stand still to be at rest; when it is switched off although it
-# does not; when a change of state has failed; when a quick stop is left by way of switching off.
+# does not; how much longer than its ramp a quick stop may last, and how long it is then looked at;
+# when a change of state has failed; when a quick stop is left by way of switching off.
 _REST = 3
 LONGEST_REST = 50
+_STOP_MARGIN = 2
+_WINDOW = 5
 _LONGEST_SWITCHING = 100
 _LONGEST_REENABLE = 10
 
@@ -33,19 +38,25 @@ class DriveMachine:
         An axis that moves no further in a cycle stands still.
     period : float
         Of a cycle [s].
+    stop_time : float
+        How long a quick stop takes at most [s].
     at : Feedback
         What the drive said last.
     """
 
-    def __init__(self, rest_counts: int, period: float, at: Feedback) -> None:
+    def __init__(self, rest_counts: int, period: float, stop_time: float, at: Feedback) -> None:
         self._rest_counts = rest_counts
         self._period = period
+        self._longest_stop = math.ceil(stop_time / period) + _STOP_MARGIN
         self._watch = TransitionWatch()
         self._goal = Goal.OFF
         self._cycles = 0
         self._via_off = False
         self._stopping = False
         self._still = 0
+        self._in_stop = 0
+        self._stopped_at = at.position
+        self._runs_on = False
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.at = at
@@ -108,6 +119,7 @@ class DriveMachine:
         self.want(Goal.OFF)
         self._stopping = False
         self._still = 0
+        self._runs_on = False
         self.at = at
         self.target = at.position
         self.trouble = ""
@@ -137,7 +149,27 @@ class DriveMachine:
             self.target = at.position
         self._stopping = self._stopping and state is DriveState.OPERATION_ENABLED
         self._cycles += 1
+        self._watch_stop(state)
         self._watch_switching(state)
+
+    def _watch_stop(self, state: DriveState) -> None:
+        """See to it that a drive does in a quick stop what it says, or switch it off."""
+        if self._goal is not Goal.STOPPED or state is not DriveState.QUICK_STOP_ACTIVE:
+            self._in_stop = 0
+            return
+        self._in_stop += 1
+        over = self._in_stop - self._longest_stop
+        if over < 0 or over % _WINDOW:
+            return
+        # What trembles beside one place goes nowhere.
+        way = abs(self.at.position - self._stopped_at)
+        self._stopped_at = self.at.position
+        if over and way > _WINDOW * self._rest_counts:
+            self._runs_on = True
+            self._complain(
+                f"runs on in its quick stop ({way} counts in {_WINDOW * self._period:g} s) and is "
+                "switched off: its ramp 0x6085, the ramp's unit"
+            )
 
     def _watch_switching(self, state: DriveState) -> None:
         homing = self.mode is Mode.HOMING and self.at.mode == Mode.HOMING
@@ -169,6 +201,8 @@ class DriveMachine:
 
     def _next_command(self) -> DriveCommand:
         state = self.state
+        if self._runs_on:
+            return DriveCommand.DISABLE_VOLTAGE
         if self._stopping:
             return DriveCommand.QUICK_STOP
         if self.let_go or (self._via_off and state is DriveState.QUICK_STOP_ACTIVE):

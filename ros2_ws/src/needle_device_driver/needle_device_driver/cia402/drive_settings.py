@@ -94,6 +94,16 @@ class DriveSettings:
         return max(1, round(value * self.counts_per_unit))
 
     @property
+    def stop_time(self) -> float:
+        """How long a quick stop takes at most [s]; a drive may round its ramp down to half."""
+        return 2.0 * self.speed / self.quick_stop_deceleration
+
+    @property
+    def limits(self) -> str:
+        """Software limits as messages have them."""
+        return f"limits [{self.lower:.6g}, {self.upper:.6g}]"
+
+    @property
     def limits_counts(self) -> tuple[int, int]:
         """Software limits in counts, lower first."""
         limits = sorted((self.counts(self.lower), self.counts(self.upper)))

@@ -9,6 +9,7 @@ from needle_device_driver.cia402.cia402 import (
     SUPPORTS_CYCLIC_POSITION,
     SUPPORTS_HOMING,
     DriveCommand,
+    Mode,
     drive_state,
 )
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
@@ -20,6 +21,8 @@ from needle_device_driver.link.object_access import DriveError, DriveRefusalErro
 
 # Milliseconds between a drive's heartbeats: well inside the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
+# Where the drive's own is fixed: what a start, and a drive that stands still, are waited for.
+_SLOWEST_HEARTBEAT_MS = 200
 # In seconds.
 _SWITCH_OFF_WAIT = 1.0
 
@@ -95,7 +98,7 @@ def set_up(
         map_pdo(access, node, od.POSITION_ALONE)
     silence_unused(access)
     access.offer(od.CYCLE_PERIOD, round(period * 1e6))
-    access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
+    _write_heartbeat(access)
     link.send(od.NMT, bytes([od.NMT_START, node]))
     return tuple(missing)
 
@@ -131,14 +134,12 @@ def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
 def _set_up_motion(
     link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
 ) -> list[str]:
-    modes = access.read(od.SUPPORTED_MODES)
-    for bit, name in (
-        (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
-        (SUPPORTS_HOMING, "homing"),
-    ):
-        if not modes & bit:
-            raise DriveError(f"node {settings.node_id} has no {name} mode (0x6502 = 0x{modes:08X})")
+    listed = _lists_modes(access, settings.node_id)
     _switch_off(link, access, settings)
+    if not listed:
+        # It refuses to be in a mode that it lacks.
+        for mode in (Mode.HOMING, Mode.CYCLIC_SYNCHRONOUS_POSITION):
+            access.write(od.MODE_OF_OPERATION, mode)
     # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
     access.write_checked(od.QUICK_STOP_OPTION, 6)
     # The node keeps its state: whether it exchanges process data tells a reboot.
@@ -167,6 +168,33 @@ def _set_up_motion(
         wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.ROUNDED))
     missing = (_set(access, entry, value, need) for entry, value, need in wanted)
     return [text for text in missing if text]
+
+
+def _write_heartbeat(access: ObjectAccess) -> None:
+    try:
+        access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
+    except DriveRefusalError as error:
+        if error.object_is_missing:
+            raise
+        if not 0 < access.read(od.PRODUCER_HEARTBEAT) <= _SLOWEST_HEARTBEAT_MS:
+            raise
+
+
+def _lists_modes(access: ObjectAccess, node: int) -> bool:
+    """Return whether a drive says which modes it has; raises where a needed one is not there."""
+    try:
+        modes = access.read(od.SUPPORTED_MODES)
+    except DriveRefusalError as error:
+        if error.object_is_missing:
+            return False
+        raise
+    for bit, name in (
+        (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
+        (SUPPORTS_HOMING, "homing"),
+    ):
+        if not modes & bit:
+            raise DriveError(f"node {node} has no {name} mode (0x6502 = 0x{modes:08X})")
+    return True
 
 
 def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:

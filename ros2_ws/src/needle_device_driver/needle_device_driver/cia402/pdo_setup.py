@@ -68,9 +68,16 @@ def _cob_id(communication: int) -> od.Entry:
 
 def _write_transmission(access: ObjectAccess, pdo: Pdo) -> None:
     transmission = od.Entry(pdo.communication, 2, od.U8, "transmission type")
-    try:
-        access.write(transmission, pdo.transmission)
-    except DriveRefusalError:
-        if pdo.transmission != od.ASYNCHRONOUS:
-            raise
-        access.write(transmission, od.ASYNCHRONOUS_BY_MAKER)
+    types = [pdo.transmission]
+    if pdo.communication < _FIRST_TRANSMIT:
+        # What a drive receives it may take at once: all of a cycle is sent together.
+        types += [od.ASYNCHRONOUS, od.ASYNCHRONOUS_BY_MAKER]
+    refusals = []
+    for number in types:
+        try:
+            access.write(transmission, number)
+        except DriveRefusalError as error:
+            refusals.append(error)
+        else:
+            return
+    raise refusals[0]

@@ -20,7 +20,7 @@ def said(statusword: int, position: int = 0, mode: int = 8, behind: int = 0) -> 
 
 @pytest.fixture
 def machine() -> DriveMachine:
-    return DriveMachine(rest_counts=2, period=0.02, at=said(DISABLED))
+    return DriveMachine(rest_counts=2, period=0.02, stop_time=0.05, at=said(DISABLED))
 
 
 def enabled(machine: DriveMachine) -> None:
@@ -114,6 +114,45 @@ def test_a_stopped_axis_that_its_drive_would_pull_on_is_switched_off(
         machine.update(said(statusword, 500))
     assert machine.ready
     assert not machine.let_go
+
+
+@pytest.mark.parametrize(
+    ("ways", "off"),
+    [
+        # It runs on; it slows down too late; it creeps at the edge of what counts as rest.
+        ([100] * 20, True),
+        ([100] * 9 + [80, 60, 40, 20, 0, 0, 0, 0, 0, 0, 0], True),
+        ([2] * 20, False),
+        # It stops on its ramp; it trembles by more than it may at rest.
+        ([100, 60, 20] + [0] * 17, False),
+        ([8, -8] * 10, False),
+    ],
+)
+def test_a_drive_that_runs_on_in_its_quick_stop_is_switched_off(
+    machine: DriveMachine, ways: list[int], off: bool
+) -> None:
+    enabled(machine)
+    machine.stop()
+    orders = [machine.next_order()[0]]
+    for position in itertools.accumulate(ways):
+        machine.update(said(QUICK_STOP, position))
+        orders.append(machine.next_order()[0])
+    # 50 ms of ramp are 3 cycles, 2 more for late answers, and 5 to see where it goes.
+    assert orders[:10] == [DriveCommand.QUICK_STOP] * 10
+    assert orders[10:] == [DriveCommand.DISABLE_VOLTAGE if off else DriveCommand.QUICK_STOP] * 11
+    assert ("runs on in its quick stop" in machine.trouble) is off
+
+
+def test_a_stop_after_one_that_ran_on_is_a_new_one(machine: DriveMachine) -> None:
+    for _ in range(2):
+        enabled(machine)
+        machine.stop()
+        for position in range(0, 2000, 100):
+            machine.next_order()
+            machine.update(said(QUICK_STOP, position))
+        assert machine.next_order()[0] is DriveCommand.DISABLE_VOLTAGE
+        assert "runs on" in machine.trouble
+        machine.begin_anew(said(DISABLED, 2000))
 
 
 def test_the_mode_changes_only_while_the_drive_is_off(machine: DriveMachine) -> None:

@@ -60,6 +60,37 @@ def test_a_setting_that_a_rule_needs_is_not_left_to_a_drive(
     assert "insertion axis: node 1 refuses to write" in reply.message
 
 
+@pytest.mark.parametrize(("fixed", "taken"), [(50, True), (200, True), (0, False), (201, False)])
+def test_a_heartbeat_that_is_fixed_may_be_slower(
+    drive_bench: DriveBench, fixed: int, taken: bool
+) -> None:
+    drive_bench.insertion.objects[0x1017, 0] = fixed.to_bytes(2, "little")
+    drive_bench.insertion.refuses = refuse(READ_ONLY, 0x1017)
+    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    assert reply.success is taken
+    assert taken or "node 1 refuses to write 30 to 0x1017:0" in reply.message
+
+
+@pytest.mark.parametrize("lacks", [None, 6, 8])
+def test_a_drive_that_lists_no_modes_is_told_each(
+    drive_bench: DriveBench, lacks: int | None
+) -> None:
+    drive = drive_bench.insertion
+    del drive.objects[0x6502, 0]
+    drive.state = "enabled"
+    drive.refuses = lambda index, sub, value: (
+        (OTHER_STATE if drive.state == "enabled" else RANGE if value[0] == lacks else 0)
+        if index == 0x6060
+        else 0
+    )
+    if lacks is None:
+        steps(drive_bench)
+        return
+    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    assert f"node 1 refuses to write {lacks} to 0x6060:0 mode of operation" in reply.message
+    assert "(docs/hardware.md says what for)" in reply.message
+
+
 def test_what_a_drive_has_already_it_need_not_take(drive_bench: DriveBench) -> None:
     drive_bench.insertion.objects[0x605A, 0] = b"\x06\x00"
     drive_bench.insertion.refuses = refuse(READ_ONLY, 0x605A)
@@ -198,11 +229,31 @@ def test_process_data_that_nobody_asked_for_is_switched_off(drive_bench: DriveBe
         assert drive.objects[index, 3] == drive.objects[index, 5] == bytes(2)
 
 
-def test_an_order_of_the_makers_event_type_acts_at_once_too(drive_bench: DriveBench) -> None:
+@pytest.mark.parametrize(
+    ("lacks", "order", "set_point"),
+    [(b"\xff", 0xFE, 1), (b"\x01", 0xFF, 0xFF), (b"\x01\xff", 0xFE, 0xFE)],
+    ids=["type 255", "type 1", "both"],
+)
+def test_what_a_drive_receives_acts_at_once_where_it_has_no_other_type(
+    drive_bench: DriveBench, lacks: bytes, order: int, set_point: int
+) -> None:
     drive = drive_bench.insertion
-    drive.refuses = lambda index, sub, value: RANGE if value == b"\xff" and sub == 2 else 0
+    drive.refuses = lambda index, sub, value: (
+        RANGE if 0x1400 <= index < 0x1500 and sub == 2 and value in (lacks[:1], lacks[1:]) else 0
+    )
     steps(drive_bench)
-    assert drive.objects[0x1400, 2] == b"\xfe"
+    assert (drive.objects[0x1400, 2], drive.objects[0x1401, 2]) == (
+        bytes([order]),
+        bytes([set_point]),
+    )
+
+
+def test_a_drive_that_answers_no_sync_is_refused(drive_bench: DriveBench) -> None:
+    drive_bench.insertion.refuses = lambda index, sub, value: (
+        RANGE if 0x1800 <= index < 0x1900 and sub == 2 and value == b"\x01" else 0
+    )
+    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    assert "node 1 refuses to write 1 to 0x1800:2 transmission type" in reply.message
 
 
 def test_digital_inputs_that_cannot_be_mapped_are_done_without(drive_bench: DriveBench) -> None:

@@ -45,6 +45,28 @@ def test_quick_stop_stays_and_forgets_the_set_point(drive_bench: DriveBench) -> 
     assert bench.positions[0] == at[0] + 20_000
 
 
+def test_quick_stop_that_a_drive_only_says_switches_both_off(drive_bench: DriveBench) -> None:
+    bench = drive_bench
+    bench.moving()
+    drive = bench.insertion
+    follow = drive.follow
+
+    def run_on() -> None:
+        # A ramp that is none: 5 mm/s, as long as it has power.
+        drive.demand += 2000 * (drive.state == "quick stop")
+        follow()
+
+    drive.follow = run_on  # type: ignore[method-assign]
+    bench.hold(False)
+    at = drive.position
+    bench.cycle(30)
+    assert drive.state == bench.rotation.state == "disabled"
+    assert drive.position - at <= 20_000, "1 mm: 0.2 s of them"
+    failed(bench, Rule.ONE_FAULT_STOPS_BOTH, "runs on in its quick stop (10000 counts in 0.1 s)")
+    drive.follow = follow  # type: ignore[method-assign]
+    recovers(bench)
+
+
 def test_quick_stop_option_that_a_drive_does_not_take_refuses_the_drive(
     drive_bench: DriveBench,
 ) -> None:

@@ -153,6 +153,27 @@ def test_software_limits_in_the_driver_refuse_a_set_point(drive_bench: DriveBenc
     assert getattr(caught.value, "rule", None) is Rule.SOFTWARE_LIMITS
 
 
+@pytest.mark.parametrize(("reverse", "at"), [(False, -(2**31)), (True, 2**31 - 1)])
+def test_software_limits_of_an_axis_without_home_are_where_its_counter_ends(
+    make_drive_bench: Callable[..., DriveBench], reverse: bool, at: int
+) -> None:
+    bench = make_drive_bench(insertion_reverse=reverse)
+    drive = bench.insertion
+    drive.position = drive.target = drive.next_target = at + (-5000 if reverse else 5000)
+    bench.configured()
+    assert bench.supervisor.enable(True, bench.clock()).success
+    bench.cycle(12)
+    bench.hold(False)
+    bench.hold()
+    bench.cycle(1, holding=True)
+    assert bench.supervisor.retract(bench.clock()).success
+    bench.cycle(30, holding=True)
+    assert in_state(bench, State.FAULT)
+    assert bench.notices[-1].rule is Rule.SOFTWARE_LIMITS
+    assert "outside the drive's counter; home it, or set it nearer 0" in bench.status.fault
+    assert abs(drive.position - at) < 1000
+
+
 def test_following_error_of_a_blocked_motor(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
