@@ -298,6 +298,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             self.get_logger().error(f"not configured: {why_not}")
             return TransitionCallbackReturn.FAILURE
         for text in self._drives.missing_optional_objects:
+            self._drives.beat()  # many words take longer than a watchdog waits
             self.get_logger().warning(text)
         self._tell_health()
         return TransitionCallbackReturn.SUCCESS

@@ -366,6 +366,28 @@ def test_drives_that_come_later_are_waited_for(make_rig: Make) -> None:
     rig.until(lambda: rig.partner.status.get("state") == "DISABLED", "configured")
 
 
+def test_between_words_on_what_the_drives_lack_their_watchdogs_are_fed(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig(autostart=False)
+    for drive in rig.peer.drives:
+        drive.missing_objects = {0x605B, 0x605C, 0x6083}
+    sent: list[int] = []
+    logger = rig.driver.get_logger()
+    said = logger.warning
+
+    def warning(text: str, **more: Any) -> bool:
+        sent.append(rig.driver._link.frames_sent)
+        return bool(said(text, **more))
+
+    monkeypatch.setattr(logger, "warning", warning)
+    monkeypatch.setattr(rig.driver, "get_logger", lambda: logger)
+    rig.until(rig.partner.change.service_is_ready, "the driver")
+    assert rig.transition(Transition.TRANSITION_CONFIGURE)
+    assert len(sent) == 6
+    assert len(set(sent)) == 6, "a heartbeat before each"
+
+
 def test_drives_that_do_not_come_are_named(make_rig: Make) -> None:
     rig = make_rig(connect_timeout=0.0)
     rig.peer.drives[0].silent = True
