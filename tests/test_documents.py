@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import re
 import signal
@@ -23,7 +22,6 @@ from typed_pages import PAGES, ROOT, PageError, Session, blocks
 SHORT_MM = 6
 # From which a curvature is told.
 ARC_MM = 12
-FREE_VIEWS = 12
 SHARED = ("README.md", "docs", "ros2_ws")
 
 
@@ -97,26 +95,6 @@ def shortened(scratch: Path, runs: dict[str, str]) -> Callable[[str], str]:
     return change
 
 
-def draw_session(folder: Path) -> None:
-    """Draw the images that docs/calibration.md asks for, of the places in its session file."""
-    sys.path.insert(0, str(ROOT / "ros2_ws/src/needle_tracker/test"))
-    try:
-        session = importlib.import_module("calibrating.session")
-        rig = importlib.import_module("calibrating.synthetic_rig").TrueRig
-    finally:
-        sys.path.pop(0)
-    (text,) = (
-        block.text
-        for block in blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
-        if block.name == "session.yaml"
-    )
-    truth = rig.read(ROOT / "ros2_ws/src/needle_tracker/config/calibration.yaml")
-    places = parse_session(yaml.safe_load(text)).places
-    session.record(folder, truth, places, free=FREE_VIEWS)
-    (folder / "left").rename(folder / "L")
-    (folder / "right").rename(folder / "R")
-
-
 def test_the_session_of_a_box_is_one() -> None:
     """Its board is seen from above and from aside; no rig of ours draws it for the page."""
     page = blocks((ROOT / "docs/calibration.md").read_text("utf-8"))
@@ -135,8 +113,6 @@ def test_every_block_works_as_written(
 ) -> None:
     scratch = tmp_path / "t"
     scratch.mkdir()
-    if page == "docs/calibration.md":
-        draw_session(checkout)
     with own_domain() as domain:
         # What a page has installed is there for the page alone.
         own = f"{scratch}/own"
