@@ -42,6 +42,7 @@ from needle_common.files.bag_directory import (
     BagDirectory,
     is_being_recorded,
     read_information,
+    require_directory,
 )
 from needle_common.files.bag_topic import BagTopic, offered_profiles
 from needle_common.files.file_access import open_regular, sync_directory
@@ -289,10 +290,7 @@ def _mapped(number: int) -> Iterator[Any]:
 
 
 def _data_files(path: Path) -> list[Path]:
-    if path.is_file():
-        raise UserError(f"{path} is a file: name the bag's directory, {path.absolute().parent}")
-    if not path.is_dir():
-        raise UserError(f"{path}: no such bag directory")
+    require_directory(path)
     files = sorted(path.glob("*.mcap"), key=_order)
     if not files:
         if any(path.glob("*.db3")):

@@ -55,12 +55,19 @@ def recover_hint(path: Path) -> str:
     return f"run `ros2 run needle_bags recover {path}`"
 
 
-def require_bag(path: Path) -> None:
-    """Raise a `UserError` if a path is no bag with metadata.yaml."""
+def require_directory(path: Path) -> None:
+    """Raise a `UserError` if a path that is to be a bag is no directory."""
     if path.is_file():
-        raise UserError(f"{path} is a file: name the bag's directory, {path.absolute().parent}")
+        part = path.suffix == ".mcap" or path.name == METADATA_FILE
+        meant = f", {path.absolute().parent}" if part else ""
+        raise UserError(f"{path} is a file: name the bag's directory{meant}")
     if not path.is_dir():
         raise UserError(f"{path}: no such bag directory")
+
+
+def require_bag(path: Path) -> None:
+    """Raise a `UserError` if a path is no bag with metadata.yaml."""
+    require_directory(path)
     if os.path.lexists(path / METADATA_FILE):
         return
     if any(is_being_recorded(file) for file in path.glob("*.mcap")):

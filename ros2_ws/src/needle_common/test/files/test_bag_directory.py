@@ -19,7 +19,7 @@ from mcap.records import Chunk, Message
 from mcap.writer import CompressionType, Writer
 
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
+from needle_common.files.bag_directory import BagDirectory, require_bag
 
 COUNT = 60
 TOPICS = ("/a", "/b")
@@ -226,3 +226,16 @@ def test_a_message_of_another_type_is_one_line(tmp_path: Path) -> None:
     record = builder.end()  # type: ignore[no-untyped-call]
     file.write_bytes(data.replace(record, record[:-8] + b"\x07" * 8))
     assert "a message of /a does not fit its definition" in reason(tmp_path / "bag")
+
+
+@pytest.mark.parametrize("name", ["bag_0.mcap", "metadata.yaml"])
+def test_a_file_of_a_bag_names_the_bag(tmp_path: Path, name: str) -> None:
+    write(tmp_path / "bag")
+    with pytest.raises(UserError, match=f"name the bag's directory, {tmp_path}/bag$"):
+        require_bag(tmp_path / "bag" / name)
+
+
+def test_another_file_is_no_bag_and_names_none(tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("")
+    with pytest.raises(UserError, match=r"README\.md is a file: name the bag's directory$"):
+        require_bag(tmp_path / "README.md")
