@@ -126,7 +126,7 @@ class DriveMachine:
 
     def next_order(self) -> tuple[DriveCommand, Mode]:
         """Return the command and the mode to send now."""
-        command = self._next_command()
+        command = DriveCommand.DISABLE_VOLTAGE if self._runs_on else self._next_command()
         self._watch.sent(command)
         # The mode of a powered drive stays: its set-point may be of another mode's making.
         if self.state not in POWERED:
@@ -201,8 +201,6 @@ class DriveMachine:
 
     def _next_command(self) -> DriveCommand:
         state = self.state
-        if self._runs_on:
-            return DriveCommand.DISABLE_VOLTAGE
         if self._stopping:
             return DriveCommand.QUICK_STOP
         if self.let_go or (self._via_off and state is DriveState.QUICK_STOP_ACTIVE):

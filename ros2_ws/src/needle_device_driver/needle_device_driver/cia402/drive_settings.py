@@ -95,7 +95,7 @@ class DriveSettings:
 
     @property
     def stop_time(self) -> float:
-        """How long a quick stop takes at most [s]; a drive may round its ramp down to half."""
+        """Longest time of a quick stop [s]; a drive may round its ramp down to half."""
         return 2.0 * self.speed / self.quick_stop_deceleration
 
     @property

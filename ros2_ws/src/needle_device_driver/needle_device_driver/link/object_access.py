@@ -168,8 +168,8 @@ class ObjectAccess:
     def _error(self, what: str, entry: Entry, error: Exception) -> DriveError:
         if isinstance(error, canopen.SdoAbortedError):
             return DriveRefusalError(
-                f"node {self._node_id} refuses to {what} {entry}: {error} (docs/hardware.md says what "
-                "for)",
+                f"node {self._node_id} refuses to {what} {entry}: {error} "
+                "(docs/hardware.md says what for)",
                 error.code,
             )
         if isinstance(error, ValueError):

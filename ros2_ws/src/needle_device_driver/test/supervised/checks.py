@@ -52,3 +52,14 @@ def recovers(bench: DriveBench) -> None:
     bench.step()
     bench.cycle(30, holding=True)
     assert bench.outcomes[-1] == "succeeded"
+
+
+def steps(bench: DriveBench) -> None:
+    """Home, enable and take a step; it ends where it should."""
+    bench.ready()
+    at = bench.positions
+    bench.cycle(1, holding=True)
+    bench.step(0.001, 0.3)
+    bench.cycle(40, holding=True)
+    assert bench.outcomes == ["succeeded"]
+    assert bench.positions[0] == at[0] + 20_000
