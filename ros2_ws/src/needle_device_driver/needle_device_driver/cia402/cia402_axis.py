@@ -257,6 +257,9 @@ class Cia402Axis(Axis):
         """
         if not self.actuated or not self._configured:
             return
+        if self._limits_due and self._machine.state not in POWERED:
+            # Before the SYNC: a drive may take its time, and is then judged by a fresh answer.
+            self._write_limits()
         self._send_order()
         self._link.send(
             od.SET_POINT.function_code + self._settings.node_id,
@@ -279,8 +282,6 @@ class Cia402Axis(Axis):
                 # The drive's own limits count from home: now that it has one, and once it is off.
                 self._limits_due = True
                 self._count_from_home()
-        elif self._limits_due and self._machine.state not in POWERED:
-            self._write_limits()
 
     def _send_order(self) -> None:
         command, mode = self._machine.next_order()

@@ -180,6 +180,31 @@ def test_software_limits_that_a_homed_drive_does_not_take_keep_it_from_being_swi
     assert "no software limits yet" in bench.supervisor.enable(True, bench.clock()).message
 
 
+def test_software_limits_are_taken_from_slow_drives_with_few_heartbeats(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.configured()
+    for drive in (bench.insertion, bench.rotation):
+
+        def slowly(data: bytes, sdo: Callable[[bytes], None] = drive.sdo) -> None:
+            bench.now += 0.09
+            sdo(data)
+
+        def say(function: int, data: bytes, said: Callable[..., None] = drive.say) -> None:
+            if function != 0x700:
+                said(function, data)
+
+        drive.sdo, drive.say = slowly, say  # type: ignore[method-assign]
+    bench.supervisor.confirm_needle_out(True)
+    assert bench.supervisor.home(bench.clock()).success
+    bench.cycle(30)
+    assert in_state(bench, State.DISABLED), bench.status.fault
+    assert bench.status.homed
+    assert bench.written(1, 0x607D, 1) == (-20_000).to_bytes(4, "little", signed=True)
+    assert bench.supervisor.enable(True, bench.clock()).success
+
+
 # ---- states ----------------------------------------------------------------------------------
 
 
