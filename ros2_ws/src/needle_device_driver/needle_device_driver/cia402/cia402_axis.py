@@ -245,7 +245,7 @@ class Cia402Axis(Axis):
         """Tell whether the drive is on its way to where it was ordered, apart from set-points."""
         if not self.actuated or self._fault is not None:
             return False
-        return self._machine.switching or self._homing is not None
+        return self._machine.switching or self._homing is not None or self._limits_due
 
     def transmit(self) -> None:
         """Send this cycle's command and set-point.

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import pytest
 
+from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import State
 
@@ -177,7 +178,29 @@ def test_software_limits_that_a_homed_drive_does_not_take_keep_it_from_being_swi
     assert in_state(bench, State.FAULT)
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
     bench.supervisor.reset(bench.clock())
-    assert "no software limits yet" in bench.supervisor.enable(True, bench.clock()).message
+    assert not bench.supervisor.enable(True, bench.clock()).success
+    with pytest.raises(AxisError, match="insertion axis has no software limits yet"):
+        bench.axes[0].power(True)
+    bench.cycle(1)
+    assert in_state(bench, State.FAULT)
+    assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
+
+
+def test_between_homing_and_its_software_limits_nothing_is_switched_on(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.configured()
+    bench.supervisor.confirm_needle_out(True)
+    assert bench.supervisor.home(bench.clock()).success
+    for _ in range(30):
+        bench.cycle(1)
+        # Whoever is in a hurry is asked to call again, and breaks nothing.
+        if bench.status.homed and bench.supervisor.enable(True, bench.clock()).success:
+            break
+        assert not in_state(bench, State.FAULT)
+    assert in_state(bench, State.HOLDING)
+    assert bench.written(1, 0x607D, 1) == (-20_000).to_bytes(4, "little", signed=True)
 
 
 def test_software_limits_are_taken_from_slow_drives_with_few_heartbeats(
