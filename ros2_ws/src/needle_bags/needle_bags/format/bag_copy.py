@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import struct
 from collections.abc import Mapping
 from pathlib import Path
 
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
@@ -14,19 +16,26 @@ from needle_common.errors import UserError
 from needle_common.files.bag_topic import BagTopic
 
 _STAMP_END = 12
-_STORE = get_typestore(Stores.ROS2_JAZZY)
 
 
 def standard_topic(name: str, type_name: str) -> BagTopic:
     """Return a topic of a standard type, for messages that the bag did not have."""
-    definition, _ = _STORE.generate_msgdef(type_name, ros_version=2)
-    return BagTopic(name, type_name, definition, _STORE.hash_rihs01(type_name), (USUAL_QOS,))
+    store = _jazzy()
+    definition, _ = store.generate_msgdef(type_name, ros_version=2)
+    return BagTopic(name, type_name, definition, store.hash_rihs01(type_name), (USUAL_QOS,))
 
 
 def standard_text(text: str) -> bytes:
     """Return a std_msgs/String as CDR."""
     name = "std_msgs/msg/String"
-    return bytes(_STORE.serialize_cdr(_STORE.types[name](data=text), name))
+    store = _jazzy()
+    return bytes(store.serialize_cdr(store.types[name](data=text), name))
+
+
+@functools.cache
+def _jazzy() -> Typestore:
+    """Return Jazzy's types, a tenth of a second of work: those who only read do without."""
+    return get_typestore(Stores.ROS2_JAZZY)
 
 
 def stamp_of(data: bytes) -> int:

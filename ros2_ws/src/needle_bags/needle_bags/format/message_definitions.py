@@ -6,9 +6,10 @@ import importlib
 import re
 from typing import Any
 
-from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from needle_common.errors import UserError
+from needle_common.files.bag_directory import parsed_types
 from needle_common.files.installed import find_shared
 
 _SEPARATOR = "=" * 80
@@ -58,7 +59,7 @@ def type_hash(type_name: str, definition: str) -> str:
     """
     store = get_typestore(Stores.EMPTY)
     try:
-        store.register(get_types_from_msg(definition, type_name))
+        store.fielddefs.update(parsed_types("ros2msg", definition, type_name))
         return store.hash_rihs01(type_name)
     except (TypesysError, KeyError) as error:
         raise UserError(f"the definition of {type_name} cannot be read: {error}") from error

@@ -6,6 +6,7 @@ import contextlib
 import fcntl
 import functools
 import os
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -28,6 +29,8 @@ METADATA_LIMIT: Final = 2**24
 _NEWEST_VERSION: Final = 9
 # A rig's definitions take 0.2 s to be understood, and a bag is read several times.
 _STORES_KEPT: Final = 4
+_PARTS_KEPT: Final = 256
+_NEXT_TYPE: Final = re.compile(r"^={80}\nMSG: ", re.MULTILINE)
 
 
 class SentMessage(NamedTuple):
@@ -298,16 +301,27 @@ class BagDirectory:
 
 def parsed_types(encoding: str, definition: str, type_name: str) -> dict[str, Any]:
     """Return the types that a schema's text defines; none for a text that is none."""
+    found: dict[str, Any] = {}
     if encoding == "ros2msg":
-        return dict(get_types_from_msg(definition, type_name))
+        head, *others = _NEXT_TYPE.split(definition)
+        found.update(_types_of_part(head, type_name))
+        for other in others:
+            name, _, text = other.partition("\n")
+            found.update(_types_of_part(text, name))
+        return found
     if encoding not in ("ros2idl", "omgidl"):
         return {}
     separator = "=" * 80 + "\n"
     parts = definition.split(separator)[1:] if definition.startswith(separator) else [definition]
-    found: dict[str, Any] = {}
     for part in parts:
         found.update(get_types_from_idl(part.partition("\n")[2] if len(parts) > 1 else part))
     return found
+
+
+@functools.lru_cache(maxsize=_PARTS_KEPT)
+def _types_of_part(text: str, type_name: str) -> dict[str, Any]:
+    """Return the type that a part of a definition describes; nearly all have Header in them."""
+    return dict(get_types_from_msg(text, type_name))
 
 
 @functools.lru_cache(maxsize=_STORES_KEPT)
@@ -321,7 +335,8 @@ def _typestore(definitions: tuple[tuple[str, str, str, str], ...]) -> Typestore:
         with contextlib.suppress(Exception):
             types = parsed_types(encoding, text, type_name)
             alone = get_typestore(Stores.EMPTY)
-            alone.register(types)
+            alone.fielddefs.update(types)
             if type_hash in ("", alone.hash_rihs01(type_name)):
-                store.register(types)
+                # A class is made of each: not of Header twenty times.
+                store.register({n: t for n, t in types.items() if store.fielddefs.get(n) != t})
     return store

@@ -17,9 +17,10 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Message
 from mcap.writer import CompressionType, Writer
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory, require_bag
+from needle_common.files.bag_directory import BagDirectory, parsed_types, require_bag
 
 COUNT = 60
 TOPICS = ("/a", "/b")
@@ -90,6 +91,19 @@ def test_all_is_read_in_order(tmp_path: Path, compression: CompressionType, chun
     write(tmp_path / "bag", swapped, compression=compression, use_chunking=chunked)
     assert read(tmp_path / "bag") == [number ^ 1 for number in range(COUNT)]
     assert read(tmp_path / "bag", ("/a",), start=1010, stop=1020) == [10, 12, 14, 16, 18]
+
+
+def test_a_definition_is_read_part_by_part_as_it_is_as_a_whole() -> None:
+    jazzy = get_typestore(Stores.ROS2_JAZZY)
+    for name in jazzy.fielddefs:
+        text, _ = jazzy.generate_msgdef(name, ros_version=2)
+        assert parsed_types("ros2msg", text, name) == get_types_from_msg(text, name)
+
+
+@pytest.mark.parametrize("after", ["int32 a\n", "MSG: \nint32 a\n", "MSG: a/B c\nint32 a\n"])
+def test_a_part_that_is_no_type_is_refused(after: str) -> None:
+    with pytest.raises(TypesysError):
+        parsed_types("ros2msg", f"int32 a\n{'=' * 80}\n{after}", "a/msg/A")
 
 
 def test_no_flipped_bit_makes_it_less(tmp_path: Path) -> None:
