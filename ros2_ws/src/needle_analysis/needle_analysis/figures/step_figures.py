@@ -9,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter
+from matplotlib.ticker import FuncFormatter, LogFormatter
 
 from needle_analysis.figures.figure_style import (
     AXES,
@@ -57,7 +57,8 @@ def innovation_figure(run: Run, found: Innovations) -> Figure:
         size.plot(insertion, np.maximum(found.squared, 1e-3), ".", color=INK, ms=4)
         size.axhline(QUANTILE_95, color=RED, lw=1.1, label="95 % of tips should be below")
         size.axhline(3.0, color=GREY, lw=0.9, ls=(0, (4, 2)), label="average where all fits: 3")
-        size.set(title="Innovation squared, normalised by its covariance", yscale="log")
+        size.set(title="Innovation squared, normalised by its covariance")
+        _scale_by_tens(size)
         size.legend(loc="best", ncols=2)
         _draw_gate(gate, run)
         gate.set_xlabel("insertion [mm]")
@@ -105,10 +106,17 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
             insertion = run.insertion_at(timing.stamps) * MM
             milliseconds = np.maximum(timing.seconds * 1e3, 1e-2)
             axes.plot(insertion, milliseconds, mark, ms=3, color=color, label=timing.name)
-        axes.set(yscale="log", ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axes.set(ylabel="ms", xlabel="insertion [mm]", title="Time for each step")
+        _scale_by_tens(axes)
         figure.legend(loc="lower center", ncols=3)
         return figure
+
+
+def _scale_by_tens(axes: Any) -> None:
+    """Make a logarithmic axis with plain numbers: typeset powers take as long as all other text."""
+    axes.set_yscale("log")
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(LogFormatter())
 
 
 def timing_rows(timings: Sequence[StageTiming]) -> list[tuple[str, ...]]:
