@@ -156,6 +156,9 @@ def run_node(
             own = remove_ros_args(argv)[1:]
             if own in (["--help"], ["-h"]):
                 return run_command(lambda: _explain(help_text, parameters))
+            # rcl takes NAME:=VALUE for a remapping, as of old: no parameter would be set.
+            before = argv[1 : argv.index("--ros-args")] if "--ros-args" in argv else argv[1:]
+            own = own or [argument for argument in before if ":=" in argument]
             if own:
                 raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
             for line in foreign_nodes(argv):
@@ -170,6 +173,8 @@ def run_node(
 
 
 def _hint(argument: str) -> str:
+    if ":=" in argument:
+        return f"a parameter is set by --ros-args -p {argument}"
     return "it goes after --ros-args" if argument in _ROS_OPTIONS else "see --help"
 
 

@@ -102,3 +102,8 @@ def test_a_parameter_before_ros_args_is_said_to_go_after(
 ) -> None:
     assert run(Refuses, "-p", "x:=1") == EXIT_BAD_INPUT
     assert "'-p'; it goes after --ros-args" in capsys.readouterr().err
+
+
+def test_a_parameter_without_its_option_is_no_remapping(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(Refuses, "rate:=1", "--ros-args", "-p", "other:=1") == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.endswith("is set by --ros-args -p rate:=1\n")
