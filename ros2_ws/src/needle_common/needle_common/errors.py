@@ -24,9 +24,16 @@ class OutOfBoundsError(UserError, ValueError):
 
     def __init__(self, name: str, value: float, lower: float, upper: float, unit: str) -> None:
         sign = "" if unit == "-" else f" {unit}"
-        super().__init__(f"{name} = {value:g}{sign} is outside [{lower:g}, {upper:g}]{sign}")
+        said = f"{name} = {_said(value)}{sign}"
+        super().__init__(f"{said} is outside [{_said(lower)}, {_said(upper)}]{sign}")
         self.name = name
         self.value = value
         self.lower = lower
         self.upper = upper
         self.unit = unit
+
+
+def _said(value: float) -> str:
+    """Return a value as a person writes it: 2147483647 and not 2.14748e+09."""
+    whole = float(value).is_integer() and abs(value) < 1e12
+    return f"{value:.0f}" if whole else f"{value:g}"

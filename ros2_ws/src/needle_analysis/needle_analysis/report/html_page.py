@@ -76,7 +76,7 @@ figure > img { max-width: 46rem; }
   grid-template-columns: repeat(auto-fit, minmax(7rem, auto)); }
 .readings dt { color: var(--soft); font-size: .78rem; } .readings dd { margin: 0;
   font-weight: 600; font-variant-numeric: tabular-nums; }
-.scroll { overflow-x: auto; }
+.scroll { overflow-x: auto; margin-bottom: .6rem; }
 table { border-collapse: collapse; width: 100%; font-size: .88rem; }
 td, th { text-align: left; vertical-align: top; padding: .22rem .6rem .22rem 0;
   border-bottom: 1px solid var(--line); overflow-wrap: anywhere; }

@@ -34,6 +34,8 @@ def test_what_is_within_its_bounds_passes() -> None:
         (Settings(width=0.0), r"width = 0 m is outside"),
         (Settings(gate=-1.0), r"gate = -1 is outside"),
         (Settings(noise=5.1), r"noise = 5.1 m is outside \[0, 5\] m"),
+        (Settings(noise=2147483648.0), r"noise = 2147483648 m is outside"),
+        (Settings(noise=1e30), r"noise = 1e\+30 m is outside"),
     ],
 )
 def test_what_is_not_is_told_with_its_bounds(settings: Settings, said: str) -> None:
