@@ -113,7 +113,7 @@ def timing_figure(run: Run, timings: Sequence[StageTiming]) -> Figure:
 
 
 def _scale_by_tens(axes: Any) -> None:
-    """Make a logarithmic axis with plain numbers: typeset powers take as long as all other text."""
+    """Make a logarithmic axis with plain numbers: typeset powers cost what a small figure does."""
     axes.set_yscale("log")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_formatter(LogFormatter())
