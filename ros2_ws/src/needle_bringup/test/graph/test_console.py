@@ -101,6 +101,11 @@ class Heard:
     def _has_heard(self, count: int) -> bool:
         return self._count >= count
 
+    def told(self) -> dict[str, str]:
+        """Return what the controller has said last."""
+        with self._heard:
+            return self._told
+
     def close(self) -> None:
         self._ended = True
         self._thread.join()
@@ -218,7 +223,7 @@ def hold_until(rig: Rig, press: Hand, let_go: Hand, wanted: Callable[[float], bo
         if rig.heard.comes(wanted, 1.0):
             return
         let_go()
-    raise AssertionError("the needle does not get there")
+    raise AssertionError(f"the needle does not get there: {rig.heard.told()}")
 
 
 def make_ready(page: Page) -> None:
@@ -266,6 +271,8 @@ def test_another_page_sees_and_can_stop_but_not_move(rig: Rig, page: Page, brows
     other = browser.new_page()
     try:
         other.goto(rig.address)
+        # Who steers looks at their page: one that lies behind gets less of the processor.
+        page.bring_to_front()
         hold_until(rig, page.mouse.down, page.mouse.up, lambda at: at > begin + 5e-4)
         expect(other.locator("#hold-words")).to_have_text("another page steers")
         expect(other.get_by_role("button", name="Switch off")).to_be_disabled()

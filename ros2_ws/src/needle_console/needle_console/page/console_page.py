@@ -10,9 +10,10 @@ from nicegui import ui
 from needle_console.page.controls import Controls
 from needle_console.page.desk import Desk
 from needle_console.page.needle_scene import NeedleScene
-from needle_console.page.r1_chart import R1Chart
 from needle_console.page.status_bar import StatusBar
 from needle_console.view.camera_feed import SIDES
+from needle_console.view.chart import chart
+from needle_console.view.snapshot import Snapshot
 
 _TEXT_PERIOD, _DRAWING_PERIOD = 0.2, 0.5
 _HEAD = """
@@ -69,7 +70,8 @@ class ConsolePage:
                         sanitize=False,
                     )
             self._scene = NeedleScene()
-            self._chart = R1Chart()
+            with ui.element("figure").classes("tile chart"):
+                self._chart = ui.html(chart(Snapshot()), sanitize=False).classes("drawing")
         self._refresh_text()
         self._refresh_drawings()
         ui.timer(_TEXT_PERIOD, self._refresh_text)
@@ -83,4 +85,4 @@ class ConsolePage:
     def _refresh_drawings(self) -> None:
         snapshot = self._desk.snapshot()
         self._scene.show(snapshot)
-        self._chart.show(snapshot)
+        self._chart.set_content(chart(snapshot))

@@ -1,9 +1,11 @@
-"""The chart of r1 over depth, as options of ECharts."""
+"""The chart of r1 over depth, as an SVG: a page's hold must not wait for a chart's library."""
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+
+import numpy as np
 
 from needle_console.view.snapshot import Snapshot
 
@@ -11,12 +13,56 @@ from needle_console.view.snapshot import Snapshot
 BLUE, ORANGE, GREY = "#0072b2", "#e69f00", "#8a8f98"
 GOAL_MM = 1.0
 _MM = 1e3
-_BAND = "\N{PLUS-MINUS SIGN}2 sigma"
 _DEFAULT_DEPTH_MM = 120.0
+# The picture and its frame, in its own units: pixels at 1280x720.
+_WIDTH, _HEIGHT = 460.0, 290.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 46.0, 446.0, 26.0, 252.0
+_TICKS_ACROSS, _TICKS_UP = 6, 6
 
 
-def chart_options(snapshot: Snapshot) -> dict[str, Any]:
-    """Return the chart: r1 as a line, twice its sigma as a band, the goal as two dashed lines.
+class _Frame:
+    """Places depths and distances [mm] in the picture, and marks them along its edges.
+
+    Parameters
+    ----------
+    depth : float
+        Of the right edge [mm]; the left one is the entry.
+    limit : float
+        Distance of the upper edge, and below 0 of the lower one [mm].
+    """
+
+    def __init__(self, depth: float, limit: float) -> None:
+        self._depth = depth
+        self._limit = limit
+
+    def x(self, depth: float) -> float:
+        return _LEFT + (_RIGHT - _LEFT) * depth / self._depth
+
+    def y(self, r1: float) -> float:
+        return 0.5 * (_TOP + _BOTTOM) - 0.5 * (_BOTTOM - _TOP) * r1 / self._limit
+
+    def path(self, points: Iterable[tuple[float, float]]) -> str:
+        return " ".join(f"{self.x(depth):.1f},{self.y(r1):.1f}" for depth, r1 in points)
+
+    def across(self, r1: float, style: str) -> str:
+        y = f"{self.y(r1):.1f}"
+        return f'<line x1="{_LEFT}" x2="{_RIGHT}" y1="{y}" y2="{y}" {style}/>'
+
+    def grid(self) -> str:
+        style = f'stroke="{GREY}" stroke-opacity="0.25"'
+        parts = []
+        for depth in _ticks(0.0, self._depth, _TICKS_ACROSS):
+            x = f"{self.x(depth):.1f}"
+            parts.append(f'<line x1="{x}" x2="{x}" y1="{_TOP}" y2="{_BOTTOM}" {style}/>')
+            parts.append(_text(self.x(depth), _BOTTOM + 14.0, f"{depth:g}"))
+        for r1 in _ticks(-self._limit, self._limit, _TICKS_UP):
+            parts.append(self.across(r1, style))
+            parts.append(_text(_LEFT - 5.0, self.y(r1) + 4.0, f"{r1:g}", "end"))
+        return "".join(parts)
+
+
+def chart(snapshot: Snapshot) -> str:
+    """Return an SVG: r1 as a line, twice its sigma as a band, the goal as two dashed lines.
 
     Parameters
     ----------
@@ -28,72 +74,48 @@ def chart_options(snapshot: Snapshot) -> dict[str, Any]:
     controller = snapshot.controller
     depth = math.nan if controller is None else controller.depth
     last = _DEFAULT_DEPTH_MM if math.isnan(depth) else depth * _MM
-    return {
-        "animation": False,
-        "grid": {"left": 46, "right": 14, "top": 30, "bottom": 36},
-        "legend": {"top": 0, "textStyle": {"color": GREY}, "data": ["r1", _BAND]},
-        "xAxis": {
-            **_axis("depth [mm]", 22),
-            "min": 0,
-            "max": round(max([last, *(row[0] for row in rows)]), 1),
-        },
-        "yAxis": {
-            **_axis("r1 [mm]", 32),
-            "min": -_round_up(limit),
-            "max": _round_up(limit),
-        },
-        "series": [
-            # The band: its lower edge carries the rest, stacked on top of it.
-            _edge([[at, r1 - half] for at, r1, half in rows]),
-            {
-                **_edge([[at, 2.0 * half] for at, _, half in rows]),
-                "name": _BAND,
-                "color": BLUE,
-                "areaStyle": {"color": BLUE, "opacity": 0.25},
-            },
-            {
-                "name": "r1",
-                "type": "line",
-                "showSymbol": False,
-                "color": BLUE,
-                "lineStyle": {"width": 2},
-                "data": [[at, r1] for at, r1, _ in rows],
-                "markLine": {
-                    "symbol": "none",
-                    "silent": True,
-                    "label": {"formatter": "goal", "position": "insideEndTop", "color": GREY},
-                    "lineStyle": {"color": ORANGE, "type": "dashed", "width": 1.5},
-                    "data": [{"yAxis": GOAL_MM}, {"yAxis": -GOAL_MM}],
-                },
-            },
-        ],
-    }
+    frame = _Frame(max([last, *(row[0] for row in rows)]), _round_up(limit))
+    upper = [(at, r1 + half) for at, r1, half in rows]
+    lower = [(at, r1 - half) for at, r1, half in rows]
+    goal = f'stroke="{ORANGE}" stroke-width="1.5" stroke-dasharray="5 4"'
+    return (
+        f'<svg viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" width="100%" height="100%" role="img" '
+        'aria-label="r1 over depth, with its sigma and the goal" font-size="12">'
+        f"{frame.grid()}"
+        f'<polygon points="{frame.path([*upper, *reversed(lower)])}" fill="{BLUE}" '
+        'fill-opacity="0.25"/>'
+        f"{frame.across(GOAL_MM, goal)}{frame.across(-GOAL_MM, goal)}"
+        f'<polyline points="{frame.path((at, r1) for at, r1, _ in rows)}" fill="none" '
+        f'stroke="{BLUE}" stroke-width="2"/>'
+        f"{_legend()}"
+        f"{_text(0.5 * (_LEFT + _RIGHT), _HEIGHT - 6.0, 'depth [mm]')}"
+        f'<g transform="rotate(-90)">{_text(-0.5 * (_TOP + _BOTTOM), 13.0, "r1 [mm]")}</g></svg>'
+    )
+
+
+def _legend() -> str:
+    line = f'<line x1="130" x2="154" y1="13" y2="13" stroke="{BLUE}" stroke-width="2"/>'
+    band = f'<rect x="190" y="7" width="24" height="12" fill="{BLUE}" fill-opacity="0.25"/>'
+    goal = (
+        f'<line x1="290" x2="314" y1="13" y2="13" stroke="{ORANGE}" stroke-width="1.5" '
+        'stroke-dasharray="5 4"/>'
+    )
+    words = ((159.0, "r1"), (219.0, "\N{PLUS-MINUS SIGN}2 sigma"), (319.0, "goal"))
+    return line + band + goal + "".join(_text(x, 17.0, word, "start") for x, word in words)
+
+
+def _text(x: float, y: float, text: str, anchor: str = "middle") -> str:
+    return f'<text x="{x:.1f}" y="{y:.1f}" fill="{GREY}" text-anchor="{anchor}">{text}</text>'
+
+
+def _ticks(begin: float, end: float, most: int) -> Iterable[float]:
+    """Return round numbers within two bounds, as many as there is room for."""
+    rough = (end - begin) / most
+    decade = 10.0 ** math.floor(math.log10(rough))
+    step = decade * next(digit for digit in (1.0, 2.0, 5.0, 10.0) if digit * decade >= rough)
+    return [step * n for n in np.arange(math.ceil(begin / step), math.floor(end / step) + 1)]
 
 
 def _round_up(limit: float) -> float:
     """Return an even limit, so that the axis does not move with every point."""
     return 2.0 * math.ceil(0.5 * limit)
-
-
-def _edge(data: list[list[float]]) -> dict[str, Any]:
-    return {
-        "type": "line",
-        "stack": "band",
-        "stackStrategy": "all",
-        "showSymbol": False,
-        "silent": True,
-        "lineStyle": {"opacity": 0},
-        "data": data,
-    }
-
-
-def _axis(name: str, gap: int) -> dict[str, Any]:
-    return {
-        "type": "value",
-        "name": name,
-        "nameLocation": "middle",
-        "nameGap": gap,
-        "nameTextStyle": {"color": GREY},
-        "axisLabel": {"color": GREY},
-        "splitLine": {"lineStyle": {"color": GREY, "opacity": 0.25}},
-    }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from xml.etree import ElementTree
 
 import cv2
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 from needle_common.errors import UserError
 from needle_common.files.installed import find_shared
 from needle_console.view.camera_feed import CameraFeed
-from needle_console.view.chart import chart_options
+from needle_console.view.chart import chart
 from needle_console.view.dial import dial
 from needle_console.view.overlay import draw_view
 from needle_console.view.snapshot import CoursePoint, SeenTip, Snapshot
@@ -96,13 +97,48 @@ def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
     assert feed.picture("right", 20.0) is None
 
 
+def read(points: str, picture: ElementTree.Element) -> np.ndarray:
+    """Return what points of a chart mean [mm], by the numbers along its edges."""
+    labels = [(text, float(str(text.text))) for text in picture.iter("text") if is_number(text)]
+    below = [(float(text.attrib["x"]), n) for text, n in labels if "middle" in text.attrib.values()]
+    # What is written stands 4 below its line.
+    beside = [
+        (float(text.attrib["y"]) - 4, n) for text, n in labels if "end" in text.attrib.values()
+    ]
+    assert len(below) > 3 and len(beside) > 3
+    x, y = np.array([point.split(",") for point in points.split()], dtype=float).T
+    scales = (np.polyfit(*np.transpose(marks), 1) for marks in (below, beside))
+    return np.column_stack([np.polyval(scale, v) for scale, v in zip(scales, (x, y), strict=True)])
+
+
+def is_number(text: ElementTree.Element) -> bool:
+    return str(text.text).lstrip("-").replace(".", "", 1).isdigit()
+
+
 def test_the_chart_has_r1_its_band_and_the_goal_in_mm() -> None:
-    options = chart_options(Snapshot(course=course(0.02, 0.04)))
-    lower, width, line = options["series"]
-    assert line["data"] == [[20.0, pytest.approx(-2.0)], [40.0, pytest.approx(-1.0)]]
-    assert lower["data"][0] == [20.0, pytest.approx(-2.4)]
-    assert width["data"][0] == [20.0, pytest.approx(0.8)]
-    assert [mark["yAxis"] for mark in line["markLine"]["data"]] == [1.0, -1.0]
+    picture = ElementTree.fromstring(chart(Snapshot(course=course(0.02, 0.04))))
+    (line,), (band,) = picture.iter("polyline"), picture.iter("polygon")
+    assert read(line.attrib["points"], picture) == pytest.approx(
+        np.array([[20.0, -2.0], [40.0, -1.0]]), abs=0.02
+    )
+    assert read(band.attrib["points"], picture) == pytest.approx(
+        np.array([[20.0, -1.6], [40.0, -0.6], [40.0, -1.4], [20.0, -2.4]]), abs=0.02
+    )
+    goals = [one.attrib for one in picture.iter("line") if "stroke-dasharray" in one.attrib]
+    heights = [read(f"{goal['x1']},{goal['y1']}", picture)[0, 1] for goal in goals]
+    assert heights[:2] == pytest.approx([1.0, -1.0], abs=0.02)
+
+
+@pytest.mark.parametrize("deepest", [0.0005, 0.12, 0.45])
+def test_all_of_a_chart_lies_within_its_picture(deepest: float) -> None:
+    text = chart(Snapshot(course=course(*np.linspace(1e-4, deepest, 1000))))
+    picture = ElementTree.fromstring(text)
+    _, _, width, height = map(float, picture.attrib["viewBox"].split())
+    for part in picture.iter():
+        for point in part.attrib.get("points", "").split():
+            x, y = map(float, point.split(","))
+            assert 0.0 <= x <= width and 0.0 <= y <= height
+    assert "nan" not in chart(Snapshot())
 
 
 def test_space_keeps_right_handed_axes_and_lengths() -> None:
