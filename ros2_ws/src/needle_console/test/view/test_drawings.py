@@ -107,8 +107,13 @@ def read(points: str, picture: ElementTree.Element) -> np.ndarray:
     ]
     assert len(below) > 3 and len(beside) > 3
     x, y = np.array([point.split(",") for point in points.split()], dtype=float).T
-    scales = (np.polyfit(*np.transpose(marks), 1) for marks in (below, beside))
-    return np.column_stack([np.polyval(scale, v) for scale, v in zip(scales, (x, y), strict=True)])
+    return np.column_stack([on_scale(x, below), on_scale(y, beside)])
+
+
+def on_scale(values: np.ndarray, marks: list[tuple[float, float]]) -> np.ndarray:
+    """Return what places mean on a straight scale with these marks: places, and their numbers."""
+    places, numbers = np.transpose(marks)
+    return np.asarray(np.polyval(np.polyfit(places, numbers, 1), values))
 
 
 def is_number(text: ElementTree.Element) -> bool:
