@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import enum
+import math
 
 import numpy as np
 
@@ -138,7 +139,8 @@ def refuse_position(
     margin : float
         What noise may add [m].
     """
-    distance = float(np.linalg.norm(tip.position))
+    # Not numpy's norm: what others publish may be too large to be squared.
+    distance = math.hypot(*tip.position)
     reach = LARGEST_SCALE * max(joints.insertion, 0.0) + margin
     if distance > reach:
         text = (
@@ -147,7 +149,7 @@ def refuse_position(
         )
         return RefusedTip(tip, Fault.TOO_FAR, text)
     if last is not None:
-        jump = float(np.linalg.norm(tip.position - last.tip.position))
+        jump = math.hypot(*(tip.position - last.tip.position))
         allowed = abs(joints.insertion - last.joints.insertion) + margin
         if jump > allowed:
             text = (

@@ -17,6 +17,8 @@ from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
         ([np.nan, 0.0, 0.0], "rig", "not finite"),
         ([0.0, 0.0, 0.0], "left_camera_optical", "left_camera_optical"),
         ([0.5, 0.2, 1.0], "rig", "from the entry point"),
+        # Too large to be squared.
+        ([-1e300, 0.2, 1.0], "rig", "from the entry point"),
     ],
 )
 def test_a_refused_tip_moves_nothing_and_asks_for_another(
