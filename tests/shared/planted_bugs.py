@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from needle_bringup.operator.joy_source import JoySource
+from needle_console.hold import page_session
+from needle_console.hold.page_session import PageSession
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.ros import conversions
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
@@ -73,6 +75,21 @@ def _anybody_keeps_a_hold_fresh(patch: pytest.MonkeyPatch) -> None:
         return min(ages, default=math.inf)
 
     patch.setattr(Hold, "age", youngest)
+
+
+def _hold_of_a_page_outlives_its_words(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(page_session, "LIFETIME", 2.0)
+
+
+def _lost_press_of_a_page_goes_on(patch: pytest.MonkeyPatch) -> None:
+    lapses = PageSession.lapses
+
+    def forgiving(session: PageSession, now: float) -> bool:
+        lapsed = lapses(session, now)
+        session._armed = session._armed or lapsed
+        return lapsed
+
+    patch.setattr(PageSession, "lapses", forgiving)
 
 
 def _screw_of_twice_the_lead(patch: pytest.MonkeyPatch) -> None:
@@ -149,6 +166,12 @@ PLANTED = {
     ),
     "a hold that anybody keeps": PlantedBug(
         "no_motion_by_another", _anybody_keeps_a_hold_fresh, 466
+    ),
+    "a page's hold that outlives its words": PlantedBug(
+        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 2
+    ),
+    "a page's lost press that goes on": PlantedBug(
+        "hold_is_of_now", _lost_press_of_a_page_goes_on, 215
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),

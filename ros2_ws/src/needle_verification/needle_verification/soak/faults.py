@@ -74,6 +74,8 @@ BUS, ADAPTER, CAMERAS, CLOCK, PERSON, PARAMETERS = (
 SECOND_PERSON = "second person"
 """At a joystick and an operator of their own: keeps it pressed, draws out, presses and lets go at
 random, loses the joystick while pressing."""
+CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
+"""Where one of them goes wrong the person holds by a page of the console, not by the joystick."""
 DRIVES = ("insertion drive", "rotation drive")
 STRANGER = "stranger on "
 """Begins the name of a part where a foreign node publishes or calls what is not its own."""
@@ -85,6 +87,8 @@ STRANGE_TOPICS = (
     "/needle/tip",
     "/target_plane",
 )
+FLOOD = "flood"
+"""A stranger that publishes 5,000 times a second what is not its own; `size` draws the topic."""
 _STRANGE_SERVICES = (*SERVICES, "/device/stop", "/plane_controller/stop", "/device/enable off")
 
 _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
@@ -103,6 +107,10 @@ _DRAWN_TOGETHER: dict[str, tuple[Kind, ...]] = {
 }
 _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     SECOND_PERSON: (Kind.STUCK, Kind.WRONG, Kind.INTERMITTENT, Kind.OFF),
+    CONSOLE: (Kind.OFF, Kind.STUCK, Kind.SLOW),
+    PAGE: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.DUPLICATED),
+    PAGE_LINE: (Kind.OFF, Kind.SLOW, Kind.INTERMITTENT),
+    FLOOD: (Kind.WRONG, Kind.GARBAGE),
 }
 VOCABULARY = {**_DRAWN_TOGETHER, **_DRAWN_ALONE}
 """What can go wrong with each part."""
@@ -151,6 +159,14 @@ class Fault:
         what = f"{self.part}: {self.kind.value} ({self.size:.2f})"
         when = f"{self.at:.3f} s after {self.after.value} {self.nth}"
         return f"{what}, {when}, for {self.lasts:.3f} s"
+
+
+def strange_topic(fault: Fault) -> str:
+    """Return the topic on which a fault lets a stranger publish; empty: on none."""
+    if fault.part == FLOOD:
+        return STRANGE_TOPICS[int(fault.size * len(STRANGE_TOPICS))]
+    name = fault.part.removeprefix(STRANGER)
+    return name if name in STRANGE_TOPICS and name != fault.part else ""
 
 
 def draw_schedule(seed: int) -> list[Fault]:

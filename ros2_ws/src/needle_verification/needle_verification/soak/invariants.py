@@ -27,6 +27,9 @@ CATCH_UP_BOUND = 0.3
 # Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
 # hold_new_press) [s].
 DISCOVERED_WITHIN = 0.2
+# So long after the finger is off a page's hold may still be said [s]: a nonce counts for 0.1 s
+# (docs/safety.md, hold's end), and the hand is looked at every 0.005 s.
+PAGE_LIFETIME = 0.11
 # How long a status may be behind the motors [s].
 _STATUS_LAG = 0.15
 # Beyond the limits themselves: of set-points that a bus brings late, three of 0.02 s may come at
@@ -110,6 +113,8 @@ class Watch:
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
         self._holds = False
+        self._page_holds = False
+        self._page_ended = -1.0
         self._must_press_after = 0.0
         self._status: Mapping[str, str] = {}
         self._status_at = 0.0
@@ -141,6 +146,25 @@ class Watch:
     def see_hold(self, at: float) -> None:
         """Take a message by which the hand's own node says that it presses."""
         self._told_until = at
+
+    def see_page_hold(self, at: float, *, pressed: bool) -> None:
+        """Take whether the console says that the hand, at its page, presses."""
+        idle = at - self._pressed_until
+        if pressed and idle > PAGE_LIFETIME:
+            self.violate(
+                "hold_is_of_now", at, f"said to be held {idle:.3f} s after the finger was off"
+            )
+        begins = pressed and not self._page_holds
+        if begins and self._pressed_since < self._page_ended - PAGE_LIFETIME:
+            self.violate(
+                "hold_is_of_now",
+                at,
+                f"held again by a press of {self._pressed_since:.3f} s, from before "
+                f"{self._page_ended:.3f} s, when its hold had ended",
+            )
+        if self._page_holds and not pressed:
+            self._page_ended = at
+        self._page_holds = pressed
 
     def see_other_hold(self, at: float) -> None:
         """Take that somebody else pressed: from outside that is a hold like any other."""

@@ -9,7 +9,7 @@ import pytest
 from needle_common.errors import UserError
 from needle_verification.soak import faults
 from needle_verification.soak.faults import (
-    SECOND_PERSON,
+    PAGE,
     VOCABULARY,
     Fault,
     Kind,
@@ -27,11 +27,11 @@ def test_every_part_is_spoilt_in_every_way_it_knows() -> None:
 
 def test_a_part_more_shifts_no_fault_of_another(monkeypatch: pytest.MonkeyPatch) -> None:
     with_all = [draw_schedule(seed) for seed in range(200)]
-    monkeypatch.setattr(faults, "_DRAWN_ALONE", {})
+    others = {part: kinds for part, kinds in faults._DRAWN_ALONE.items() if part != PAGE}
+    monkeypatch.setattr(faults, "_DRAWN_ALONE", others)
     assert any(with_all[seed] != draw_schedule(seed) for seed in range(200))
     for seed, drawn in enumerate(with_all):
-        without = [fault for fault in drawn if fault.part != SECOND_PERSON]
-        assert without == draw_schedule(seed)
+        assert [fault for fault in drawn if fault.part != PAGE] == draw_schedule(seed)
 
 
 def test_a_schedule_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -54,3 +54,15 @@ def test_faults_that_do_not_matter_are_left_out() -> None:
     kept = shrink(drawn, lambda some: {"operator", "bus"} <= {fault.part for fault in some})
     assert [fault.part for fault in kept] == ["operator", "bus"]
     assert [fault.lasts for fault in kept] == [1.0, 1.0]
+
+
+def test_a_flood_is_on_any_topic_that_a_stranger_may_publish_on() -> None:
+    sizes = [(n + 0.5) / len(faults.STRANGE_TOPICS) for n in range(len(faults.STRANGE_TOPICS))]
+    floods = [Fault(faults.FLOOD, Kind.WRONG, 0.0, 1.0, size) for size in sizes]
+    assert [faults.strange_topic(flood) for flood in floods] == list(faults.STRANGE_TOPICS)
+    for part, topic in (
+        (f"{faults.STRANGER}/joint_states", "/joint_states"),
+        (f"{faults.STRANGER}/device/home", ""),
+        ("/joint_states", ""),
+    ):
+        assert faults.strange_topic(Fault(part, Kind.WRONG, 0.0, 1.0, 0.5)) == topic

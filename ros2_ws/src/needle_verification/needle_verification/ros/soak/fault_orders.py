@@ -25,12 +25,13 @@ from needle_verification.soak.faults import Fault, Kind
 from needle_verification.soak.link_faults import LinkFault
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
+_LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
 _SLOWEST_CALLBACK_NS = 50_000_000
 LATEST_MESSAGE = 1.0
 """What the worst of faults delays a message by [s]."""
 _LATEST_NS = round(LATEST_MESSAGE * NANOSECONDS)
 _LATEST_FRAME_NS = 100_000_000
-_STRANGER_RATE = 20.0
+_STRANGER_RATE, _FLOOD_RATE = 20.0, 5000.0
 _JUMP_NS = 20 * NANOSECONDS
 _DRIFT_NS, _DRIFT_PERIOD_NS = 2_000_000, 20_000_000
 # Seconds between two changes of mind of a hand that trembles.
@@ -64,8 +65,9 @@ class FaultOrders:
         self._world = rig.world
         self._stranger: VirtualNode | None = None
         self._spoilers: dict[str, Callable[[Fault], Undo]] = {
-            **dict.fromkeys(faults.PROCESSES, self._spoil_process),
-            **dict.fromkeys((*faults.TOPICS, *faults.SERVICES, faults.BUS), self._spoil_links),
+            **dict.fromkeys((*faults.PROCESSES, faults.CONSOLE), self._spoil_process),
+            **dict.fromkeys(_LINKS, self._spoil_links),
+            faults.PAGE: self._spoil_page,
             **dict.fromkeys(faults.DRIVES, self._spoil_drive),
             faults.ADAPTER: self._unplug,
             faults.CAMERAS: self._spoil_cameras,
@@ -193,6 +195,19 @@ class FaultOrders:
 
         return end
 
+    def _spoil_page(self, fault: Fault) -> Undo:
+        page = self._rig.page
+        assert page is not None, "who sits at no page spoils none"
+        if fault.kind is Kind.OFF:
+            page.close()
+            return page.open
+        if fault.kind is Kind.STUCK:
+            page.freeze()
+            return page.go_on
+        doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
+        setattr(page, doing, True)
+        return partial(setattr, page, doing, False)
+
     def _let_second_person_in(self, fault: Fault) -> Undo:
         rig, hand = self._rig, self._rig.second_hand
         chance, world = self._chance_of(fault), self._world
@@ -245,9 +260,10 @@ class FaultOrders:
     # ---- strangers ----------------------------------------------------------------------------
 
     def _let_stranger_act(self, fault: Fault) -> Undo:
-        name = fault.part.removeprefix(faults.STRANGER)
+        topic = faults.strange_topic(fault)
         stranger = self._make_stranger()
-        if name not in faults.STRANGE_TOPICS:
+        if not topic:
+            name = fault.part.removeprefix(faults.STRANGER)
             client_of = self._rig.person
             if name.endswith(" off"):
                 client_of.call("enable", on=False)
@@ -257,13 +273,14 @@ class FaultOrders:
                 client_of.call(name.removeprefix("/"))
             return _nothing
         make, kind, qos = self._strange_messages(fault)
-        publisher = stranger.create_publisher(kind, name, qos)
+        publisher = stranger.create_publisher(kind, topic, qos)
+        rate = _FLOOD_RATE if fault.part == faults.FLOOD else _STRANGER_RATE
         end_ns = self._world.steady_ns + round(fault.lasts * NANOSECONDS)
 
         def act() -> None:
             if self._world.steady_ns < end_ns:
                 publisher.publish(make())
-                self._world.call_after(round(NANOSECONDS / _STRANGER_RATE), act)
+                self._world.call_after(round(NANOSECONDS / rate), act)
 
         def end() -> None:
             if kind is Bool:
@@ -336,4 +353,4 @@ class FaultOrders:
             "/needle/tip": (tip, PointStamped, RELIABLE),
             "/target_plane": (plane, PoseStamped, LATCHED),
         }
-        return rows[fault.part.removeprefix(faults.STRANGER)]
+        return rows[faults.strange_topic(fault)]

@@ -35,7 +35,7 @@ def watch_moments(rig: VirtualRig, meet: Callable[[Moment], None]) -> None:
         rig.graph.watch(topic, see)
 
     def see_hold(node: str, message: Any) -> None:
-        if node != "/operator":
+        if node != rig.hand_node:
             return
         presses, pressed = any(message.buttons), heard.get(node, False)
         heard[node] = presses

@@ -23,7 +23,16 @@ from needle_verification.ros.soak.virtual_rig import (
     virtual_rig,
 )
 from needle_verification.soak.course import Course, told_by_moments
-from needle_verification.soak.faults import SECOND_PERSON, STRANGER, Fault, Kind, draw_schedule
+from needle_verification.soak.faults import (
+    CONSOLE,
+    PAGE,
+    PAGE_LINE,
+    SECOND_PERSON,
+    Fault,
+    Kind,
+    draw_schedule,
+    strange_topic,
+)
 from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 
@@ -35,12 +44,13 @@ _GO_ON, _DRAW_OUT = 60.0, 60.0
 # A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 # The way of a press to the driver.
-_HOLD_LINKS = ("/joy", "/device/hold")
-# Who else may hold.
-_OTHER_HANDS = (SECOND_PERSON, f"{STRANGER}/device/hold")
+_HOLD, _JOINTS = "/device/hold", "/joint_states"
+_HOLD_LINKS = ("/joy", _HOLD)
+# Those who are there only where one of them goes wrong.
+_AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
-# The device's faults that take the joints from the controller, or give it others.
-_JOINTS = ("/joint_states", f"{STRANGER}/joint_states", "device_driver", "plane_controller")
+# The device's faults that take the joints from the controller.
+_TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,6 +118,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             # Their hand must be seen neutral before it counts.
             rig.start(SECOND_JOYSTICK)
             rig.start(SECOND_OPERATOR)
+        if any(fault.part in _AT_PAGE for fault in faults):
+            rig.sit_at_page()
         watch = _watched(rig, faults)
         course = Course(rig.world, faults, FaultOrders(rig).begin)
         watch_moments(rig, course.meet)
@@ -153,7 +165,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
     watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
-    joints_spoilt = any(fault.part in _JOINTS for fault in faults)
+    strange = {strange_topic(fault) for fault in faults}
+    joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 
     def now() -> float:
         return _seconds(rig.world.steady_ns)
@@ -163,7 +176,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         process = rig.processes.get("device_driver")
         speaks = process is not None and process.alive and not process.stands_still
         rig.graph.digest.update(_rounded((at.insertion, at.rotation)))
-        watch.see_hand(at_s, holds=rig.hand.holds)
+        watch.see_hand(at_s, holds=rig.hand_presses)
         watch.see_driver(at_s, speaks=speaks)
         watch.see_drives(at_s, blocked=rig.bench.has_blocked_motor)
         watch.see_motors(at_s, at.insertion, at.rotation)
@@ -183,8 +196,13 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         watch.see_estop(now(), pressed=message.data)
 
     def see_hold(node: str, message: Any) -> None:
-        if any(message.buttons):
-            (watch.see_hold if node == "/operator" else watch.see_other_hold)(now())
+        pressed = any(message.buttons)
+        if node == f"/{CONSOLE}":
+            # It may have been pressed since the last tick.
+            watch.see_hand(now(), holds=rig.hand_presses)
+            watch.see_page_hold(now(), pressed=pressed)
+        if pressed:
+            (watch.see_hold if node == rig.hand_node else watch.see_other_hold)(now())
 
     def hear_hold(data: bytes) -> None:
         message = deserialize_message(data, Joy)
@@ -197,9 +215,9 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     rig.graph.watch("/needle/controller_status", see_belief)
     rig.graph.watch("/device/joint_trajectory", see_command)
     rig.graph.watch("/device/estop", see_estop)
-    rig.graph.watch("/device/hold", see_hold)
-    if any(fault.part in _OTHER_HANDS for fault in faults):
-        rig.graph.listen_at("/device_driver", "/device/hold", hear_hold)
+    rig.graph.watch(_HOLD, see_hold)
+    if _HOLD in strange or any(fault.part == SECOND_PERSON for fault in faults):
+        rig.graph.listen_at("/device_driver", _HOLD, hear_hold)
     return watch
 
 

@@ -180,6 +180,25 @@ class VirtualTimer:
         self._callback()
 
 
+class VirtualBell:
+    """rclpy's GuardCondition: however often it is rung before it is heard, it is heard once."""
+
+    def __init__(self, process: VirtualProcess, callback: Callable[[], None]) -> None:
+        self._process = process
+        self._callback = callback
+        self._rung = False
+
+    def trigger(self) -> None:
+        """Have it called back, by any thread."""
+        if not self._rung:
+            self._rung = True
+            self._process.do(self._hear)
+
+    def _hear(self) -> None:
+        self._rung = False
+        self._callback()
+
+
 class VirtualNode(Node):
     """rclpy's Node without rcl: parameters are the real ones, all else is the virtual graph's.
 
@@ -286,6 +305,10 @@ class VirtualNode(Node):
         """Make a timer; both clocks go alike, but for jumps, which no timer follows."""
         del clock
         return VirtualTimer(self._process, round(timer_period_sec * NANOSECONDS), callback)
+
+    def create_guard_condition(self, callback: Any, **_: Any) -> Any:
+        """Make a guard condition."""
+        return VirtualBell(self._process, callback)
 
     def destroy_node(self) -> None:
         """Take all that it made out of the graph."""

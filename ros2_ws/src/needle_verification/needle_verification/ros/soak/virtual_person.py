@@ -13,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, values_of
 from needle_verification.ros.soak.virtual_node import VirtualNode
+from needle_verification.soak.virtual_page import VirtualPage
 from needle_verification.soak.virtual_world import NANOSECONDS
 
 INSERT, RETRACT, STOP = 0, 1, 2
@@ -52,6 +53,13 @@ class Hand:
     def holds(self) -> bool:
         """Whether it presses what could move the needle."""
         return self.insert or self.retract
+
+    @property
+    def button(self) -> str:
+        """The button of a page that a finger is on; empty: none, or more than one."""
+        if self.insert is self.retract or self.stop:
+            return ""
+        return "insert" if self.insert else "retract"
 
 
 class Joystick(VirtualNode):
@@ -96,6 +104,8 @@ class Person(VirtualNode):
         Whether the controller has said once that it is done.
     absent : bool
         Whether it minds nothing, whatever its hand does.
+    page : VirtualPage or None
+        Where it holds, if not at the joystick.
     """
 
     def __init__(self, hand: Hand, insertion: Callable[[], float]) -> None:
@@ -107,6 +117,7 @@ class Person(VirtualNode):
         self.controller: dict[str, str] = {}
         self.done = False
         self.absent = False
+        self.page: VirtualPage | None = None
         self._called_ns: dict[str, int] = {}
         self._off_since_ns = 0
         self.create_subscription(DiagnosticStatus, "device/status", self._see_device, LATCHED)
@@ -137,6 +148,11 @@ class Person(VirtualNode):
             self._triggers[name].call_async(Trigger.Request())
         else:
             self._switches[name].call_async(SetBool.Request(data=on))
+
+    @property
+    def source(self) -> str:
+        """Name of the node by which it holds, as the device knows it."""
+        return "operator" if self.page is None else "console"
 
     @property
     def _now_ns(self) -> int:
@@ -200,7 +216,9 @@ class Person(VirtualNode):
     def _press(self, *, insert: bool, retract: bool) -> None:
         """Let go of what is not wanted; press what is, from neutral, anew where asked to."""
         hand = self._hand
-        unheeded = self.device.get("press_again") == "operator"
+        unheeded = self.device.get("press_again") == self.source
+        if self.page is not None:
+            unheeded = unheeded or self.page.asks_for_a_new_press
         stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
         if hand.holds and (stale or unheeded):
             self._let_go()
@@ -216,7 +234,7 @@ class Person(VirtualNode):
             self._off_since_ns = self._now_ns
 
     def _is_served(self) -> bool:
-        return self.device.get("hold_owner") == "operator"
+        return self.device.get("hold_owner") == self.source
 
     def _let_go(self) -> None:
         self._hand.insert = self._hand.retract = False

@@ -13,6 +13,7 @@ from rclpy.node import Node
 
 from needle_bringup.ros.operator import OperatorNode
 from needle_common.errors import UserError
+from needle_console.ros.console_node import ConsoleNode
 from needle_controller.ros.plane_controller import PlaneControllerNode
 from needle_device_driver.ros.device_driver import DeviceDriverNode
 from needle_verification.ros.soak.virtual_bench import TIP_NOISE, Bench, TrackerStandIn
@@ -27,7 +28,11 @@ from needle_verification.ros.soak.virtual_person import (
     Person,
 )
 from needle_verification.ros.soak.virtual_topics import VirtualGraph
+from needle_verification.soak.faults import CONSOLE
 from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.virtual_hold import VirtualHold
+from needle_verification.soak.virtual_line import VirtualLine
+from needle_verification.soak.virtual_page import VirtualPage
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
@@ -63,6 +68,8 @@ class VirtualRig:
         Drives and needle.
     can : VirtualCan
         The bus.
+    page : VirtualPage or None
+        Where the person sits, if it is at a page of the console.
     hand, second_hand : Hand
         The person's, and that of a second one.
     processes : dict of str to VirtualProcess
@@ -81,6 +88,8 @@ class VirtualRig:
         self.graph = VirtualGraph(self.world, self.faults)
         self.bench = Bench(self.world)
         self.can = VirtualCan(self.world, self.bench.bus, self.faults)
+        self.page: VirtualPage | None = None
+        self._line = VirtualLine(self.world, self.faults)
         self.hand, self.second_hand = Hand(), Hand()
         self.processes: dict[str, VirtualProcess] = {}
         self.nodes: dict[str, Node] = {}
@@ -107,6 +116,22 @@ class VirtualRig:
         """Source of tips, while it runs."""
         tracker = self.nodes.get("stereo_tracker")
         return tracker if isinstance(tracker, TrackerStandIn) else None
+
+    @property
+    def hand_node(self) -> str:
+        """Full name of the node by which the person holds."""
+        return f"/{self.person.source}"
+
+    @property
+    def hand_presses(self) -> bool:
+        """Whether the hand presses what could move the needle, where it holds."""
+        return self.hand.holds if self.page is None else bool(self.hand.button)
+
+    def sit_at_page(self) -> None:
+        """Let the person hold by a page of the console; the joystick is not touched then."""
+        self.start(CONSOLE)
+        self.page = VirtualPage(self.world, self._line, lambda: self.hand.button)
+        self.person.page = self.page
 
     def start(self, name: str) -> None:
         """Start a node that does not run."""
@@ -164,12 +189,15 @@ class VirtualRig:
         if name in ("operator", SECOND_OPERATOR):
             buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
             return {"source": "joy", **buttons}, OperatorNode
-        if name == "stereo_tracker":
-            return {}, partial(TrackerStandIn, self.bench)
-        if name in ("joy_node", SECOND_JOYSTICK):
-            hand = self.hand if name == "joy_node" else self.second_hand
-            return {}, partial(Joystick, hand)
-        return {}, partial(Person, self.hand, lambda: self.bench.motors.insertion)
+        touched = self.hand if self.page is None else Hand()
+        others: dict[str, Callable[[], Node]] = {
+            "stereo_tracker": partial(TrackerStandIn, self.bench),
+            "joy_node": partial(Joystick, touched),
+            SECOND_JOYSTICK: partial(Joystick, self.second_hand),
+            CONSOLE: partial(_make_console, process, self._line),
+            PERSON: partial(Person, self.hand, lambda: self.bench.motors.insertion),
+        }
+        return {}, others[name]
 
     def _on_end(self, name: str, why: str) -> None:
         self.ends.append((self.world.steady_ns, name, why))
@@ -197,6 +225,27 @@ def virtual_rig(seed: int, depth: float | None) -> Iterator[VirtualRig]:
             if rig is not None:
                 rig.close()
     gc.collect()
+
+
+class _NoServer:
+    """The page's server: what a page shows and does beside the hold is the person's own here."""
+
+    def start(self) -> None:
+        """Do nothing."""
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
+def _make_console(process: VirtualProcess, line: VirtualLine) -> ConsoleNode:
+    def make_hold(access: Any, _: int, on_state: Any, on_notice: Any) -> VirtualHold:
+        made.append(VirtualHold(process, line, access, on_state, on_notice))
+        return made[0]
+
+    made: list[VirtualHold] = []
+    node = ConsoleNode(make_hold, lambda *_: _NoServer())
+    node.context.on_shutdown(made[0].close)
+    return node
 
 
 def _own_domain() -> int:
