@@ -328,7 +328,8 @@ def _readable(name: str, text: str | None) -> Path | None:
         return None
     path = Path(text).expanduser()
     if not path.is_file():
-        raise UserError(f"{name} {text}: no such file")
+        what = "a folder, not a file" if path.is_dir() else "no such file"
+        raise UserError(f"{name} {text}: {what}")
     return path
 
 
