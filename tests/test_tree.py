@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 from collections import Counter
 
+from _pytest.config import PytestPluginManager
+
 from code_lines import ROOT, code_lines, is_test, modules
 from pytest_lanes import LONG_FILES
 
@@ -75,3 +77,12 @@ def test_docstrings_begin_with_a_noun_or_a_verb() -> None:
 
 def test_the_test_files_that_are_run_first_are_there() -> None:
     assert [name for name in LONG_FILES if not (ROOT / name).is_file()] == []
+
+
+def test_a_time_limit_begins_when_the_test_has_its_place_in_a_lane() -> None:
+    manager = PytestPluginManager()
+    for plugin in ("pytest_lanes", "pytest_timeout"):
+        manager.import_plugin(plugin)
+    # The last one is called first, and around the others.
+    names = [one.plugin_name for one in manager.hook.pytest_runtest_protocol.get_hookimpls()]
+    assert names.index("pytest_lanes") > names.index("pytest_timeout")
