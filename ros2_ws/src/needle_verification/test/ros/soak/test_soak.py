@@ -21,7 +21,7 @@ BAD = RunResult(2, FAULTS, (Violation("estop_stops", 1.0, "it went on"),), FAULT
 
 
 @pytest.fixture
-def ended(monkeypatch: pytest.MonkeyPatch) -> None:
+def ended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """End the soak by a signal after two runs, and once more while a schedule is shrunk."""
 
     def results(_: range) -> Iterator[RunResult]:
@@ -34,6 +34,10 @@ def ended(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(soak, "results_here", results)
     monkeypatch.setattr(soak, "shrink", shrinking)
+    # A shell's background ignores SIGINT.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
 
 
 @pytest.mark.usefixtures("ended")
