@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 from collections import Counter
+from types import SimpleNamespace
+from typing import cast
 
+import pytest
 from _pytest.config import PytestPluginManager
 
 from code_lines import ROOT, code_lines, is_test, modules
-from pytest_lanes import LONG_FILES
+from pytest_lanes import BACKGROUND_LIMIT, LONG_FILES, pytest_collection_modifyitems
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
@@ -86,3 +89,16 @@ def test_a_time_limit_begins_when_the_test_has_its_place_in_a_lane() -> None:
     # The last one is called first, and around the others.
     names = [one.plugin_name for one in manager.hook.pytest_runtest_protocol.get_hookimpls()]
     assert names.index("pytest_lanes") > names.index("pytest_timeout")
+
+
+def test_who_makes_way_for_others_has_time(request: pytest.FixtureRequest) -> None:
+    for file, limit in (
+        ("ros2_ws/src/needle_tracker/test/calibrating/test_box_calibration.py", BACKGROUND_LIMIT),
+        ("tests/test_tree.py", 300.0),
+    ):
+        item = pytest.Function.from_parent(request.node.parent, name="test", callobj=lambda: None)
+        item.add_marker(pytest.mark.timeout(300.0))
+        placed = SimpleNamespace(nodeid=f"{file}::test", add_marker=item.add_marker)
+        pytest_collection_modifyitems([cast(pytest.Item, placed)])
+        marker = item.get_closest_marker("timeout")
+        assert marker is not None and marker.args == (limit,)

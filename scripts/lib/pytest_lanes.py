@@ -48,6 +48,8 @@ IN_BACKGROUND = re.compile(
     r".*/needle_verification/test/(studies|tracking|training|paper)/.*"
 )
 """Test files without processes or watchdogs of their own."""
+BACKGROUND_LIMIT = 900.0
+"""A test's time in the background [s]: while both cores are in use it may stand still."""
 _IN_FRONT = 2
 _left: list[str] = []
 _place = contextlib.ExitStack()
@@ -81,7 +83,10 @@ def pytest_collection() -> Generator[None, object, object]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Put the longest files first, all else as it was collected."""
+    """Put the longest files first, all else as it was collected; give time to who makes way."""
+    for item in items:
+        if IN_BACKGROUND.fullmatch(item.nodeid.partition("::")[0]):
+            item.add_marker(pytest.mark.timeout(BACKGROUND_LIMIT), append=False)
     places = {file: place for place, file in enumerate(LONG_FILES)}
     items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
 
