@@ -85,10 +85,10 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected; give time to who makes way."""
     for item in items:
-        if IN_BACKGROUND.fullmatch(item.nodeid.partition("::")[0]):
+        if IN_BACKGROUND.fullmatch(_file_of(item)):
             item.add_marker(pytest.mark.timeout(BACKGROUND_LIMIT), append=False)
     places = {file: place for place, file in enumerate(LONG_FILES)}
-    items.sort(key=lambda item: places.get(item.nodeid.partition("::")[0], len(places)))
+    items.sort(key=lambda item: places.get(_file_of(item), len(places)))
 
 
 # First of all: a test's own time limit begins when it has its place.
@@ -97,15 +97,19 @@ def pytest_runtest_protocol(
     item: pytest.Item, nextitem: pytest.Item | None
 ) -> Generator[None, object, object]:
     """Take a file's place, in front or in the background, for as long as it runs."""
-    file = item.nodeid.partition("::")[0]
+    file = _file_of(item)
     if in_lane(item.config) and _running != [file]:
         _take_place(file)
         _running[:] = [file]
     result = yield
-    if nextitem is None or nextitem.nodeid.partition("::")[0] != file:
+    if nextitem is None or _file_of(nextitem) != file:
         _running.clear()
         _place.close()
     return result
+
+
+def _file_of(item: pytest.Item) -> str:
+    return item.nodeid.partition("::")[0]
 
 
 def _take_place(file: str) -> None:

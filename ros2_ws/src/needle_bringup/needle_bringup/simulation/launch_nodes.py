@@ -15,7 +15,7 @@ from needle_bringup.simulation.rig_configuration import (
     command_line_parameters,
     merge,
 )
-from needle_bringup.simulation.simulate_options import parse
+from needle_bringup.simulation.simulate_options import existing_file, parse
 from needle_common.errors import UserError
 from needle_common.settings.parameter_files import Parameters, read_parameters
 
@@ -118,9 +118,7 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     UserError
         If a file is missing or is not what it should be, or the bag is there already.
     """
-    calibration = Path(arguments["calibration"]).expanduser().absolute()
-    if not calibration.is_file():
-        raise UserError(f"calibration:={arguments['calibration']}: no such file")
+    calibration = existing_file("calibration:=", arguments["calibration"]).absolute()
     bag = _new_bag(arguments["bag"])
     parameters: Parameters = {
         # Hears cameras that publish best effort and such that do not.
@@ -195,10 +193,7 @@ def _with_file(parameters: Parameters, file: str, reserved: Mapping[str, str]) -
 
 
 def _read(argument: str, file: str) -> Parameters:
-    path = Path(file).expanduser()
-    if not path.is_file():
-        raise UserError(f"{argument}:={file}: no such file")
-    return read_parameters(path, NODES)
+    return read_parameters(existing_file(f"{argument}:=", file), NODES)
 
 
 def _new_bag(text: str) -> Path | None:

@@ -324,12 +324,28 @@ def _obstacles(text: str | None, target: tuple[float, float, float] | None) -> P
 
 
 def _readable(name: str, text: str | None) -> Path | None:
-    if text is None:
-        return None
+    return None if text is None else existing_file(f"{name} ", text)
+
+
+def existing_file(given_by: str, text: str) -> Path:
+    """Return a file that is there.
+
+    Parameters
+    ----------
+    given_by : str
+        What stands before it where it is given: `--params `, `params:=`.
+    text : str
+        As given.
+
+    Raises
+    ------
+    UserError
+        If it is a folder, or is not there.
+    """
     path = Path(text).expanduser()
     if not path.is_file():
         what = "a folder, not a file" if path.is_dir() else "no such file"
-        raise UserError(f"{name} {text}: {what}")
+        raise UserError(f"{given_by}{text}: {what}")
     return path
 
 

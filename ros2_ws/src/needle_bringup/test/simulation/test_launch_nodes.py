@@ -57,6 +57,8 @@ def test_a_calibration_or_simulated_params_that_are_missing_start_nothing(tmp_pa
         beside_rig(calibration=str(tmp_path / "typo.yaml"))
     with pytest.raises(UserError, match=r"params:=.*no such file"):
         simulated(params=str(tmp_path / "typo.yaml"))
+    with pytest.raises(UserError, match=r"calibration:=.*: a folder, not a file"):
+        beside_rig(calibration=str(tmp_path))
 
 
 def test_drives_that_name_another_node_do_not_start_the_driver_on_its_defaults(

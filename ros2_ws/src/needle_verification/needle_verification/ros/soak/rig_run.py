@@ -43,8 +43,8 @@ _FAULTS_OVER = 30.0
 _GO_ON, _DRAW_OUT = 60.0, 60.0
 # A needle that nothing disturbs goes as deep [m], and is as near to the plane there [m].
 UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
-# The way of a press to the driver.
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
+# The way of a press to the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
 # Those who are there only where one of them goes wrong.
 _AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)

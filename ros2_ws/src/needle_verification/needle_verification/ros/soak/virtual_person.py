@@ -13,6 +13,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, values_of
 from needle_verification.ros.soak.virtual_node import VirtualNode
+from needle_verification.soak.faults import CONSOLE
 from needle_verification.soak.virtual_page import VirtualPage
 from needle_verification.soak.virtual_world import NANOSECONDS
 
@@ -152,7 +153,7 @@ class Person(VirtualNode):
     @property
     def source(self) -> str:
         """Name of the node by which it holds, as the device knows it."""
-        return "operator" if self.page is None else "console"
+        return "operator" if self.page is None else CONSOLE
 
     @property
     def _now_ns(self) -> int:

@@ -68,8 +68,6 @@ class VirtualRig:
         Drives and needle.
     can : VirtualCan
         The bus.
-    page : VirtualPage or None
-        Where the person sits, if it is at a page of the console.
     hand, second_hand : Hand
         The person's, and that of a second one.
     processes : dict of str to VirtualProcess
@@ -88,7 +86,6 @@ class VirtualRig:
         self.graph = VirtualGraph(self.world, self.faults)
         self.bench = Bench(self.world)
         self.can = VirtualCan(self.world, self.bench.bus, self.faults)
-        self.page: VirtualPage | None = None
         self._line = VirtualLine(self.world, self.faults)
         self.hand, self.second_hand = Hand(), Hand()
         self.processes: dict[str, VirtualProcess] = {}
@@ -118,6 +115,11 @@ class VirtualRig:
         return tracker if isinstance(tracker, TrackerStandIn) else None
 
     @property
+    def page(self) -> VirtualPage | None:
+        """Page of the console at which the person sits, if at one."""
+        return self.person.page
+
+    @property
     def hand_node(self) -> str:
         """Full name of the node by which the person holds."""
         return f"/{self.person.source}"
@@ -130,8 +132,7 @@ class VirtualRig:
     def sit_at_page(self) -> None:
         """Let the person hold by a page of the console; the joystick is not touched then."""
         self.start(CONSOLE)
-        self.page = VirtualPage(self.world, self._line, lambda: self.hand.button)
-        self.person.page = self.page
+        self.person.page = VirtualPage(self.world, self._line, lambda: self.hand.button)
 
     def start(self, name: str) -> None:
         """Start a node that does not run."""
@@ -189,10 +190,9 @@ class VirtualRig:
         if name in ("operator", SECOND_OPERATOR):
             buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
             return {"source": "joy", **buttons}, OperatorNode
-        touched = self.hand if self.page is None else Hand()
         others: dict[str, Callable[[], Node]] = {
             "stereo_tracker": partial(TrackerStandIn, self.bench),
-            "joy_node": partial(Joystick, touched),
+            "joy_node": lambda: Joystick(self.hand if self.page is None else Hand()),
             SECOND_JOYSTICK: partial(Joystick, self.second_hand),
             CONSOLE: partial(_make_console, process, self._line),
             PERSON: partial(Person, self.hand, lambda: self.bench.motors.insertion),
