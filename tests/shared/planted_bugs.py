@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 
 import pytest
 
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.recording.recording import Received, Recording
 from needle_bringup.operator.joy_source import JoySource
 from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
@@ -158,6 +160,21 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(RollLaw, "__call__", away)
 
 
+def _queue_without_a_bound(patch: pytest.MonkeyPatch) -> None:
+    def append(recording: Recording, message: Received) -> None:
+        recording.append_all((message,))
+
+    patch.setattr(Recording, "append", append)
+
+
+def _drops_uncounted(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Recording, "_drop", lambda *_: None)
+
+
+def _never_written_out(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(BagWriter, "flush", lambda _: None)
+
+
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 143),
@@ -180,6 +197,9 @@ PLANTED = {
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
+    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 134),
+    "a message dropped unsaid": PlantedBug("nothing_recorded_is_lost", _drops_uncounted, 28),
+    "a bag kept in memory": PlantedBug("nothing_recorded_is_lost", _never_written_out, 10),
     "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
 }
 

@@ -204,9 +204,13 @@ class BagWriter:
         with self._writing():
             write_metadata(self.directory, self._information())
 
+    def open_file(self, path: Path) -> IO[bytes]:
+        """Return a new file of the bag."""
+        return path.open("xb")
+
     def _begin_file(self) -> None:
         name = f"{self.directory.absolute().name}_{len(self._files)}.mcap"
-        self._stream: IO[bytes] = (self.directory / name).open("xb")
+        self._stream = self.open_file(self.directory / name)
         # Held until the file is closed: `recover` keeps off a bag that is being recorded.
         fcntl.flock(self._stream, fcntl.LOCK_EX)
         self._files.append(DataFile(name))

@@ -1,11 +1,10 @@
-"""The recorder's writing half: a queue that callbacks append to, and a thread that empties it."""
+"""The recorder's writing half: a queue that callbacks append to, and a worker that empties it."""
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
-import queue
-import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,14 +17,15 @@ from needle_bags.format.bag_writer import (
     refuse_existing_bag,
 )
 from needle_bags.recording.free_space import FreeSpace, megabytes
+from needle_bags.recording.worker import Step, Worker, WorkerThread
 from needle_common.errors import UserError
 from needle_common.files.bag_topic import BagTopic
 
 FLUSH_PERIOD: Final = 0.1
 # What waits for a slow disk at most, in bytes; more is dropped, and counted. Nearly three seconds
-# of stereo images. Where images fill it, there is still room for what is small.
+# of stereo images. Where images fill it, there is still an eighth more for what is small.
 WAITING_LIMIT: Final = 128_000_000
-ROOM_FOR_SMALL: Final = 16_000_000
+_SHARE_FOR_SMALL: Final = 8
 SMALL: Final = 65_536
 # What a message takes in memory beside its data.
 OVERHEAD: Final = 800
@@ -65,25 +65,19 @@ class Received:
 
 
 class Recording:
-    """A bag that fills in a thread of its own, so that no disk delay reaches the subscriptions.
+    """A bag that a worker fills, so that no disk delay reaches the subscriptions.
 
     Parameters
     ----------
-    directory : Path
-        The bag.
-    distribution : str
-        ROS distribution of its message types.
-    max_file_size : int
-        Bytes of messages after which another data file is begun; 0: never.
-    compression : str
-        `none` or `zstd`.
-    reserve : int
-        Free bytes on the disk at which the recording ends in order (`FreeSpace`).
-
-    Raises
-    ------
-    UserError
-        If the directory holds a bag already or cannot be made, or the disk is full.
+    bag : BagWriter
+        The bag; the worker's from now on.
+    space : FreeSpace
+        Of its disk: where none is left the recording ends in order.
+    make_worker : callable
+        Makes the worker from what does one step.
+    waiting_limit : int
+        What waits for a slow disk at most [B], but for an eighth more of what is small; what is
+        beyond is dropped, and counted.
 
     Attributes
     ----------
@@ -97,22 +91,16 @@ class Recording:
 
     def __init__(
         self,
-        directory: Path,
-        *,
-        distribution: str = "jazzy",
-        max_file_size: int = 0,
-        compression: str = "none",
-        reserve: int = RESERVE,
+        bag: BagWriter,
+        space: FreeSpace,
+        make_worker: Callable[[Step], Worker] = WorkerThread,
+        waiting_limit: int = WAITING_LIMIT,
     ) -> None:
-        refuse_existing_bag(directory)
-        self.space = _space(directory, reserve)
-        self._bag = BagWriter(
-            directory,
-            distribution=distribution,
-            max_file_size=max_file_size,
-            compression=compression,
-        )
-        self._jobs: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self.space = space
+        self._bag = bag
+        self._waiting_limit = waiting_limit
+        self._jobs: collections.deque[Callable[[], None]] = collections.deque()
+        self._end_wanted = False
         self._numbers: dict[str, int] = {}
         self.error: str | None = None
         self.is_whole = False
@@ -120,13 +108,14 @@ class Recording:
         self.bytes_received = 0
         self.messages_received = 0
         self._bytes_done = 0
-        self._thread = threading.Thread(target=self._run, name="bag_writer")
-        self._thread.start()
+        self._looked_at = self._flushed = 0
+        self._next_flush = time.monotonic() + FLUSH_PERIOD
+        self._worker = make_worker(self._step)
 
     @property
     def messages_waiting(self) -> int:
-        """Messages received that the thread has not taken yet."""
-        return self._jobs.qsize()
+        """Messages received that the worker has not taken yet."""
+        return len(self._jobs)
 
     @property
     def bytes_waiting(self) -> int:
@@ -139,8 +128,9 @@ class Recording:
 
     def append(self, message: Received) -> None:
         """Queue one message; it is dropped, and counted, where too much waits already."""
-        room = ROOM_FOR_SMALL if len(message.data) <= SMALL else 0
-        if self.bytes_waiting > WAITING_LIMIT + room:
+        is_small = len(message.data) <= SMALL
+        room = self._waiting_limit // _SHARE_FOR_SMALL if is_small else 0
+        if self.bytes_waiting > self._waiting_limit + room:
             self._drop(message.topic)
         else:
             self.append_all((message,))
@@ -153,7 +143,7 @@ class Recording:
                 continue
             self.bytes_received += len(message.data)
             self.messages_received += 1
-            self._jobs.put(lambda message=message: self._write(message))  # type: ignore[misc]
+            self._queue(lambda message=message: self._write(message))  # type: ignore[misc]
 
     def add_record(self, name: str, values: dict[str, str]) -> None:
         """Queue a metadata record, kept in the MCAP file as soon as it is known."""
@@ -165,17 +155,20 @@ class Recording:
 
     def set_custom_data(self, key: str, value: str) -> None:
         """Queue a text for metadata.yaml's `custom_data`."""
-        self._jobs.put(lambda: self._bag.set_custom_data(key, value))
+        self._queue(lambda: self._bag.set_custom_data(key, value))
 
     def close(self) -> None:
         """Write all that waits, then index and metadata; `error` tells how it went."""
-        if self._thread.is_alive():
-            self._jobs.put(None)
-            self._thread.join()
+        self._end_wanted = True
+        self._worker.finish()
 
     def _put(self, job: Callable[[], None]) -> None:
         """Queue what can be done only while data is written."""
-        self._jobs.put(lambda: job() if self.error is None else None)
+        self._queue(lambda: job() if self.error is None else None)
+
+    def _queue(self, job: Callable[[], None]) -> None:
+        self._jobs.append(job)
+        self._worker.ring()
 
     def _add_topic(self, topic: BagTopic) -> None:
         self._numbers[topic.name] = self._bag.add_topic(topic)
@@ -201,17 +194,64 @@ class Recording:
     def _drop(self, topic: str) -> None:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
 
-    def _run(self) -> None:
+    def _step(self) -> float | None:
+        """Do the next job, and what the disk needs; `Step` says what is returned.
+
+        After an early end what waits, or still arrives, is counted as dropped.
+        """
+        # Looked at first: all that had to be queued before the end is then in the queue.
+        is_last = self._end_wanted
+        job = self._jobs.popleft() if self._jobs else _nothing
+        if self.error is None:
+            self._do(job)
+        else:
+            job()
+        if self._jobs:
+            return time.monotonic()
+        if not is_last:
+            return self._next_flush if self.error is None else time.monotonic() + FLUSH_PERIOD
+        if self.error is None:
+            self._complete()
+        elif self.is_whole:
+            with contextlib.suppress(BagWriteError):
+                self._bag.update_metadata()
+        return None
+
+    def _do(self, job: Callable[[], None]) -> None:
         try:
-            self._empty_queue()
-            if self.error is not None:
-                self._bag.set_custom_data(ENDED_EARLY, self.error)
+            job()
+            self._tend_disk()
+        except (BagWriteError, OSError) as error:
+            self._end_early(str(error))
+            return
+        # A worker that ended in silence would leave all that comes after it waiting.
+        except Exception as error:  # noqa: BLE001
+            self.error = f"{type(error).__name__}: {error}"
+        if self.error is not None:
+            self._bag.set_custom_data(ENDED_EARLY, self.error)
+            self._complete()
+
+    def _tend_disk(self) -> None:
+        """Write out where it is time; end the recording where there is no room for more."""
+        is_due = time.monotonic() >= self._next_flush
+        if is_due or self._bytes_done - self._looked_at >= _LOOK_EVERY:
+            self._looked_at = self._bytes_done
+            unwritten = min(CHUNK_SIZE, self._bytes_done - self._flushed)
+            if self.space.usable() < unwritten:
+                left = megabytes(self.space.usable() + self.space.reserve)
+                self.error = f"the disk of {self._bag.directory} has only {left} left"
+                return
+        if is_due:
+            self._bag.flush()
+            self._flushed = self._bytes_done
+            self._next_flush = time.monotonic() + FLUSH_PERIOD
+
+    def _complete(self) -> None:
+        try:
             self._bag.close()
             self.is_whole = True
         except (BagWriteError, OSError) as error:
             self._end_early(str(error))
-        if self.error is not None:
-            self._discard()
 
     def _end_early(self, why: str) -> None:
         self.error = self.error or why
@@ -221,43 +261,48 @@ class Recording:
                 self.dropped[topic] = self.dropped.get(topic, 0) + count
             self.is_whole = True
 
-    def _empty_queue(self) -> None:
-        next_flush = time.monotonic() + FLUSH_PERIOD
-        looked_at = flushed = 0
-        while True:
-            try:
-                job = self._jobs.get(timeout=max(0.0, next_flush - time.monotonic()))
-                if job is None:
-                    return
-                job()
-            except queue.Empty:
-                pass
-            except (BagWriteError, OSError):
-                raise
-            # A thread that ended in silence would leave all that comes after it waiting.
-            except Exception as error:  # noqa: BLE001
-                self.error = f"{type(error).__name__}: {error}"
-                return
-            is_due = time.monotonic() >= next_flush
-            if is_due or self._bytes_done - looked_at >= _LOOK_EVERY:
-                looked_at = self._bytes_done
-                unwritten = min(CHUNK_SIZE, self._bytes_done - flushed)
-                if self.space.usable() < unwritten:
-                    left = megabytes(self.space.usable() + self.space.reserve)
-                    self.error = f"the disk of {self._bag.directory} has only {left} left"
-                    return
-            if is_due:
-                self._bag.flush()
-                flushed = self._bytes_done
-                next_flush = time.monotonic() + FLUSH_PERIOD
 
-    def _discard(self) -> None:
-        """Count what still waits, or arrives, after an early end, until the recorder closes."""
-        while (job := self._jobs.get()) is not None:
-            job()
-        if self.is_whole:
-            with contextlib.suppress(BagWriteError):
-                self._bag.update_metadata()
+def open_recording(
+    directory: Path,
+    *,
+    distribution: str = "jazzy",
+    max_file_size: int = 0,
+    compression: str = "none",
+    reserve: int = RESERVE,
+) -> Recording:
+    """Begin a bag that a thread of its own fills.
+
+    Parameters
+    ----------
+    directory : Path
+        The bag.
+    distribution : str
+        ROS distribution of its message types.
+    max_file_size : int
+        Bytes of messages after which another data file is begun; 0: never.
+    compression : str
+        `none` or `zstd`.
+    reserve : int
+        Free bytes on the disk at which the recording ends in order (`FreeSpace`).
+
+    Raises
+    ------
+    UserError
+        If the directory holds a bag already or cannot be made, or the disk is full.
+    """
+    refuse_existing_bag(directory)
+    space = _space(directory, reserve)
+    bag = BagWriter(
+        directory,
+        distribution=distribution,
+        max_file_size=max_file_size,
+        compression=compression,
+    )
+    return Recording(bag, space)
+
+
+def _nothing() -> None:
+    """Do nothing: no job waits."""
 
 
 def _space(directory: Path, reserve: int) -> FreeSpace:

@@ -17,7 +17,13 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition
-from needle_bags.recording.recording import WAITING_LIMIT, Received, Recording
+from needle_bags.recording.free_space import FreeSpace
+from needle_bags.recording.recording import (
+    WAITING_LIMIT,
+    Received,
+    Recording,
+    open_recording,
+)
 from needle_common.errors import UserError
 from needle_common.files.bag_topic import BagTopic
 
@@ -172,7 +178,7 @@ def test_a_full_disk_ends_the_recording_with_its_reason(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    recording = Recording(tmp_path / "bag")
+    recording = open_recording(tmp_path / "bag")
     recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
     monkeypatch.setattr("mcap.writer.Writer.add_message", full)
     for number in range(10):
@@ -194,7 +200,7 @@ def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(
         write(*given)
 
     monkeypatch.setattr(BagWriter, "write", slow)
-    recording = Recording(tmp_path / "bag")
+    recording = open_recording(tmp_path / "bag")
     for name in ("/image", "/command"):
         recording.add_topic(BagTopic(name, TYPE, full_definition(TYPE)))
     image = bytes(WAITING_LIMIT // 8)
@@ -218,9 +224,8 @@ def test_a_flood_of_tiny_messages_is_bounded_by_what_they_take_in_memory(
 ) -> None:
     moves = threading.Event()
     monkeypatch.setattr(BagWriter, "write", lambda *_: moves.wait(20.0))
-    monkeypatch.setattr("needle_bags.recording.recording.WAITING_LIMIT", 1_000_000)
-    monkeypatch.setattr("needle_bags.recording.recording.ROOM_FOR_SMALL", 100_000)
-    recording = Recording(tmp_path / "bag")
+    space = FreeSpace(tmp_path, 0)
+    recording = Recording(BagWriter(tmp_path / "bag"), space, waiting_limit=900_000)
     recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
     for _ in range(5000):
         recording.append(Received("/t", b"", TIME, TIME))
@@ -232,7 +237,7 @@ def test_a_flood_of_tiny_messages_is_bounded_by_what_they_take_in_memory(
 
 def test_a_message_that_cannot_be_written_ends_the_recording_in_order(tmp_path: Path) -> None:
     """The thread that writes may not end in silence: all that comes after would wait for ever."""
-    recording = Recording(tmp_path / "bag")
+    recording = open_recording(tmp_path / "bag")
     recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
     recording.append(Received("/t", pose(1), TIME, TIME))
     recording.append(Received("/nobody_described_it", pose(2), TIME, TIME))

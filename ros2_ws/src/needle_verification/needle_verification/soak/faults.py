@@ -76,6 +76,8 @@ SECOND_PERSON = "second person"
 random, loses the joystick while pressing."""
 CONSOLE, PAGE, PAGE_LINE = "console", "page", "page line"
 """Where one of them goes wrong the person holds by a page of the console, not by the joystick."""
+RECORDER, DISK = "recorder", "disk"
+"""Where one of them goes wrong a recorder is there, with a disk of its own."""
 DRIVES = ("insertion drive", "rotation drive")
 STRANGER = "stranger on "
 """Begins the name of a part where a foreign node publishes or calls what is not its own."""
@@ -111,6 +113,8 @@ _DRAWN_ALONE: dict[str, tuple[Kind, ...]] = {
     PAGE: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.DUPLICATED),
     PAGE_LINE: (Kind.OFF, Kind.SLOW, Kind.INTERMITTENT),
     FLOOD: (Kind.WRONG, Kind.GARBAGE),
+    RECORDER: (Kind.OFF, Kind.STUCK, Kind.SLOW),
+    DISK: (Kind.OFF, Kind.STUCK, Kind.GARBAGE, Kind.SLOW),
 }
 VOCABULARY = {**_DRAWN_TOGETHER, **_DRAWN_ALONE}
 """What can go wrong with each part."""

@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 
 from needle_verification.soak.hold_witness import HoldWitness
+from needle_verification.soak.virtual_disk import WAITING_LIMIT
 
 # Speeds are judged over so many ticks, 0.1 s.
 _SPEED_TICKS = 20
@@ -43,6 +44,8 @@ _COMMANDS = 50
 # Farther in than commanded [m], and farther turned than the part of the way that was made wants
 # [rad]: a rotation drive falls silent at 3 rad/s, and insertion goes on until that is noticed.
 _BEYOND_COMMAND, _OUT_OF_PROPORTION = 0.0006, 0.5
+# What is small has an eighth more room, and the last of it may go beyond [B].
+_WAITING = WAITING_LIMIT + WAITING_LIMIT // 8 + 70_000
 
 
 @dataclasses.dataclass(frozen=True)
@@ -250,6 +253,11 @@ class Watch:
         self._judge_status(at)
         if along > _REST_INSERTION:
             self._judge_way(at, insertion, rotation)
+
+    def see_waiting(self, at: float, waiting: int) -> None:
+        """Take how much waits for the recorder's disk [B]."""
+        if waiting > _WAITING:
+            self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
     def see_belief(self, at: float, values: Mapping[str, str], *, joints_heard: bool) -> None:
         """Take a needle/controller_status as it is published, while joints reach the controller."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import random
 from collections.abc import Callable
@@ -23,10 +24,11 @@ from needle_verification.soak import faults
 from needle_verification.soak.course import Undo
 from needle_verification.soak.faults import Fault, Kind
 from needle_verification.soak.link_faults import LinkFault
+from needle_verification.soak.virtual_disk import ROOM
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
-_SLOWEST_CALLBACK_NS = 50_000_000
+_SLOWEST_CALLBACK_NS, _SLOWEST_STEP_NS = 50_000_000, 5_000_000
 LATEST_MESSAGE = 1.0
 """What the worst of faults delays a message by [s]."""
 _LATEST_NS = round(LATEST_MESSAGE * NANOSECONDS)
@@ -65,9 +67,12 @@ class FaultOrders:
         self._world = rig.world
         self._stranger: VirtualNode | None = None
         self._spoilers: dict[str, Callable[[Fault], Undo]] = {
-            **dict.fromkeys((*faults.PROCESSES, faults.CONSOLE), self._spoil_process),
+            **dict.fromkeys(
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._spoil_process
+            ),
             **dict.fromkeys(_LINKS, self._spoil_links),
             faults.PAGE: self._spoil_page,
+            faults.DISK: self._spoil_disk,
             **dict.fromkeys(faults.DRIVES, self._spoil_drive),
             faults.ADAPTER: self._unplug,
             faults.CAMERAS: self._spoil_cameras,
@@ -207,6 +212,29 @@ class FaultOrders:
         doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
         setattr(page, doing, True)
         return partial(setattr, page, doing, False)
+
+    def _spoil_disk(self, fault: Fault) -> Undo:
+        recorders = self._rig.recorders
+        assert recorders is not None, "who records nothing has no disk"
+        disk = recorders.disk
+        if fault.kind is Kind.STUCK:
+            disk.stands_still = True
+            return partial(setattr, disk, "stands_still", False)
+        if fault.kind is Kind.SLOW:
+            disk.slowness_ns = round(fault.size * _SLOWEST_STEP_NS)
+            return partial(setattr, disk, "slowness_ns", 0)
+        if fault.kind is Kind.GARBAGE:
+            disk.error = errno.EIO
+        elif fault.size < 0.5:
+            # Others fill it, and it can be seen.
+            disk.room = 0
+        else:
+            disk.error = errno.ENOSPC
+
+        def mend() -> None:
+            disk.error, disk.room = 0, ROOM
+
+        return mend
 
     def _let_second_person_in(self, fault: Fault) -> Undo:
         rig, hand = self._rig, self._rig.second_hand

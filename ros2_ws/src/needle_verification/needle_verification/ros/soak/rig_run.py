@@ -15,6 +15,7 @@ from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_verification.ros.soak.fault_orders import LATEST_MESSAGE, FaultOrders
 from needle_verification.ros.soak.moment_watch import watch_moments
 from needle_verification.ros.soak.virtual_bench import Motors
+from needle_verification.ros.soak.virtual_endpoint import Sample
 from needle_verification.ros.soak.virtual_person import OUT, Wish
 from needle_verification.ros.soak.virtual_rig import (
     SECOND_JOYSTICK,
@@ -25,8 +26,10 @@ from needle_verification.ros.soak.virtual_rig import (
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import (
     CONSOLE,
+    DISK,
     PAGE,
     PAGE_LINE,
+    RECORDER,
     SECOND_PERSON,
     Fault,
     Kind,
@@ -48,6 +51,7 @@ _HOLD, _JOINTS = "/device/hold", "/joint_states"
 _HOLD_LINKS = ("/joy", _HOLD)
 # Those who are there only where one of them goes wrong.
 _AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)
+_RECORDED = (RECORDER, DISK)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
@@ -120,6 +124,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             rig.start(SECOND_OPERATOR)
         if any(fault.part in _AT_PAGE for fault in faults):
             rig.sit_at_page()
+        if any(fault.part in _RECORDED for fault in faults):
+            rig.record()
         watch = _watched(rig, faults)
         course = Course(rig.world, faults, FaultOrders(rig).begin)
         watch_moments(rig, course.meet)
@@ -139,6 +145,11 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
             watch.violate("the_way_goes_on", now, _state_of(rig))
         for name, error in rig.world.crashes:
             watch.violate("no_node_crashes", now, f"{name}: {error}")
+        if rig.recorders is not None:
+            of_bags = [fault for fault in faults if fault.part in _RECORDED]
+            losses = rig.recorders.end(judges_killed=len(of_bags) == 1)
+            if losses:
+                watch.violate("nothing_recorded_is_lost", now, "; ".join(losses))
         if not faults and not (rig.person.done and abs(rig.bench.deepest_tip[0]) <= _CONVERGED):
             off = f"the tip went to {rig.bench.deepest_tip[0] * 1e3:.2f} mm from the plane"
             watch.violate("undisturbed_converges", now, f"{off}; {_state_of(rig)}")
@@ -180,6 +191,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         watch.see_driver(at_s, speaks=speaks)
         watch.see_drives(at_s, blocked=rig.bench.has_blocked_motor)
         watch.see_motors(at_s, at.insertion, at.rotation)
+        if rig.recorders is not None:
+            watch.see_waiting(at_s, rig.recorders.bytes_waiting)
 
     def see_device(_: str, message: Any) -> None:
         watch.see_device(now(), values_of(message))
@@ -204,8 +217,10 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         if pressed:
             (watch.see_hold if node == rig.hand_node else watch.see_other_hold)(now())
 
-    def hear_hold(data: bytes) -> None:
-        message = deserialize_message(data, Joy)
+    def hear(topic: str, sample: Sample) -> None:
+        if topic != _HOLD:
+            return
+        message = deserialize_message(sample.data, Joy)
         speed, lifetime = (*message.axes, math.inf)[:2]
         pressed = bool(message.buttons[0]) and 0.0 <= speed <= 1.0
         watch.witness.hear(now(), message.header.frame_id, pressed=pressed, lifetime=lifetime)
@@ -217,7 +232,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     rig.graph.watch("/device/estop", see_estop)
     rig.graph.watch(_HOLD, see_hold)
     if _HOLD in strange or any(fault.part == SECOND_PERSON for fault in faults):
-        rig.graph.listen_at("/device_driver", _HOLD, hear_hold)
+        rig.graph.listen_at("/device_driver", hear)
     return watch
 
 

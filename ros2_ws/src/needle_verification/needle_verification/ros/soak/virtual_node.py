@@ -10,6 +10,7 @@ from typing import Any
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -25,6 +26,7 @@ from needle_verification.ros.soak.virtual_topics import (
     VirtualPublisher,
     VirtualSubscription,
 )
+from needle_verification.soak.virtual_timers import VirtualBell, VirtualTimer
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 _PARAMETER_EVENTS_DEPTH = 1000
@@ -141,64 +143,6 @@ class _Logger:
         self._tell("error", text)
 
 
-class VirtualTimer:
-    """rclpy's Timer: late calls are skipped, not made up for."""
-
-    def __init__(self, process: VirtualProcess, period_ns: int, callback: Any) -> None:
-        self._process = process
-        self._world = process.world
-        self.timer_period_ns = period_ns
-        self._callback = callback
-        self._canceled = False
-        self._due = 0
-        self._generation = 0
-        self._arm(self._world.steady_ns + period_ns)
-
-    def cancel(self) -> None:
-        """Do not call back until `reset`."""
-        self._canceled = True
-
-    def reset(self) -> None:
-        """Begin the period anew."""
-        self._canceled = False
-        self._arm(self._world.steady_ns + self.timer_period_ns)
-
-    def _arm(self, due_ns: int) -> None:
-        self._due = due_ns
-        self._generation += 1
-        generation = self._generation
-
-        def call() -> None:
-            if generation == self._generation and not self._canceled:
-                self._call()
-
-        self._world.call_at(due_ns, lambda: self._process.do(call))
-
-    def _call(self) -> None:
-        behind = self._world.steady_ns - self._due
-        self._arm(self._due + self.timer_period_ns * (1 + behind // self.timer_period_ns))
-        self._callback()
-
-
-class VirtualBell:
-    """rclpy's GuardCondition: however often it is rung before it is heard, it is heard once."""
-
-    def __init__(self, process: VirtualProcess, callback: Callable[[], None]) -> None:
-        self._process = process
-        self._callback = callback
-        self._rung = False
-
-    def trigger(self) -> None:
-        """Have it called back, by any thread."""
-        if not self._rung:
-            self._rung = True
-            self._process.do(self._hear)
-
-    def _hear(self) -> None:
-        self._rung = False
-        self._callback()
-
-
 class VirtualNode(Node):
     """rclpy's Node without rcl: parameters are the real ones, all else is the virtual graph's.
 
@@ -273,11 +217,17 @@ class VirtualNode(Node):
         qos_profile: Any,
         *,
         raw: bool = False,
+        event_callbacks: SubscriptionEventCallbacks | None = None,
         **_: Any,
     ) -> Any:
         """Make a subscription."""
         subscription = VirtualSubscription(
-            *self._at(topic), _qos(qos_profile), kind=msg_type, callback=callback, raw=raw
+            *self._at(topic),
+            _qos(qos_profile),
+            kind=msg_type,
+            callback=callback,
+            raw=raw,
+            on_lost=event_callbacks.message_lost if event_callbacks is not None else None,
         )
         subscription.careful = partial(self.run_guarded, subscription.topic_name)
         return subscription
@@ -294,6 +244,11 @@ class VirtualNode(Node):
         return VirtualClient(
             self._graph, self._process, srv_type, self.resolve_service_name(srv_name)
         )
+
+    def destroy_subscription(self, subscription: Any) -> bool:
+        """Take a subscription out of the graph."""
+        subscription.gone_ns = self._graph.world.steady_ns
+        return True
 
     def destroy_client(self, _: Any) -> bool:
         """Forget a client."""
@@ -316,6 +271,22 @@ class VirtualNode(Node):
         self.context.shutdown()
 
     # ---- what it knows of others --------------------------------------------------------------
+
+    def get_node_names_and_namespaces(self) -> list[tuple[str, str]]:
+        """Return the nodes that it knows."""
+        there = self._graph.publishers["/parameter_events"]
+        infos = [one.info for one in there if one.is_seen(self._process)]
+        return [(info.node_name, info.node_namespace) for info in infos]
+
+    def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
+        """Return the topics that it knows, and their types."""
+        del no_demangle
+        found: dict[str, set[str]] = {}
+        for table in (self._graph.publishers, self._graph.subscriptions):
+            for name, endpoints in table.items():
+                types = {one.type_name for one in endpoints if one.is_seen(self._process)}
+                found.setdefault(name, set()).update(types)
+        return [(name, sorted(types)) for name, types in sorted(found.items()) if types]
 
     def count_publishers(self, topic_name: str) -> int:
         """Return how many publishers of a topic it knows."""

@@ -27,8 +27,9 @@ from needle_verification.ros.soak.virtual_person import (
     Joystick,
     Person,
 )
+from needle_verification.ros.soak.virtual_recorder import VirtualRecorders
 from needle_verification.ros.soak.virtual_topics import VirtualGraph
-from needle_verification.soak.faults import CONSOLE
+from needle_verification.soak.faults import CONSOLE, RECORDER
 from needle_verification.soak.link_faults import LinkFaults
 from needle_verification.soak.virtual_hold import VirtualHold
 from needle_verification.soak.virtual_line import VirtualLine
@@ -74,6 +75,8 @@ class VirtualRig:
         By the name of the node in it.
     nodes : dict of str to Node
         Those that run.
+    recorders : VirtualRecorders or None
+        Those of the run, if it is recorded.
     log : list of tuple
         Steady time [ns], node, level and text of all that was logged.
     ends : list of tuple
@@ -90,6 +93,7 @@ class VirtualRig:
         self.hand, self.second_hand = Hand(), Hand()
         self.processes: dict[str, VirtualProcess] = {}
         self.nodes: dict[str, Node] = {}
+        self.recorders: VirtualRecorders | None = None
         self.log: list[tuple[int, str, str, str]] = []
         self.ends: list[tuple[int, str, str]] = []
         draw = self.world.chance("rig")
@@ -134,6 +138,11 @@ class VirtualRig:
         self.start(CONSOLE)
         self.person.page = VirtualPage(self.world, self._line, lambda: self.hand.button)
 
+    def record(self) -> None:
+        """Record all that is published from now on."""
+        self.recorders = VirtualRecorders(self.graph)
+        self.start(RECORDER)
+
     def start(self, name: str) -> None:
         """Start a node that does not run."""
         if name in self.processes and self.processes[name].alive:
@@ -167,6 +176,8 @@ class VirtualRig:
         """Let go of everything that the operating system knows of."""
         for node in self.nodes.values():
             node.context.shutdown()
+        if self.recorders is not None:
+            self.recorders.close()
 
     def _plan(
         self, name: str, process: VirtualProcess
@@ -190,6 +201,9 @@ class VirtualRig:
         if name in ("operator", SECOND_OPERATOR):
             buttons = {"key": INSERT, "retract_key": RETRACT, "stop_key": STOP}
             return {"source": "joy", **buttons}, OperatorNode
+        if name == RECORDER:
+            assert self.recorders is not None
+            return self.recorders.plan(process)
         others: dict[str, Callable[[], Node]] = {
             "stereo_tracker": partial(TrackerStandIn, self.bench),
             "joy_node": lambda: Joystick(self.hand if self.page is None else Hand()),

@@ -8,10 +8,10 @@ from typing import Any
 from rclpy.serialization import deserialize_message, serialize_message
 from rclpy.task import Future
 
+from needle_verification.ros.soak.virtual_endpoint import Endpoint
 from needle_verification.ros.soak.virtual_topics import (
     TRANSPORT_NS,
     Careful,
-    Endpoint,
     VirtualGraph,
     plainly,
 )
@@ -22,12 +22,12 @@ from needle_verification.soak.virtual_world import VirtualProcess
 class VirtualService(Endpoint):
     """rclpy's Service, as far as the nodes use it."""
 
-    def __init__(self, *place: Any, kind: type[Any], callback: Any) -> None:
+    def __init__(self, graph: VirtualGraph, *place: Any, kind: type[Any], callback: Any) -> None:
         super().__init__(*place)
         self.srv_type = kind
         self.callback = callback
         self.careful: Careful = plainly
-        self.graph.services.setdefault(self.srv_name, []).append(self)
+        graph.services.setdefault(self.srv_name, []).append(self)
 
     def answer(self, data: bytes, reply: Callable[[bytes], None]) -> None:
         """Answer a request that has come."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from functools import partial
 from types import SimpleNamespace
@@ -13,12 +13,10 @@ from typing import Any
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message, serialize_message
 
-from needle_verification.soak.invariants import DISCOVERED_WITHIN
+from needle_verification.ros.soak.virtual_endpoint import Endpoint, Sample
 from needle_verification.soak.link_faults import Delivery, LinkFaults, Way
-from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess, VirtualWorld
+from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
 
-# From an endpoint's creation until another process knows it [ns], at least and at most.
-_DISCOVERY_NS = (5_000_000, round(DISCOVERED_WITHIN * NANOSECONDS))
 TRANSPORT_NS = (50_000, 1_500_000)
 """What a message takes on its way [ns], at least and at most."""
 # From a reliable writer's sending to its sending again, where no acknowledgement came [ns].
@@ -28,7 +26,7 @@ _LEASE_NS = 8_000_000_000
 
 
 Watcher = Callable[[str, Any], None]
-Listener = Callable[[bytes], None]
+Listener = Callable[[str, Sample], None]
 Careful = Callable[[Callable[[], None]], None]
 """Calls back; a node sets its own, which knows what to do with a failure."""
 
@@ -36,62 +34,6 @@ Careful = Callable[[Callable[[], None]], None]
 def plainly(act: Callable[[], None]) -> None:
     """Call back where no node has set its own."""
     act()
-
-
-class Endpoint:
-    """A node's publisher, subscription, service or client, as others find it.
-
-    Parameters
-    ----------
-    graph : VirtualGraph
-        Where it is.
-    process : VirtualProcess
-        Whose it is.
-    node_name : str
-        Its node's full name.
-    name : str
-        Topic or service.
-    qos : QoSProfile, optional
-        As created; a service has none.
-    """
-
-    def __init__(
-        self,
-        graph: VirtualGraph,
-        process: VirtualProcess,
-        node_name: str,
-        name: str,
-        qos: Any = None,
-    ) -> None:
-        self.graph = graph
-        self.process = process
-        self.node_name = node_name
-        self.topic_name = self.topic = self.srv_name = name
-        self.qos_profile = qos
-        self.created_ns = graph.world.steady_ns
-        self.gone_ns: int | None = None
-        self._known_ns: dict[VirtualProcess, int] = {process: self.created_ns}
-
-    def known_ns(self, process: VirtualProcess) -> int:
-        """Return when a process comes to know it, steady clock [ns]."""
-        if process not in self._known_ns:
-            found = "discovery", self.node_name, self.topic_name, process.name
-            late_ns = self.graph.world.chance(*found).randint(*_DISCOVERY_NS)
-            self._known_ns[process] = max(self.created_ns, process.started_ns) + late_ns
-        return self._known_ns[process]
-
-    def is_seen(self, process: VirtualProcess) -> bool:
-        """Return whether a process takes it for there."""
-        now = self.graph.world.steady_ns
-        return (self.gone_ns is None or now < self.gone_ns) and self.known_ns(process) <= now
-
-    @property
-    def info(self) -> SimpleNamespace:
-        """Answer of rclpy's `get_*_info_by_topic` about it."""
-        namespace, _, name = self.node_name.rpartition("/")
-        return SimpleNamespace(
-            node_name=name, node_namespace=namespace or "/", qos_profile=self.qos_profile
-        )
 
 
 class VirtualGraph:
@@ -108,13 +50,16 @@ class VirtualGraph:
     ----------
     digest : hashlib hash
         Of all that was published and called: by whom, when, how long.
+    overflows : Counter of tuple of str
+        Messages that a node's queue had no room for, by the node's full name and the topic.
     """
 
     def __init__(self, world: VirtualWorld, faults: LinkFaults) -> None:
         self.world = world
         self.faults = faults
         self.digest = hashlib.sha256()
-        self._listeners: dict[tuple[str, str], Listener] = {}
+        self.overflows: Counter[tuple[str, str]] = Counter()
+        self._listeners: dict[str, Listener] = {}
         self._watchers: dict[str, list[Watcher]] = {}
         self.publishers: dict[str, list[VirtualPublisher]] = {}
         self.subscriptions: dict[str, list[VirtualSubscription]] = {}
@@ -124,15 +69,15 @@ class VirtualGraph:
         """Call `watcher` with the node's full name and the message, whenever one is published."""
         self._watchers.setdefault(topic, []).append(watcher)
 
-    def listen_at(self, node_name: str, topic: str, listener: Listener) -> None:
-        """Call `listener` with the bytes of each message of a topic when a node takes it."""
-        self._listeners[node_name, topic] = listener
+    def listen_at(self, node_name: str, listener: Listener) -> None:
+        """Call `listener` with the topic of each message that a node takes, and the message."""
+        self._listeners[node_name] = listener
 
-    def take(self, node_name: str, topic: str, data: bytes) -> None:
+    def take(self, node_name: str, topic: str, sample: Sample) -> None:
         """Show a message that a node takes."""
-        listener = self._listeners.get((node_name, topic))
+        listener = self._listeners.get(node_name)
         if listener is not None:
-            listener(data)
+            listener(topic, sample)
 
     def show(self, topic: str, node_name: str, message: Any) -> None:
         """Show a message to who watches its topic."""
@@ -152,13 +97,16 @@ class VirtualGraph:
 class VirtualPublisher(Endpoint):
     """rclpy's Publisher, as far as the nodes use it."""
 
-    def __init__(self, *place: Any, kind: type[Any]) -> None:
+    def __init__(self, graph: VirtualGraph, *place: Any, kind: type[Any]) -> None:
         super().__init__(*place)
+        self.graph = graph
         self.msg_type = kind
-        self._kept: deque[bytes] = deque(maxlen=self.qos_profile.depth)
+        self._kept: deque[Sample] = deque(maxlen=self.qos_profile.depth)
+        self._count = 0
+        self._last_ns = 0
         self._arrivals: dict[VirtualSubscription, int] = {}
         self._ways: dict[VirtualSubscription, Way] = {}
-        self._unacknowledged: dict[VirtualSubscription, deque[tuple[bytes, int]]] = {}
+        self._unacknowledged: dict[VirtualSubscription, deque[Sample]] = {}
         self.graph.publishers.setdefault(self.topic_name, []).append(self)
         for subscription in self.graph.subscriptions.get(self.topic_name, ()):
             self.send_latched(subscription)
@@ -172,6 +120,7 @@ class VirtualPublisher(Endpoint):
         # Not the bytes: what fills them up between two fields is whatever lay in memory.
         graph.digest.update(f"{now} {self.node_name} {self.topic_name}\n".encode())
         graph.show(self.topic_name, self.node_name, message)
+        self._count += 1
         readers = [
             subscription
             for subscription in graph.subscriptions.get(self.topic_name, ())
@@ -181,10 +130,14 @@ class VirtualPublisher(Endpoint):
         if not (readers or latched):
             return
         data = message if isinstance(message, bytes) else serialize_message(message)
+        # A callback takes no time here, and two messages never have one time elsewhere.
+        sent_ns = graph.world.system_ns
+        self._last_ns = sent_ns + 1 if sent_ns == self._last_ns else sent_ns
+        sample = Sample(data, self._last_ns, self._count)
         if latched:
-            self._kept.append(data)
+            self._kept.append(sample)
         for subscription in readers:
-            self._send(subscription, data)
+            self._send(subscription, sample)
 
     def get_subscription_count(self) -> int:
         """Return how many subscriptions it knows."""
@@ -198,8 +151,8 @@ class VirtualPublisher(Endpoint):
 
         def send() -> None:
             if self.process.alive:
-                for data in self._kept:
-                    self._send(subscription, data)
+                for sample in self._kept:
+                    self._send(subscription, sample)
 
         self.graph.world.call_at(self._matched_ns(subscription) - 1, send)
 
@@ -213,14 +166,13 @@ class VirtualPublisher(Endpoint):
             return False
         return not _is_latched(asked) or _is_latched(offered)
 
-    def _send(self, subscription: VirtualSubscription, data: bytes) -> None:
+    def _send(self, subscription: VirtualSubscription, sample: Sample) -> None:
         """Send a message, or queue it behind what a reliable reader has not acknowledged yet."""
-        sent = data, self.graph.world.system_ns
         if not self._is_reliable(subscription):
-            self._put_on_link(subscription, *sent)
+            self._put_on_link(subscription, sample)
             return
         waiting = self._unacknowledged.setdefault(subscription, deque(maxlen=self._history))
-        waiting.append(sent)
+        waiting.append(sample)
         if len(waiting) == 1:
             self._send_waiting(subscription)
 
@@ -228,7 +180,7 @@ class VirtualPublisher(Endpoint):
         """Send in order; what the link loses is sent again, unless newer ones took its place."""
         waiting = self._unacknowledged[subscription]
         while waiting:
-            if not self._put_on_link(subscription, *waiting[0]):
+            if not self._put_on_link(subscription, waiting[0]):
                 world = self.graph.world
                 again = partial(self._send_again, subscription)
                 late_ns = self._way(subscription).faults.randint(*_RESEND_NS)
@@ -248,21 +200,19 @@ class VirtualPublisher(Endpoint):
         both = self.qos_profile, subscription.qos_profile
         return all(one.reliability == ReliabilityPolicy.RELIABLE for one in both)
 
-    def _put_on_link(self, subscription: VirtualSubscription, data: bytes, sent_ns: int) -> bool:
+    def _put_on_link(self, subscription: VirtualSubscription, sample: Sample) -> bool:
         """Send a message once; returns whether it arrives."""
         world = self.graph.world
         way = self._way(subscription)
-        deliveries = self.graph.faults.deliveries(self.topic_name, data, way)
+        deliveries = self.graph.faults.deliveries(self.topic_name, sample.data, way)
         for delivery in deliveries:
             arrival = world.steady_ns + way.takes_ns() + delivery.late_ns
             if self._keeps_order(delivery, subscription):
                 arrival = max(arrival, self._arrivals.get(subscription, 0))
                 self._arrivals[subscription] = arrival
 
-            def arrive(data: bytes = delivery.data, sent_ns: int = sent_ns) -> None:
-                subscription.arrive(data, sent_ns)
-
-            world.call_at(arrival, arrive)
+            arrived = sample._replace(data=delivery.data)
+            world.call_at(arrival, partial(subscription.arrive, arrived))
         return bool(deliveries)
 
     def _keeps_order(self, delivery: Delivery, subscription: VirtualSubscription) -> bool:
@@ -279,28 +229,47 @@ class VirtualPublisher(Endpoint):
 class VirtualSubscription(Endpoint):
     """rclpy's Subscription, as far as the nodes use it; its own handle, too."""
 
-    def __init__(self, *place: Any, kind: type[Any], callback: Any, raw: bool) -> None:
+    def __init__(
+        self,
+        graph: VirtualGraph,
+        *place: Any,
+        kind: type[Any],
+        callback: Any,
+        raw: bool,
+        on_lost: Any = None,
+    ) -> None:
         super().__init__(*place)
+        self.graph = graph
         self.msg_type = kind
         self.callback = callback
         self._raw = raw
+        self._on_lost = on_lost
+        self._lost = 0
         self._with_info = _takes_two(callback)
-        self._queue: deque[tuple[bytes, int]] = deque()
+        self._queue: deque[Sample] = deque()
         self.careful: Careful = plainly
         self.handle = self
         self.graph.subscriptions.setdefault(self.topic_name, []).append(self)
         for publisher in self.graph.publishers.get(self.topic_name, ()):
             publisher.send_latched(self)
 
-    def arrive(self, data: bytes, sent_ns: int) -> None:
+    def arrive(self, sample: Sample) -> None:
         """Queue a message; the oldest gives way where there is no room."""
         if not self.process.alive or self.gone_ns is not None:
             return
         if len(self._queue) >= self.qos_profile.depth:
             self._queue.popleft()
+            self._lose_one()
         else:
             self.process.do(self._take_next)
-        self._queue.append((data, sent_ns))
+        self._queue.append(sample)
+
+    def _lose_one(self) -> None:
+        self.graph.overflows[self.node_name, self.topic_name] += 1
+        self._lost += 1
+        if self._on_lost is not None:
+            event = SimpleNamespace(total_count=self._lost)
+            self.process.do(partial(self._on_lost, event))
 
     def get_publisher_count(self) -> int:
         """Return how many publishers it knows."""
@@ -318,24 +287,28 @@ class VirtualSubscription(Endpoint):
         assert raw
         if not self._queue:
             return None
-        data, sent_ns = self._take()
-        return data, self._info(sent_ns)
+        sample = self._take()
+        return sample.data, self._info(sample)
 
     def _take_next(self) -> None:
         if not self._queue or self.gone_ns is not None:
             return
-        data, sent_ns = self._take()
-        message = data if self._raw else deserialize_message(data, self.msg_type)
-        arguments = (message, self._info(sent_ns)) if self._with_info else (message,)
+        sample = self._take()
+        message = sample.data if self._raw else deserialize_message(sample.data, self.msg_type)
+        arguments = (message, self._info(sample)) if self._with_info else (message,)
         self.careful(lambda: self.callback(*arguments))
 
-    def _take(self) -> tuple[bytes, int]:
-        data, sent_ns = self._queue.popleft()
-        self.graph.take(self.node_name, self.topic_name, data)
-        return data, sent_ns
+    def _take(self) -> Sample:
+        sample = self._queue.popleft()
+        self.graph.take(self.node_name, self.topic_name, sample)
+        return sample
 
-    def _info(self, sent_ns: int) -> dict[str, int]:
-        return {"source_timestamp": sent_ns, "received_timestamp": self.graph.world.system_ns}
+    def _info(self, sample: Sample) -> dict[str, int]:
+        return {
+            "source_timestamp": sample.sent_ns,
+            "received_timestamp": self.graph.world.system_ns,
+            "publication_sequence_number": sample.number,
+        }
 
 
 def _is_latched(qos: QoSProfile) -> bool:
