@@ -6,6 +6,7 @@ import io
 import os
 import shutil
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -85,11 +86,8 @@ class DiskUser:
     def open_recording(self, directory: Path, *, reserve: int, **settings: Any) -> Recording:
         """Begin a recording, as `needle_bags` does, that this disk may spoil."""
         del reserve
-        bag = _Bag(self, directory, **settings)
-        worker = _DiskWorker
-        self.recording = Recording(
-            bag, _Space(self.disk), lambda step: worker(self, step), WAITING_LIMIT
-        )
+        bag, space = _Bag(self, directory, **settings), _Space(self.disk)
+        self.recording = Recording(bag, space, partial(_DiskWorker, self), WAITING_LIMIT)
         return self.recording
 
     def open_file(self, path: Path) -> IO[bytes]:

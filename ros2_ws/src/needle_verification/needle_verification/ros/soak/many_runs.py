@@ -27,7 +27,12 @@ def results_here(seeds: range) -> Iterator[RunResult]:
         return
     # Fresh interpreters: a fork would share what numerical libraries keep for their threads.
     workers = min(len(seeds), os.cpu_count() or 1)
-    with multiprocessing.get_context("spawn").Pool(workers, _begin_worker) as pool:
+    context = multiprocessing.get_context("spawn")
+    # Where a worker that is ended in mid-run leaves nothing behind.
+    with (
+        tempfile.TemporaryDirectory(prefix="needle_soak_") as folder,
+        context.Pool(workers, _begin_worker, (folder,)) as pool,
+    ):
         yield from pool.imap(_run_seed, seeds)
 
 
@@ -53,7 +58,8 @@ def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResul
             yield result
 
 
-def _begin_worker() -> None:
+def _begin_worker(folder: str) -> None:
+    tempfile.tempdir = folder
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
