@@ -35,6 +35,7 @@ def test_what_falls_short_is_a_miss(
     change: dict[str, float], passed: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     good = {"moving": 1.0, "last_motion_ms": 120.0, "distance_mm": 0.5, "resumed_mm": 0.0}
+    good["silent_ms"] = 20.0
     monkeypatch.setattr(check_hold_sources, "trial_outcomes", lambda *_: [good, {**good, **change}])
     findings = check_hold_sources.hold_sources(Workbench([], tmp_path), 2)
     assert [finding.passed for finding in findings] == [passed] * len(check_hold_sources.WHAT)

@@ -86,6 +86,7 @@ def _lose(hand: HeldSource, witness: HoldWitness, rng: random.Random) -> dict[st
         "last_motion_ms": (last - lost) * 1e3,
         "distance_mm": witness.way(lost, back) * 1e3,
         "resumed_mm": witness.way(back, math.inf) * 1e3,
+        "silent_ms": witness.longest_silence(lost - RECENT, math.inf) * 1e3,
     }
 
 

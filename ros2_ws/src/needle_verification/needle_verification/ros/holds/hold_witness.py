@@ -110,6 +110,11 @@ class HoldWitness(ListeningNode):
         """Return how far the needle moved in a time, to and fro [m]."""
         return sum(way for _, way in self._motions(begin, end))
 
+    def longest_silence(self, begin: float, end: float) -> float:
+        """Return the longest that the rig said nothing in a time [s]: it stood still itself."""
+        told = [at.time for at in self.places if begin < at.time <= end]
+        return max((after - before for before, after in itertools.pairwise(told)), default=0.0)
+
     def _motions(self, begin: float, end: float) -> Iterator[tuple[Place, float]]:
         """Yield each place of a time that is another than that before, and how far from it."""
         for before, after in itertools.pairwise(self.places):
