@@ -14,6 +14,7 @@ from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.free_space import FreeSpace
 from needle_bags.recording.recording import Recording
 from needle_bags.recording.worker import Step
+from needle_verification.soak.virtual_timers import VirtualAlarm
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 # What a step of the recording takes [ns], at least and at most.
@@ -141,7 +142,7 @@ class _DiskWorker:
         self._chance = self._world.chance("disk", user.process.name)
         self._free_ns = self._world.steady_ns
         self._planned_ns: int | None = None
-        self._plans = 0
+        self._alarm = VirtualAlarm(self._world, user.process.do_concurrently, self._take)
         self.ring()
 
     def ring(self) -> None:
@@ -150,7 +151,7 @@ class _DiskWorker:
 
     def finish(self) -> None:
         """Take all steps at once: who waits for the end does nothing meanwhile."""
-        self._plans += 1
+        self._alarm.cancel()
         while self._step() is not None:
             pass
 
@@ -159,15 +160,7 @@ class _DiskWorker:
         if self._planned_ns is not None and self._planned_ns <= due_ns:
             return
         self._planned_ns = due_ns
-        self._plans += 1
-        this = self._plans
-
-        def take() -> None:
-            # Another plan has come in between.
-            if this == self._plans:
-                self._take()
-
-        self._world.call_at(due_ns, lambda: self._user.process.do_concurrently(take))
+        self._alarm.set(due_ns)
 
     def _take(self) -> None:
         self._planned_ns = None

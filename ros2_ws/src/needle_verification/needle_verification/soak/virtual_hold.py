@@ -11,6 +11,7 @@ from needle_console.hold.hold_talk import PERIOD, HoldTalk
 from needle_console.hold.page_message import GarbageError, read_token
 from needle_console.hold.refusals import Refusal
 from needle_verification.soak.virtual_line import Connection, VirtualLine
+from needle_verification.soak.virtual_timers import VirtualAlarm
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 _PERIOD_NS = round(PERIOD * NANOSECONDS)
@@ -47,7 +48,7 @@ class VirtualHold:
         )
         self._line = line
         self._connections: list[_Served] = []
-        self._looks = 0
+        self._alarm = VirtualAlarm(process.world, process.do_concurrently, self.look)
 
     @property
     def is_alive(self) -> bool:
@@ -72,18 +73,9 @@ class VirtualHold:
     def look(self) -> None:
         """Hand on the hold, and plan to look again."""
         world = self.process.world
-        self._looks += 1
-        this = self._looks
         again_ns = math.ceil(self.talk.look(world.steady) * NANOSECONDS)
-
-        def look_again() -> None:
-            # Another look has come in between, and has planned its own.
-            if this == self._looks:
-                self.look()
-
         # Time in seconds is rounded: a look that is due by less than that would not end.
-        due_ns = max(again_ns, world.steady_ns + 1)
-        world.call_at(due_ns, lambda: self.process.do_concurrently(look_again))
+        self._alarm.set(max(again_ns, world.steady_ns + 1))
 
     def _accept(self, connection: Connection) -> _Served:
         served = _Served(self, connection)

@@ -1,45 +1,75 @@
-"""Timers and bells of a virtual process."""
+"""Alarms, timers and bells of a virtual process."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import Any
 
-from needle_verification.soak.virtual_world import VirtualProcess
+from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
+
+
+class VirtualAlarm:
+    """Goes off once when it is due; set anew, it forgets when it was due before.
+
+    Parameters
+    ----------
+    world : VirtualWorld
+        Its time.
+    run : callable
+        Runs what is due: the process' `do`, or `do_concurrently` as beside its thread.
+    action : callable
+        What is due.
+    """
+
+    def __init__(
+        self,
+        world: VirtualWorld,
+        run: Callable[[Callable[[], None]], None],
+        action: Callable[[], None],
+    ) -> None:
+        self._world = world
+        self._run = run
+        self._action = action
+        self._count = 0
+
+    def set(self, due_ns: int) -> None:
+        """Go off when the steady clock shows `due_ns` [ns]."""
+        self._count += 1
+        this = self._count
+
+        def go_off() -> None:
+            if this == self._count:
+                self._action()
+
+        self._world.call_at(due_ns, lambda: self._run(go_off))
+
+    def cancel(self) -> None:
+        """Do not go off until it is set again."""
+        self._count += 1
 
 
 class VirtualTimer:
     """rclpy's Timer: late calls are skipped, not made up for."""
 
     def __init__(self, process: VirtualProcess, period_ns: int, callback: Any) -> None:
-        self._process = process
         self._world = process.world
         self.timer_period_ns = period_ns
         self._callback = callback
-        self._canceled = False
+        self._alarm = VirtualAlarm(self._world, process.do, self._call)
         self._due = 0
-        self._generation = 0
-        self._arm(self._world.steady_ns + period_ns)
+        self.reset()
 
     def cancel(self) -> None:
         """Do not call back until `reset`."""
-        self._canceled = True
+        self._alarm.cancel()
 
     def reset(self) -> None:
         """Begin the period anew."""
-        self._canceled = False
         self._arm(self._world.steady_ns + self.timer_period_ns)
 
     def _arm(self, due_ns: int) -> None:
         self._due = due_ns
-        self._generation += 1
-        generation = self._generation
-
-        def call() -> None:
-            if generation == self._generation and not self._canceled:
-                self._call()
-
-        self._world.call_at(due_ns, lambda: self._process.do(call))
+        self._alarm.set(due_ns)
 
     def _call(self) -> None:
         behind = self._world.steady_ns - self._due

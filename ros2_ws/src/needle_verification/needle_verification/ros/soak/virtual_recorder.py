@@ -6,7 +6,6 @@ import contextlib
 import io
 from collections import Counter
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from needle_bags.ros.recorder import Recorder
@@ -50,7 +49,7 @@ class VirtualRecorders:
             one.witness.take(world.steady_ns, topic, sample.sent_ns, sample.number)
 
         self._graph.listen_at(_NAME, hear)
-        return {"bag": str(bag)}, partial(one.make, lambda: world.steady_ns)
+        return {"bag": str(bag)}, one.make
 
     @property
     def bytes_waiting(self) -> int:
@@ -98,12 +97,12 @@ class _Recorder:
     def runs(self) -> bool:
         return self._node is not None
 
-    def make(self, now_ns: Callable[[], int]) -> Recorder:
+    def make(self) -> Recorder:
         node = self._node = Recorder(self.user.open_recording)
 
         def end() -> None:
             if self.runs:
-                self._node, self.killed_ns = None, now_ns()
+                self._node, self.killed_ns = None, self.user.process.world.steady_ns
             self.user.cut()
 
         node.context.on_shutdown(end)
