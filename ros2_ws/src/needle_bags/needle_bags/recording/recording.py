@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import dataclasses
 import time
@@ -17,7 +16,7 @@ from needle_bags.format.bag_writer import (
     refuse_existing_bag,
 )
 from needle_bags.recording.free_space import FreeSpace, megabytes
-from needle_bags.recording.worker import Step, Worker, WorkerThread
+from needle_bags.recording.worker import Do, Job, Worker, WorkerThread
 from needle_common.errors import UserError
 from needle_common.files.bag_topic import BagTopic
 
@@ -74,7 +73,7 @@ class Recording:
     space : FreeSpace
         Of its disk: where none is left the recording ends in order.
     make_worker : callable
-        Makes the worker from what does one step.
+        Makes the worker from what does a job and what comes at the end.
     waiting_limit : int
         What waits for a slow disk at most [B], but for an eighth more of what is small; what is
         beyond is dropped, and counted.
@@ -93,14 +92,12 @@ class Recording:
         self,
         bag: BagWriter,
         space: FreeSpace,
-        make_worker: Callable[[Step], Worker] = WorkerThread,
+        make_worker: Callable[[Do, Job], Worker] = WorkerThread,
         waiting_limit: int = WAITING_LIMIT,
     ) -> None:
         self.space = space
         self._bag = bag
         self._waiting_limit = waiting_limit
-        self._jobs: collections.deque[Callable[[], None]] = collections.deque()
-        self._end_wanted = False
         self._numbers: dict[str, int] = {}
         self.error: str | None = None
         self.is_whole = False
@@ -110,12 +107,12 @@ class Recording:
         self._bytes_done = 0
         self._looked_at = self._flushed = 0
         self._next_flush = time.monotonic() + FLUSH_PERIOD
-        self._worker = make_worker(self._step)
+        self._worker = make_worker(self._do, self._end)
 
     @property
     def messages_waiting(self) -> int:
         """Messages received that the worker has not taken yet."""
-        return len(self._jobs)
+        return self._worker.waiting
 
     @property
     def bytes_waiting(self) -> int:
@@ -143,7 +140,7 @@ class Recording:
                 continue
             self.bytes_received += len(message.data)
             self.messages_received += 1
-            self._queue(lambda message=message: self._write(message))  # type: ignore[misc]
+            self._worker.put(lambda message=message: self._write(message))  # type: ignore[misc]
 
     def add_record(self, name: str, values: dict[str, str]) -> None:
         """Queue a metadata record, kept in the MCAP file as soon as it is known."""
@@ -155,20 +152,15 @@ class Recording:
 
     def set_custom_data(self, key: str, value: str) -> None:
         """Queue a text for metadata.yaml's `custom_data`."""
-        self._queue(lambda: self._bag.set_custom_data(key, value))
+        self._worker.put(lambda: self._bag.set_custom_data(key, value))
 
     def close(self) -> None:
         """Write all that waits, then index and metadata; `error` tells how it went."""
-        self._end_wanted = True
         self._worker.finish()
 
-    def _put(self, job: Callable[[], None]) -> None:
+    def _put(self, job: Job) -> None:
         """Queue what can be done only while data is written."""
-        self._queue(lambda: job() if self.error is None else None)
-
-    def _queue(self, job: Callable[[], None]) -> None:
-        self._jobs.append(job)
-        self._worker.ring()
+        self._worker.put(lambda: job() if self.error is None else None)
 
     def _add_topic(self, topic: BagTopic) -> None:
         self._numbers[topic.name] = self._bag.add_topic(topic)
@@ -194,30 +186,15 @@ class Recording:
     def _drop(self, topic: str) -> None:
         self.dropped[topic] = self.dropped.get(topic, 0) + 1
 
-    def _step(self) -> float | None:
-        """Do the next job, and what the disk needs; `Step` says what is returned.
-
-        After an early end what waits, or still arrives, is counted as dropped.
-        """
-        # Looked at first: all that had to be queued before the end is then in the queue.
-        is_last = self._end_wanted
-        job = self._jobs.popleft() if self._jobs else _nothing
+    def _do(self, job: Job) -> float:
+        """Do a job, and what the disk needs; after an early end messages are counted as dropped."""
         if self.error is None:
-            self._do(job)
+            self._write_on(job)
         else:
             job()
-        if self._jobs:
-            return time.monotonic()
-        if not is_last:
-            return self._next_flush if self.error is None else time.monotonic() + FLUSH_PERIOD
-        if self.error is None:
-            self._complete()
-        elif self.is_whole:
-            with contextlib.suppress(BagWriteError):
-                self._bag.update_metadata()
-        return None
+        return self._next_flush if self.error is None else time.monotonic() + FLUSH_PERIOD
 
-    def _do(self, job: Callable[[], None]) -> None:
+    def _write_on(self, job: Job) -> None:
         try:
             job()
             self._tend_disk()
@@ -245,6 +222,13 @@ class Recording:
             self._bag.flush()
             self._flushed = self._bytes_done
             self._next_flush = time.monotonic() + FLUSH_PERIOD
+
+    def _end(self) -> None:
+        if self.error is None:
+            self._complete()
+        elif self.is_whole:
+            with contextlib.suppress(BagWriteError):
+                self._bag.update_metadata()
 
     def _complete(self) -> None:
         try:
@@ -299,10 +283,6 @@ def open_recording(
         compression=compression,
     )
     return Recording(bag, space)
-
-
-def _nothing() -> None:
-    """Do nothing: no job waits."""
 
 
 def _space(directory: Path, reserve: int) -> FreeSpace:

@@ -1,24 +1,35 @@
-"""A worker beside its owner: does one step after the other until there is none."""
+"""A worker beside its owner: does one job after the other, in the order in which they came."""
 
 from __future__ import annotations
 
+import queue
 import threading
 import time
 from collections.abc import Callable
 from typing import Protocol
 
-Step = Callable[[], float | None]
-"""Does one thing; returns when the next is due by itself, steady clock [s]; None: there is none."""
+Job = Callable[[], None]
+Do = Callable[[Job], float]
+"""Does a job; returns when it wants to be called at the latest, be it for `nothing`, steady clock
+[s]."""
+
+
+def nothing() -> None:
+    """Do nothing: the job of who is called for the time alone."""
 
 
 class Worker(Protocol):
-    """Takes steps, each when it is due or when the bell rings."""
+    """Hands jobs on, each as soon as the one before is done."""
 
-    def ring(self) -> None:
-        """Have it take its next step at once."""
+    @property
+    def waiting(self) -> int:
+        """Jobs that have not been taken yet."""
+
+    def put(self, job: Job) -> None:
+        """Queue a job."""
 
     def finish(self) -> None:
-        """Ring, and return after the last step."""
+        """Return when all jobs, and what comes at the end, are done."""
 
 
 class WorkerThread:
@@ -26,29 +37,41 @@ class WorkerThread:
 
     Parameters
     ----------
-    step : Step
-        What it does.
+    do : Do
+        Does its jobs.
+    end : callable
+        Called once, after the last.
     """
 
-    def __init__(self, step: Step) -> None:
-        self._step = step
-        self._bell = threading.Event()
+    def __init__(self, do: Do, end: Callable[[], None]) -> None:
+        self._do = do
+        self._end = end
+        self._jobs: queue.SimpleQueue[Job | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run, name="worker")
         self._thread.start()
 
-    def ring(self) -> None:
-        """Have it take its next step at once."""
-        self._bell.set()
+    @property
+    def waiting(self) -> int:
+        """Jobs that have not been taken yet."""
+        return self._jobs.qsize()
+
+    def put(self, job: Job) -> None:
+        """Queue a job."""
+        self._jobs.put(job)
 
     def finish(self) -> None:
-        """Ring, and return after the last step."""
-        self._bell.set()
+        """Return when all jobs, and what comes at the end, are done."""
+        self._jobs.put(None)
         self._thread.join()
 
     def _run(self) -> None:
-        while (due := self._step()) is not None:
-            wait = due - time.monotonic()
-            if wait > 0.0:
-                self._bell.wait(wait)
-            # Before the step: what rings from now on is seen by it, or by the next.
-            self._bell.clear()
+        due = self._do(nothing)
+        while True:
+            try:
+                job = self._jobs.get(timeout=max(0.0, due - time.monotonic()))
+            except queue.Empty:
+                job = nothing
+            if job is None:
+                self._end()
+                return
+            due = self._do(job)

@@ -1,59 +1,60 @@
-"""A worker takes a step when it is due or the bell rings, and none after the last."""
+"""A worker does its jobs in order, looks when it is time to, and ends after the last."""
 
 from __future__ import annotations
 
 import threading
 import time
 
-from needle_bags.recording.worker import WorkerThread
+from needle_bags.recording.worker import Job, WorkerThread, nothing
 
 LONG = 3600.0
 
 
-def test_the_bell_ends_a_wait() -> None:
-    begun, rung = threading.Event(), threading.Event()
+def test_a_job_ends_the_wait_for_what_is_due() -> None:
+    begun, done = threading.Event(), threading.Event()
 
-    def step() -> float | None:
-        if not begun.is_set():
-            begun.set()
-            return time.monotonic() + LONG
-        rung.set()
-        return None
+    def do(job: Job) -> float:
+        job()
+        begun.set()
+        return time.monotonic() + LONG
 
-    worker = WorkerThread(step)
+    worker = WorkerThread(do, nothing)
     assert begun.wait(20.0)
-    worker.ring()
-    assert rung.wait(20.0)
+    worker.put(done.set)
+    assert done.wait(20.0)
     worker.finish()
 
 
-def test_what_is_due_needs_no_bell() -> None:
-    steps = iter((0.0, time.monotonic() + 0.01, None))
+def test_what_is_due_needs_no_job() -> None:
+    looks: list[Job] = []
     over = threading.Event()
 
-    def step() -> float | None:
-        due = next(steps)
-        if due is None:
+    def do(job: Job) -> float:
+        looks.append(job)
+        if len(looks) == 3:
             over.set()
-        return due
+        return time.monotonic() + (LONG if over.is_set() else 0.01)
 
-    worker = WorkerThread(step)
+    worker = WorkerThread(do, nothing)
     assert over.wait(20.0)
+    assert set(looks) == {nothing}
     worker.finish()
 
 
-def test_finish_waits_for_the_last_step() -> None:
-    ends, left = threading.Event(), list(range(5))
+def test_finish_waits_for_all_jobs_and_the_end() -> None:
+    done: list[str] = []
 
-    def step() -> float | None:
-        if not ends.is_set():
-            return time.monotonic() + LONG
-        left.pop()
-        return time.monotonic() if left else None
+    def do(job: Job) -> float:
+        job()
+        return time.monotonic() + LONG
 
-    worker = WorkerThread(step)
-    ends.set()
+    worker = WorkerThread(do, lambda: done.append("end"))
+    names = [f"job {number}" for number in range(5)]
+    for name in names:
+        worker.put(lambda name=name: done.append(name))  # type: ignore[misc]
     worker.finish()
-    assert not left
+    assert done == [*names, "end"]
+    assert not worker.waiting
     # Asked for again it has nothing to do.
     worker.finish()
+    assert done[-2:] == [names[-1], "end"]

@@ -6,6 +6,7 @@ import io
 import os
 import shutil
 import tempfile
+from collections import deque
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -13,12 +14,12 @@ from typing import IO, Any
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.free_space import FreeSpace
 from needle_bags.recording.recording import Recording
-from needle_bags.recording.worker import Step
+from needle_bags.recording.worker import Do, Job, nothing
 from needle_verification.soak.virtual_timers import VirtualAlarm
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
-# What a step of the recording takes [ns], at least and at most.
-_STEP_NS = (2_000, 40_000)
+# What a job of the recording takes [ns], at least and at most.
+_JOB_NS = (2_000, 40_000)
 # A recording ends in order where no more is left [B].
 _RESERVE = 1_000_000
 ROOM = 10**9
@@ -41,7 +42,7 @@ class VirtualDisk:
     stands_still : bool
         Whether no write ends.
     slowness_ns : int
-        What each step takes longer [ns].
+        What each job takes longer [ns].
     """
 
     def __init__(self) -> None:
@@ -133,27 +134,36 @@ class _Space(FreeSpace):
 
 
 class _DiskWorker:
-    """Takes the steps of a recording beside the node's own thread, each in its time."""
+    """Does the jobs of a recording beside the node's own thread, each in its time."""
 
-    def __init__(self, user: DiskUser, step: Step) -> None:
+    def __init__(self, user: DiskUser, do: Do, end: Job) -> None:
         self._user = user
-        self._step = step
+        self._do = do
+        self._end = end
+        self._jobs: deque[Job] = deque()
         self._world = user.process.world
         self._chance = self._world.chance("disk", user.process.name)
         self._free_ns = self._world.steady_ns
         self._planned_ns: int | None = None
         self._alarm = VirtualAlarm(self._world, user.process.do_concurrently, self._take)
-        self.ring()
+        self._plan(self._free_ns)
 
-    def ring(self) -> None:
-        """Take the next step as soon as the one before has ended."""
+    @property
+    def waiting(self) -> int:
+        """Jobs that have not been taken yet."""
+        return len(self._jobs)
+
+    def put(self, job: Job) -> None:
+        """Queue a job."""
+        self._jobs.append(job)
         self._plan(self._world.steady_ns)
 
     def finish(self) -> None:
-        """Take all steps at once: who waits for the end does nothing meanwhile."""
+        """Do all at once: who waits for the end does nothing meanwhile."""
         self._alarm.cancel()
-        while self._step() is not None:
-            pass
+        while self._jobs:
+            self._do(self._jobs.popleft())
+        self._end()
 
     def _plan(self, due_ns: int) -> None:
         due_ns = max(due_ns, self._free_ns)
@@ -168,8 +178,8 @@ class _DiskWorker:
         if disk.stands_still:
             self._plan(world.steady_ns + _LOOK_NS)
             return
-        self._free_ns = world.steady_ns + self._chance.randint(*_STEP_NS) + disk.slowness_ns
-        due = self._step()
-        if due is not None:
-            # Time in seconds is rounded: what is due by less than that would not end.
-            self._plan(max(round(due * NANOSECONDS), world.steady_ns + 1))
+        self._free_ns = world.steady_ns + self._chance.randint(*_JOB_NS) + disk.slowness_ns
+        due = self._do(self._jobs.popleft() if self._jobs else nothing)
+        # Time in seconds is rounded: what is due by less than that would not end.
+        due_ns = max(round(due * NANOSECONDS), world.steady_ns + 1)
+        self._plan(world.steady_ns if self._jobs else due_ns)

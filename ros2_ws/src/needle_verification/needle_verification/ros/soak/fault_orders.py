@@ -28,7 +28,7 @@ from needle_verification.soak.virtual_disk import ROOM
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
-_SLOWEST_CALLBACK_NS, _SLOWEST_STEP_NS = 50_000_000, 5_000_000
+_SLOWEST_CALLBACK_NS, _SLOWEST_JOB_NS = 50_000_000, 5_000_000
 LATEST_MESSAGE = 1.0
 """What the worst of faults delays a message by [s]."""
 _LATEST_NS = round(LATEST_MESSAGE * NANOSECONDS)
@@ -221,7 +221,7 @@ class FaultOrders:
             disk.stands_still = True
             return partial(setattr, disk, "stands_still", False)
         if fault.kind is Kind.SLOW:
-            disk.slowness_ns = round(fault.size * _SLOWEST_STEP_NS)
+            disk.slowness_ns = round(fault.size * _SLOWEST_JOB_NS)
             return partial(setattr, disk, "slowness_ns", 0)
         if fault.kind is Kind.GARBAGE:
             disk.error = errno.EIO
