@@ -151,17 +151,20 @@ def _pick(tiles: Tiles, picked: npt.NDArray[np.int64], counts: npt.NDArray[np.in
     """Write the slots of what stays, and how many of each needle do; return how many in all."""
     count = 0
     for n in range(counts.size):
-        before = count
-        for s in tiles.slot[tiles.first[n] : tiles.first[n + 1]]:
+        slots, alive = tiles.slot[tiles.first[n] : tiles.first[n + 1]], 0
+        for s in slots:
             if tiles.state[s // LANES, WEIGHT, s % LANES] > 0.0:
-                picked[count] = s
-                count += 1
-        spare = 1 + (count - before) // _ESTIMATES_PER_SPARE
-        for s in tiles.slot[tiles.first[n] : tiles.first[n + 1]]:
-            if spare > 0 and tiles.state[s // LANES, WEIGHT, s % LANES] == 0.0:
-                picked[count] = s
-                count += 1
-                spare -= 1
+                alive += 1
+        spare = 1 + alive // _ESTIMATES_PER_SPARE
+        before = count
+        # In their order, as where nothing goes: it must not depend on the other needles.
+        for s in slots:
+            has_ended = tiles.state[s // LANES, WEIGHT, s % LANES] == 0.0
+            if has_ended and spare == 0:
+                continue
+            picked[count] = s
+            count += 1
+            spare -= has_ended
         counts[n] = count - before
     return count
 

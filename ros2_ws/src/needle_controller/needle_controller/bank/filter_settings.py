@@ -83,7 +83,6 @@ class Limits(NamedTuple):
     outlier_share: float
     outlier_density: float
     jump_share: float
-    jump_variance: float
     jump_turn_variance: float
 
 
@@ -123,9 +122,10 @@ class FilterSettings:
         Share by which the variance of an expected coordinate is taken as larger than it is: a
         filter that is linear in the roll knows less than it thinks.
     jump_share : float
-        How likely a tip that looks like an outlier shows such a jump, against that it is one.
-    jump_std, jump_turn_std : float
-        How far a phantom or a tracker may be displaced [m], and turned [rad], at once.
+        How likely a tip that looks like an outlier shows that phantom or tracker were displaced,
+        against that it is one.
+    jump_turn_std : float
+        How far they may be turned at once [rad].
     initial_angle_std : float
         How well pitch and yaw at the entry are known [rad].
     entry_std : float
@@ -161,9 +161,8 @@ class FilterSettings:
     model_error: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.0001
     softness: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.00004
     mistrust: Annotated[float, Bounds(0.0, 10.0, "-")] = 0.25
-    jump_share: Annotated[float, Bounds(1e-6, 1.0, "-")] = 0.1
-    jump_std: Annotated[float, Bounds(0.0, 0.1, "m")] = 0.003
-    jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(3.0)
+    jump_share: Annotated[float, Bounds(1e-6, 1.0, "-")] = 0.2
+    jump_turn_std: Annotated[float, Bounds(0.0, 1.0, "rad")] = math.radians(2.0)
     initial_angle_std: Annotated[float, Bounds(1e-6, math.pi, "rad")] = math.radians(8.0)
     entry_std: Annotated[float, Bounds(1e-6, 0.1, "m")] = 0.0005
     orientation_drift: Annotated[float, Bounds(0.0, 100.0, "rad/sqrt(m)")] = math.sqrt(0.001)
@@ -227,7 +226,6 @@ class FilterSettings:
             outlier_share=self.outlier_share,
             outlier_density=self.outlier_reach**-3,
             jump_share=self.jump_share,
-            jump_variance=self.jump_std**2,
             jump_turn_variance=self.jump_turn_std**2,
         )
 

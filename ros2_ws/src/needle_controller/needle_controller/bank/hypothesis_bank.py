@@ -15,17 +15,28 @@ import numpy.typing as npt
 from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
     E_TURN,
+    ERROR,
     EVIDENCE,
     LANES,
     OUTLIER,
     PLACE,
+    REMAINDER,
     ROWS,
     WEIGHT,
     Tiles,
+    X,
 )
 from needle_controller.bank.filter_settings import Drift, Limits
 from needle_controller.bank.tip_motion import LARGEST_TURN, MOTION_ROWS, move
-from needle_controller.bank.tip_update import FOUND, READING_ROWS, UPDATE_ROWS, take_tip
+from needle_controller.bank.tip_update import (
+    ALONG,
+    BOUND,
+    FOUND,
+    READ,
+    READING_ROWS,
+    UPDATE_ROWS,
+    take_tip,
+)
 from needle_controller.model.arrays import Array
 
 _NEWEST_SHARE = 0.1
@@ -119,11 +130,11 @@ def correct_bank(
         take_tip(state[t], seen, noises, limits, work)
     for n in range(bank.base.size):
         if reading[n, FOUND] > 0.0:
-            _judge(bank, n, limits)
+            _judge(bank, n, reading[n], limits)
 
 
 @compiled
-def _judge(bank: Bank, n: int, limits: Limits) -> None:
+def _judge(bank: Bank, n: int, reading: Array, limits: Limits) -> None:
     """Weigh a needle's hypotheses by its tip; end what is unlikely."""
     state = bank.tiles.state
     slots = bank.tiles.slot[bank.tiles.first[n] : bank.tiles.first[n + 1]]
@@ -144,12 +155,14 @@ def _judge(bank: Bank, n: int, limits: Limits) -> None:
     bank.unexplained[n] += _NEWEST_SHARE * (refused - bank.unexplained[n])
     # None of them has more than all have.
     if limits.jump_share * refused * whole / largest > limits.smallest_weight:
-        _suspect_jumps(state, slots, limits)
+        _suspect_jumps(state, slots, reading, limits)
 
 
 @compiled
-def _suspect_jumps(state: Array, slots: npt.NDArray[np.int64], limits: Limits) -> None:
-    """Let estimates for which the tip was an outlier come back, displaced nobody knows where.
+def _suspect_jumps(
+    state: Array, slots: npt.NDArray[np.int64], reading: Array, limits: Limits
+) -> None:
+    """Let estimates for which the tip was an outlier come back, displaced to where it was seen.
 
     Each takes the place of one that has ended, likeliest first, and weighs the share of its own
     that a jump has. If the needle was not displaced it will end soon; if it was, the next tips will
@@ -172,5 +185,26 @@ def _suspect_jumps(state: Array, slots: npt.NDArray[np.int64], limits: Limits) -
             tile[row, h] = state[likeliest // LANES, row, likeliest % LANES]
         tile[WEIGHT, h] = most
         for axis in range(3):
-            tile[PLACE[axis, axis], h] += limits.jump_variance
             tile[PLACE[E_TURN + axis, E_TURN + axis], h] += limits.jump_turn_variance
+        _put_at_tip(tile, h, reading)
+
+
+@compiled
+def _put_at_tip(tile: Array, h: int, reading: Array) -> None:
+    """Let an estimate know of the needle's place what a tip says, and no more."""
+    # What the readings' directions undo: the tip is L times them, its covariance L D L^T.
+    l10, l21 = -reading[ALONG + 3], -reading[ALONG + 7]
+    l20 = l21 * l10 - reading[ALONG + 6]
+    read = reading[READ : READ + 3]
+    d = reading[BOUND : BOUND + 3] ** 2 / 3.0
+    tile[X, h] = read[0]
+    tile[X + 1, h] = l10 * read[0] + read[1]
+    tile[X + 2, h] = l20 * read[0] + l21 * read[1] + read[2]
+    for axis in range(3):
+        tile[REMAINDER + axis, h] = 0.0
+        for k in range(3, ERROR):
+            tile[PLACE[axis, k], h] = 0.0
+    tile[PLACE[0, 0], h] = d[0]
+    tile[PLACE[0, 1], h], tile[PLACE[1, 1], h] = l10 * d[0], l10 * l10 * d[0] + d[1]
+    tile[PLACE[0, 2], h], tile[PLACE[1, 2], h] = l20 * d[0], l20 * l10 * d[0] + l21 * d[1]
+    tile[PLACE[2, 2], h] = l20 * l20 * d[0] + l21 * l21 * d[1] + d[2]

@@ -11,7 +11,7 @@ from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_controller.bank.estimate_tiles import OUTLIER, PLACE, SCALE, WEIGHT, rows
+from needle_controller.bank.estimate_tiles import OUTLIER, SCALE, WEIGHT, X, covariances, rows
 from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.bank.hypotheses import (
     LASTING,
@@ -288,11 +288,29 @@ def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -
     wanted = settings.jump_share * estimates(1e-6, WEIGHT) * estimates(1e-6, OUTLIER)
     wanted = np.sort(wanted[wanted > 1.0 / settings.prune_ratio])
     weights = estimates(settings.jump_share, WEIGHT)
-    displaced = estimates(settings.jump_share, int(PLACE[0, 0])) > settings.jump_std**2
+    displaced = np.isclose(estimates(settings.jump_share, X), tips[9, 0], rtol=0.0, atol=1e-12)
     seen = np.sort(weights[displaced & (weights > 0.0)])
     # As far as there is room: the likeliest.
     assert len(seen) > 5
     np.testing.assert_allclose(seen, wanted[-len(seen) :])
+
+
+def test_what_comes_back_displaced_knows_its_place_as_well_as_the_tip() -> None:
+    turns = turns_for(20)
+    tips = path(turns)[:, :3, 3]
+    noise = 1e-8 * np.array([[4.0, 1.5, -1.0], [1.5, 3.0, 0.5], [-1.0, 0.5, 5.0]])
+    settings = FilterSettings()
+    estimator = HypothesisFilter(settings)
+    drive(estimator, turns, tips, noise)
+    seen = tips[20] + np.array([0.002, -0.001, 0.003])
+    estimator.correct(seen, noise)
+    tiles = estimator._bank.tiles
+    displaced = np.all(np.isclose(rows(tiles, X, 3), seen, atol=1e-12), axis=1)
+    assert np.count_nonzero(displaced) > 0
+    wanted = noise + np.eye(3) * settings.model_error**2
+    for covariance in covariances(tiles)[displaced]:
+        np.testing.assert_allclose(covariance[:3, :3], wanted, rtol=1e-9)
+        np.testing.assert_allclose(covariance[:3, 3:], 0.0)
 
 
 def test_learns_that_the_needle_lags_behind_the_stage() -> None:
