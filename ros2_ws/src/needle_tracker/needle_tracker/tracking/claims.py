@@ -117,10 +117,13 @@ class StagedEnd:
     ----------
     zero_sigma : float
         Standard deviation of where the stage's zero is along the needle [m].
+    margin : float
+        A shaft that is longer or shorter than the insertion by more was not seen as a whole [m].
     """
 
-    def __init__(self, zero_sigma: float) -> None:
+    def __init__(self, zero_sigma: float, margin: float) -> None:
         self._zero_variance = zero_sigma * zero_sigma
+        self._margin = margin
         self.forget()
 
     def forget(self) -> None:
@@ -145,9 +148,12 @@ class StagedEnd:
         behind = behind[(behind - tip.position) @ ahead < -_PITCH]
         if insertion is None or len(behind) < _LEAST_POINTS:
             return tip
-        self._shaft = np.vstack([behind, tip.position])
+        whole = np.vstack([behind, tip.position])
         seen = float(ahead @ tip.covariance @ ahead)
-        now = _Offset(shaft_length(self._shaft) - insertion, seen, insertion)
+        now = _Offset(shaft_length(whole) - insertion, seen, insertion)
+        if abs(now.value) > self._margin:
+            return tip
+        self._shaft = whole
         best = self._best
         if best is None or now.is_better_than(best):
             self._best = best = now

@@ -63,7 +63,8 @@ class TipTracker:
         self._claims = Claims(
             self._lines.views, widths, settings.needle_width, settings.bevel_length
         )
-        self._staged = StagedEnd(0.5 * settings.gates.reach.hole_tolerance)
+        gates = settings.gates
+        self._staged = StagedEnd(0.5 * gates.reach.hole_tolerance, gates.insertion_margin)
         face_widths = settings.bevel_length / settings.needle_width
         left, right = self._looks = (
             MapLook(widths[0], face_widths * widths[0]),
@@ -73,15 +74,13 @@ class TipTracker:
             self._lines.views, settings.hole_clearance, settings.needle_width, settings.reference
         )
         # A tip that is known badly is better than none: maps know what they do not see.
-        gates = dataclasses.replace(
-            settings.gates,
+        wider = dataclasses.replace(
+            gates,
             max_depth_sigma=CLEAR_WIDTHS * settings.needle_width,
-            max_disagreement=max(
-                settings.gates.max_disagreement, _APART_WIDTHS * settings.needle_width
-            ),
+            max_disagreement=max(gates.max_disagreement, _APART_WIDTHS * settings.needle_width),
         )
-        wider = dataclasses.replace(settings, gates=gates)
-        self._maps = StereoTracker(calibration, wider, (left, right))
+        of_maps = dataclasses.replace(settings, gates=wider)
+        self._maps = StereoTracker(calibration, of_maps, (left, right))
         self.settings = settings
         self._begin()
 

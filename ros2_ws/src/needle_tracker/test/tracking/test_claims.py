@@ -83,7 +83,7 @@ def _shaft(length: float) -> np.ndarray:
 
 
 def test_an_end_that_is_seen_badly_lies_where_the_stage_has_it() -> None:
-    staged = StagedEnd(0.25e-3)
+    staged = StagedEnd(0.25e-3, 2e-3)
     first = staged.placed(_along(0.4e-3, 0.4e-3, 0.05), _shaft(0.05), 0.05)
     # Weights are the inverse variances of a zero of 0.25 mm and an end of 0.4 mm.
     assert 0.05 - first.position[2] == pytest.approx(0.4e-3 * 25 / 89, rel=0.02)
@@ -98,7 +98,7 @@ def test_an_end_that_is_seen_badly_lies_where_the_stage_has_it() -> None:
 
 
 def test_the_end_that_was_seen_best_says_where_the_stage_has_its_zero() -> None:
-    staged = StagedEnd(0.25e-3)
+    staged = StagedEnd(0.25e-3, 2e-3)
     staged.placed(_along(0.02e-3, 0.9e-3, 0.05), _shaft(0.05), 0.05)
     hidden = staged.placed(_along(0.4e-3, 1.4e-3, 0.052), None, 0.052)
     assert 0.052 - hidden.position[2] == pytest.approx(0.9e-3, abs=0.02e-3)
@@ -112,7 +112,16 @@ def test_the_end_that_was_seen_best_says_where_the_stage_has_its_zero() -> None:
 
 
 def test_without_stage_or_shaft_a_tip_stays_as_it_is() -> None:
-    staged = StagedEnd(0.25e-3)
+    staged = StagedEnd(0.25e-3, 2e-3)
     seen = _along(0.4e-3, 0.4e-3, 0.05)
     assert staged.placed(seen, None, 0.05) is seen
     assert staged.placed(seen, _shaft(0.05), None) is seen
+
+
+def test_a_shaft_that_the_stage_cannot_have_pushed_in_moves_no_tip() -> None:
+    staged = StagedEnd(0.25e-3, 2e-3)
+    seen = _along(0.3e-3, 0.0, 0.02)
+    assert staged.placed(seen, _shaft(0.02), 0.008) is seen
+    # Nothing of it is kept: the next that fits is the first.
+    later = staged.placed(seen, _shaft(0.02), 0.02)
+    assert later.position[2] == pytest.approx(0.02, abs=0.01e-3)
