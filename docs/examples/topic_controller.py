@@ -97,8 +97,8 @@ class TopicController(Node):
         elif self.aim < DEPTH:
             self.say("STEERING", "tip")
         else:
-            self.say("DONE", "nothing")
             self.get_logger().info(f"done, {self.above * 1e3:.2f} mm above the plane")
+            self.say("DONE", "nothing")
 
 
 rclpy.init()
