@@ -4,7 +4,7 @@ import contextlib
 
 import rclpy
 from geometry_msgs.msg import PointStamped
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -36,5 +36,9 @@ class MoveTarget(Node):
 
 
 rclpy.init()
+executor = SingleThreadedExecutor()
+executor.add_node(MoveTarget())
 with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-    rclpy.spin(MoveTarget())
+    # rclpy wakes its wait before it shuts down: one without a limit may miss that it is to end.
+    while rclpy.ok():
+        executor.spin_once(timeout_sec=0.5)

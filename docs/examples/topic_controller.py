@@ -11,7 +11,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PointStamped
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -102,5 +102,9 @@ class TopicController(Node):
 
 
 rclpy.init()
+executor = SingleThreadedExecutor()
+executor.add_node(TopicController())
 with contextlib.suppress(KeyboardInterrupt, ExternalShutdownException):
-    rclpy.spin(TopicController())
+    # rclpy wakes its wait before it shuts down: one without a limit may miss that it is to end.
+    while rclpy.ok():
+        executor.spin_once(timeout_sec=0.5)
