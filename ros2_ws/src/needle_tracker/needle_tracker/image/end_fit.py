@@ -28,7 +28,7 @@ _SLOPES = 7  # directions that are tried, so far to either side [-]
 _SLOPE = 0.15
 _CORE = 0.3  # of the width, to either side: the end is where it reaches farthest there
 _PASSES = 3
-_WHOLE = 0.8  # of the width: a map shows that much of a needle that it sees whole
+_WHOLE = (0.8, 1.0)  # of the width: a map shows so much of a needle that it sees whole and alone
 _EARLY = 0.841  # the chance to reach one standard deviation less than the middle
 _GAP_WIDTHS, _UNLIKELY = 1.5, 0.3  # where needle is less likely for so long, it has ended
 _LEAST_STEP = 0.2  # of the map from shaft to floor: less is no end
@@ -197,9 +197,11 @@ def _centre_line(
     independent = max(total / width, 2.0)
     across = variance / (independent - 1.0) * (1.0 + (end - mean) ** 2 / max(spread / total, 1e-9))
     sums[1], sums[2] = middle - lean * mean, lean
-    # Where the map shows less than the needle's width, what is missing lies on one side of it.
-    missing = 0.5 * width * max(_WHOLE - apparent / count, 0.0)
-    sums[3] = math.sqrt(across + missing * missing)
+    # Where the map shows less than the needle's width, what is missing lies on one side of it; so
+    # does what it shows of something else.
+    shown = apparent / count
+    aside = 0.5 * width * max(_WHOLE[0] - shown, shown - _WHOLE[1], 0.0)
+    sums[3] = math.sqrt(across + aside * aside)
     sums[4] = math.sqrt(variance / (independent - 1.0) / max(spread / total, 1e-9))
     sums[5] = certainty / count
 

@@ -105,3 +105,21 @@ def test_a_bevel_reaches_as_far_as_its_farthest_side() -> None:
     result = fitted(np.asarray(np.rint(255.0 * chance), np.uint8), 0.0)
     assert result is not None
     assert result[0] == pytest.approx(END[0], abs=0.3)
+
+
+@pytest.mark.parametrize("beside", [-3.0, 3.0])
+@pytest.mark.parametrize("also", [-1.0, 0.8])
+def test_a_line_that_is_not_as_wide_as_the_needle_may_be_beside_it(
+    also: float, beside: float
+) -> None:
+    """One side of the needle is not shown (-1), or a shadow along it is shown as well."""
+    needle, other = drawn(0.0), drawn(0.0, end=END + np.array([0.0, beside]))
+    both = np.where(other > 0, 0, needle) if also < 0.0 else np.maximum(needle, also * other)
+    result = fitted(both.astype(np.uint8), 0.0)
+    alone = fitted(needle, 0.0)
+    assert result is not None
+    assert alone is not None
+    off = abs(result[1] - END[1])
+    assert off > 0.6
+    assert off < 2.0 * result[4]
+    assert alone[4] < 0.1
