@@ -28,7 +28,9 @@ _SLOPES = 7  # directions that are tried, so far to either side [-]
 _SLOPE = 0.15
 _CORE = 0.3  # of the width, to either side: the end is where it reaches farthest there
 _PASSES = 3
-_WHOLE = (0.8, 1.0)  # of the width: a map shows so much of a needle that it sees whole and alone
+_WHOLE = 0.8  # of the width: a map shows that much of a needle that it sees whole
+ASIDE_WIDTHS = 2.0
+"""What a map shows so far beside the line may be the needle, too [needle widths]."""
 _EARLY = 0.841  # the chance to reach one standard deviation less than the middle
 _GAP_WIDTHS, _UNLIKELY = 1.5, 0.3  # where needle is less likely for so long, it has ended
 _LEAST_STEP = 0.2  # of the map from shaft to floor: less is no end
@@ -168,19 +170,25 @@ def _centre_line(
     """Fit the line to the middles of the needle; write (mass, offset, slope, sigmas, certainty)."""
     count = int(back)
     places, middles, weights = np.empty(count), np.empty(count), np.empty(count)
+    spreads = np.empty(count)
     certainty = apparent = 0.0
     for i in range(count):
         s = end - i
         line = offset + slope * s
-        mass = moment = 0.0
-        t = -0.9 * width
-        while t <= 0.9 * width:
+        mass = moment = all_mass = all_moment = square = 0.0
+        t = -ASIDE_WIDTHS * width
+        while t <= ASIDE_WIDTHS * width:
             value = _seen(image, point, direction, s, line + t)
-            mass += value
-            moment += value * t
+            all_mass += value
+            all_moment += value * t
+            square += value * t * t
+            if abs(t) <= 0.9 * width:
+                mass += value
+                moment += value * t
             t += 0.5
         places[i], weights[i] = s, min(0.5 * mass / width, 1.0)
         middles[i] = line + (moment / mass if mass > 0.0 else 0.0)
+        spreads[i] = square / all_mass - (all_moment / all_mass) ** 2 if all_mass > 0.0 else 0.0
         certainty += _seen(image, point, direction, s, line)
         apparent += 0.5 * mass / width
     total = weights.sum()
@@ -197,11 +205,12 @@ def _centre_line(
     independent = max(total / width, 2.0)
     across = variance / (independent - 1.0) * (1.0 + (end - mean) ** 2 / max(spread / total, 1e-9))
     sums[1], sums[2] = middle - lean * mean, lean
-    # Where the map shows less than the needle's width, what is missing lies on one side of it; so
-    # does what it shows of something else.
-    shown = apparent / count
-    aside = 0.5 * width * max(_WHOLE[0] - shown, shown - _WHOLE[1], 0.0)
-    sums[3] = math.sqrt(across + aside * aside)
+    # Where the map shows less than the needle's width, what is missing lies on one side of it.
+    missing = 0.5 * width * max(_WHOLE - apparent / count, 0.0)
+    # What it shows of more, such as a shadow alongside, may be the needle: the chance of that is
+    # spread wider than the needle, and a pixel, is.
+    wider = max(np.median(spreads) - (width + 1.0) ** 2 / 12.0, 0.0)
+    sums[3] = math.sqrt(across + missing * missing + wider)
     sums[4] = math.sqrt(variance / (independent - 1.0) / max(spread / total, 1e-9))
     sums[5] = certainty / count
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from needle_tracker.image import detection, tip_fit
 from needle_tracker.image.background import LEAST_NEW, SURE, Background
 from needle_tracker.image.detection import DetectionSettings, Image, Path
-from needle_tracker.image.end_fit import LINE_WIDTHS, fit_end, hidden_sigma
+from needle_tracker.image.end_fit import ASIDE_WIDTHS, LINE_WIDTHS, fit_end, hidden_sigma
 from needle_tracker.image.needle_map import TILE, Box, Mask, NeedleMap, tile_counts
 from needle_tracker.image.search_grid import SearchGrid
 from needle_tracker.image.tip_fit import HIDDEN_END_PX, HIDDEN_FACTOR, Expected, ImageTip
@@ -204,8 +204,8 @@ class MapLook:
         width = settings.needle_width_px
         ahead, back = _ROOM_WIDTHS * width, (LINE_WIDTHS + 1.0) * width
         corners = np.array([-back, ahead])[:, None] * expected.direction + expected.point
-        low = corners.min(axis=0) - expected.search - width
-        high = corners.max(axis=0) + expected.search + width
+        beside = max(expected.search, ASIDE_WIDTHS * width) + width
+        low, high = corners.min(axis=0) - beside, corners.max(axis=0) + beside
         if (
             not np.isfinite(low + high).all()
             or (high < 0.0).any()
