@@ -119,6 +119,24 @@ def test_a_shadow_that_ends_first_does_not_hide_the_needles_end(
     assert tip.contrast == pytest.approx(125.0, rel=0.1)
 
 
+@pytest.mark.parametrize("apart", [-4.6, 3.0, 4.6])
+def test_of_two_lines_that_touch_either_may_be_the_needle(
+    make_line: Callable[..., np.ndarray], apart: float
+) -> None:
+    """A shadow as dark as the needle lies along it: the claim covers the needle's own middle."""
+    start, end = np.array([50.0, 150.0]), np.array([150.3, 150.0])
+    needle, shadow = (
+        make_line((300, 300), np.add([start, end], [0.0, aside]), 4.6, 0.0, 1.0)
+        for aside in (0.0, apart)
+    )
+    tip, _, across = fitted(60.0 + 100.0 * np.minimum(needle, shadow), 5, start, end)
+    assert abs(across) < 2.0 * tip.sigma_across
+    assert tip.sigma_across > 0.3 * abs(apart)
+    alone, _, across = fitted(60.0 + 100.0 * needle, 5, start, end)
+    assert abs(across) < 0.15
+    assert alone.sigma_across < 0.15
+
+
 @pytest.mark.parametrize("aside", [-0.4, 0.0, 0.4])
 @pytest.mark.parametrize(("first", "last"), [(0.0, 0.88), (0.5, 0.9), (0.6, 1.0)])
 def test_a_streak_of_light_along_the_needle_hides_neither_its_line_nor_its_end(
