@@ -38,6 +38,7 @@ _VOTE_STEP_PX = 0.3
 _EDGES_APART_PX = 0.25  # from the centroid: something disturbs that
 _SHIFTS, _TILTS = 9, 8
 _ROWS_ALIKE = 3.0
+_FEW_ROWS = 4  # one row of so many may be as narrow as the needle where something lies along it
 # The needle's edges by what is a little darker than the light beside it and what is nearly as dark
 # as the needle [its contrast]; how far their middles may be apart [px], and what more is worth.
 _FOOT, _TOP = (0.15, 0.4), (0.5, 0.8)
@@ -228,8 +229,10 @@ def middle_line(
     # A needle is as dark on its one side as on the other; with a shadow, a glint or a bubble along
     # it where its middle is depends on what one takes for its edge.
     doubt = min(_LOPSIDED * max(abs(lopsided) - _EVEN_PX, 0.0), _MOST_LOPSIDED_PX)
-    # What is wider than the needle is the needle and something else, on either side.
-    doubt = math.hypot(doubt, 0.5 * np.median(excess[:rows]))
+    # What is wider than the needle nearly all along is the needle and something else, on either
+    # side; what crosses it makes fewer rows wider.
+    wider = np.sort(excess[:rows])[rows // _FEW_ROWS]
+    doubt = math.hypot(doubt, 0.5 * wider)
     sigma_offset = math.hypot(sigma_offset, doubt)
     sigma_slope = math.hypot(sigma_slope, doubt / length)
     return offset, slope, sigma_offset, sigma_slope, count
