@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
+from mcap.writer import Writer
 
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.recording import Received, Recording
@@ -204,6 +205,17 @@ PLANTED = {
 }
 
 
+def _bag_begins_without_writing(patch: pytest.MonkeyPatch) -> None:
+    begin = BagWriter._begin_file
+
+    def unwritten(bag: BagWriter) -> None:
+        with pytest.MonkeyPatch.context() as meanwhile:
+            meanwhile.setattr(Writer, "flush", lambda *_: None)
+            begin(bag)
+
+    patch.setattr(BagWriter, "_begin_file", unwritten)
+
+
 class MendedBug(NamedTuple):
     """A bug of the rig, or of the soak's own judges, and what it violates under its schedule."""
 
@@ -262,6 +274,9 @@ def _judge_forgets(**values: float) -> Plant:
 
 
 MENDED = {
+    "a_recorder_begins_on_a_broken_disk": MendedBug(
+        "nothing_recorded_is_lost", _bag_begins_without_writing
+    ),
     "blocked_when_the_hold_is_let_go": MendedBug(
         "no_motion_without_hold", _blocked_axis_keeps_its_power
     ),

@@ -54,7 +54,7 @@ class BagWriter:
     Raises
     ------
     UserError
-        If the directory holds a bag already or cannot be made.
+        If the directory holds a bag already or cannot be made, or the disk takes nothing.
     """
 
     def __init__(
@@ -79,6 +79,7 @@ class BagWriter:
             directory.mkdir(parents=True, exist_ok=True)
             self._begin_file()
         except OSError as error:
+            self._leave_nothing()
             raise UserError(f"cannot record into {directory}: {error.strerror}") from error
 
     @property
@@ -224,6 +225,15 @@ class BagWriter:
         self._mcap.add_metadata(METADATA_RECORD, {DISTRO_KEY: self._distribution})
         for topic in self._topics:
             self._register(topic)
+        # A disk that takes nothing is found out before there is anything to lose.
+        self._mcap.flush()  # type: ignore[no-untyped-call]
+
+    def _leave_nothing(self) -> None:
+        """Remove the file that could not be begun, so that the next try finds no bag."""
+        if self._files:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+            self.data_file.unlink(missing_ok=True)
 
     def _end_file(self) -> None:
         self._mcap.finish()  # type: ignore[no-untyped-call]

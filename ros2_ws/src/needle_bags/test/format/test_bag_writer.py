@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import threading
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,22 @@ def test_a_folder_without_a_bag_is_accepted(tmp_path: Path) -> None:
 def test_unknown_type_is_named() -> None:
     with pytest.raises(UserError, match="no_such_msgs/msg/Thing is not installed"):
         full_definition("no_such_msgs/msg/Thing")
+
+
+def test_a_disk_that_takes_nothing_is_said_at_the_start(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not after a run of which nothing was kept; and nothing stands in the way of the next try."""
+    monkeypatch.setattr(BagWriter, "open_file", lambda _, path: _BrokenFile(path, "xb"))
+    with pytest.raises(UserError, match=r"cannot record into .*bag: Input/output error"):
+        open_recording(tmp_path / "bag")
+    monkeypatch.undo()
+    open_recording(tmp_path / "bag").close()
+
+
+class _BrokenFile(io.FileIO):
+    def write(self, _: object) -> int:
+        raise OSError(errno.EIO, "Input/output error")
 
 
 def test_a_full_disk_ends_the_recording_with_its_reason(

@@ -75,4 +75,7 @@ def _freeze_once() -> None:
 
 
 def _run_seed(seed: int) -> RunResult:
-    return run(seed, schedule_of(seed))
+    try:
+        return run(seed, schedule_of(seed))
+    except Exception as error:
+        raise RuntimeError(f"the run of seed {seed} broke: {error!r}") from error

@@ -68,8 +68,8 @@ class VirtualRecorders:
         losses = []
         for one in self._all:
             if one.runs:
-                one.finish()
-                losses += one.witness.losses_of_ended(self._overflows())
+                why = one.finish()
+                losses += [why] if why else one.witness.losses_of_ended(self._overflows())
             elif one.killed_ns is not None and judges_killed:
                 losses += one.witness.losses_of_killed(one.killed_ns)
         return losses
@@ -108,10 +108,13 @@ class _Recorder:
         node.context.on_shutdown(end)
         return node
 
-    def finish(self) -> None:
+    def finish(self) -> str:
+        """End it; return why its bag is not whole, empty where it is."""
         node, self._node = self._node, None
         assert node is not None
         # What it says of it is for the person who ran it.
         with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
             node.finish()
         node.context.shutdown()
+        recording = node.recording
+        return "" if recording.is_whole else f"{node.bag} is not whole: {recording.error}"
