@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import json
 import time
-from collections.abc import Callable, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -31,6 +33,8 @@ OVERHEAD: Final = 800
 RESERVE: Final = 64_000_000
 # Key of the custom data that says why a recording ended before it was told to.
 ENDED_EARLY: Final = "recording_ended"
+# Key of that which says how many messages of each topic are not in the bag, as JSON.
+MESSAGES_LOST: Final = "messages_lost"
 # The disk is looked at after so many bytes, and with every flush.
 _LOOK_EVERY: Final = 2**20
 
@@ -102,6 +106,7 @@ class Recording:
         self.error: str | None = None
         self.is_whole = False
         self.dropped: dict[str, int] = {}
+        self._lost_before: dict[str, int] = {}
         self.bytes_received = 0
         self.messages_received = 0
         self._bytes_done = 0
@@ -154,8 +159,15 @@ class Recording:
         """Queue a text for metadata.yaml's `custom_data`."""
         self._worker.put(lambda: self._bag.set_custom_data(key, value))
 
-    def close(self) -> None:
-        """Write all that waits, then index and metadata; `error` tells how it went."""
+    def close(self, lost_before: Mapping[str, int] | None = None) -> None:
+        """Write all that waits, then index and metadata; `error` tells how it went.
+
+        Parameters
+        ----------
+        lost_before : mapping of str to int
+            Messages of each topic that never got here; the bag names them beside `dropped`.
+        """
+        self._lost_before = dict(lost_before or {})
         self._worker.finish()
 
     def _put(self, job: Job) -> None:
@@ -224,11 +236,19 @@ class Recording:
             self._next_flush = time.monotonic() + FLUSH_PERIOD
 
     def _end(self) -> None:
+        self._name_lost()
         if self.error is None:
             self._complete()
-        elif self.is_whole:
+        if self.error is not None and self.is_whole:
+            # What was dropped at the very end is known only now.
+            self._name_lost()
             with contextlib.suppress(BagWriteError):
                 self._bag.update_metadata()
+
+    def _name_lost(self) -> None:
+        lost = Counter(self._lost_before) + Counter(self.dropped)
+        if lost:
+            self._bag.set_custom_data(MESSAGES_LOST, json.dumps(lost))
 
     def _complete(self) -> None:
         try:

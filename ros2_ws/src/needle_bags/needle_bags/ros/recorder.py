@@ -256,10 +256,7 @@ class Recorder(WholeNode):
         self.recording.add_file(
             "parameters.yaml", "application/yaml", parameters.encode(), time.time_ns()
         )
-        lost = self._lost()
-        if lost:
-            self.recording.set_custom_data("messages_lost", json.dumps(lost))
-        self.recording.close()
+        self.recording.close(self._topics.lost)
         count = self.recording.messages_received
         lost = self._lost()
         if self.recording.error is not None:

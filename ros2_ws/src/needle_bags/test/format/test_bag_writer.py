@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import threading
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosHistory, QosReliability, QosTime
 from rosbags.rosbag2 import Reader
@@ -203,6 +205,28 @@ def test_a_full_disk_ends_the_recording_with_its_reason(
     recording.close()
     assert recording.error is not None
     assert recording.error.endswith("bag_0.mcap: No space left on device")
+
+
+def test_what_a_disk_that_fills_at_the_very_end_drops_is_named_in_the_bag(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    finish = Writer.finish
+
+    def full_once(writer: Writer) -> None:
+        monkeypatch.setattr(Writer, "finish", finish)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(BagWriter, "flush", lambda _: None)
+    monkeypatch.setattr(Writer, "finish", full_once)
+    recording = open_recording(tmp_path / "bag")
+    recording.add_topic(BagTopic("/t", TYPE, full_definition(TYPE)))
+    for number in range(10):
+        recording.append(Received("/t", pose(number), TIME, TIME))
+    recording.close({"/t": 2, "/other": 1})
+    assert recording.is_whole
+    text = (tmp_path / "bag" / "metadata.yaml").read_text()
+    custom = yaml.safe_load(text)["rosbag2_bagfile_information"]["custom_data"]
+    assert json.loads(custom["messages_lost"]) == {"/t": 12, "/other": 1}
 
 
 def test_a_recording_keeps_room_for_what_is_small_and_counts_what_it_drops(
