@@ -18,13 +18,13 @@ from needle_tracker.optics.compiled_projection import point_jacobian, project_po
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.following import SLACK, Follower, is_sound, misfit
+from needle_tracker.tracking.gates import GateSettings
 from needle_tracker.tracking.tip_prediction import Anchor, TipMotion, across
 from needle_tracker.tracking.triangulation import SpatialTip
 
 # Standard deviations: what is farther from the prediction is something else. A prediction that is
 # not known so well [px] says too little of what is seen.
 _BORNE_OUT, _KNOWN_PX = 2.0, 2.5
-_KNOWN = 0.3e-3  # so well must a tip be known, seen by one view and before [m]
 
 Seen = tuple[ImageTip | None, ImageTip | None]
 
@@ -73,7 +73,7 @@ def kept_up(
 
 
 def seen_alone(
-    predicted: Anchor, motion: TipMotion, believed: SpatialTip, curvature: float
+    predicted: Anchor, motion: TipMotion, believed: SpatialTip, settings: GateSettings
 ) -> SpatialTip | None:
     """Return the tip of a needle that one view keeps up with.
 
@@ -85,8 +85,8 @@ def seen_alone(
         The same with what is seen taken in.
     believed : SpatialTip
         The last tip that both views showed.
-    curvature : float
-        The needle's largest [1/m].
+    settings : GateSettings
+        How well a tip must be known, be it seen by one view or by both, and how the needle bends.
 
     Returns
     -------
@@ -94,9 +94,9 @@ def seen_alone(
         Its direction is the last that was seen, the less known the farther the needle went since;
         None where the tip is not known well enough.
     """
-    if max(predicted.motion.sigma, motion.sigma) > _KNOWN:
+    if max(predicted.motion.sigma, motion.sigma) > settings.max_depth_sigma:
         return None
-    turned = (curvature * predicted.unseen) ** 2 * across(believed.direction)
+    turned = (settings.reach.curvature * predicted.unseen) ** 2 * across(believed.direction)
     return dataclasses.replace(
         believed,
         position=motion.position,

@@ -155,10 +155,12 @@ class TipTracker:
         stands = maps.reason == NoTip.STANDS
         shown = maps.tip is not None or (maps.state is TrackState.CONFIRMING and not stands)
         self._in_vain = 0 if shown else self._in_vain + 1
-        if lines.tip is None or maps.tip is None:
+        instead = lines.tip is None and maps.tip is not None
+        # What one view alone shows, and says so, denies nothing that both show.
+        if lines.tip is None or maps.tip is None or (maps.reason and not pair.mirrored):
             self._against = 0
-            self._maps_count = self._maps_count or maps.tip is not None
-            return lines if maps.tip is None else maps
+            self._maps_count = self._maps_count or instead
+            return maps if instead else lines
         self._since_compared = 0
         self._hear(agree=not pair.mirrored and _agree(lines.tip, maps.tip))
         return maps if self._maps_count else lines

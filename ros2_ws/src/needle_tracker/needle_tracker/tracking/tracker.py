@@ -225,8 +225,7 @@ class StereoTracker:
         self._last = self._steadied(seen[0] or last[0], seen[1] or last[1])
         if self._believed is None or not self.track.is_established:
             return None
-        curvature = self.settings.gates.reach.curvature
-        tip = seen_alone(predicted, motion, self._believed, curvature)
+        tip = seen_alone(predicted, motion, self._believed, self.settings.gates)
         return None if tip is None else (tip, seen)
 
     def skip(self, reason: str) -> Measurement:

@@ -99,18 +99,20 @@ def test_a_needle_that_may_be_another_is_not_seen_by_one_view(
         assert (tracker.process(left, blocked, 0.05).tip is not None) is (count == 10)
 
 
-def test_one_view_goes_on_as_long_as_the_depth_is_known() -> None:
+def test_one_view_goes_on_as_long_as_the_depth_is_known(settings: TrackerSettings) -> None:
     known = []
+    reach = dataclasses.replace(settings.gates.reach, curvature=9.0)
+    gates = dataclasses.replace(settings.gates, reach=reach, max_depth_sigma=0.3e-3)
     motion, unseen = TipMotion.start(BELIEVED), 0.0
     for _ in range(14):
         motion, unseen = motion.advanced(1e-3, 9.0, unseen), unseen + 1e-3
         predicted = Anchor(motion, 0.06, 1e-3, True, unseen)
         # One view says all but the depth.
         motion = motion.taken_in(np.zeros(2), np.eye(3)[1:], 1e-10 * np.eye(2))
-        tip = seen_alone(predicted, motion, BELIEVED, 9.0)
+        tip = seen_alone(predicted, motion, BELIEVED, gates)
         known.append(tip is not None)
         if tip is not None:
-            assert predicted.motion.sigma <= 0.3e-3
+            assert predicted.motion.sigma <= gates.max_depth_sigma
             assert tip.position is motion.position
             assert tip.disagreement == tip.disagreement_across == 0.0
             np.testing.assert_array_equal(tip.direction, BELIEVED.direction)
