@@ -58,7 +58,8 @@ Subscribes to every topic of the graph; publishes /diagnostics: a warning when m
 what came cannot be understood (it is recorded all the same) or the disk is nearly full. Down to
 `reserve` the recording ends, the bag is completed, and the node stays and reports it; the rest of
 the graph goes on.
-Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters.
+Exit codes: 0 the bag is whole; 1 the disk refused data or was full; 2 bad parameters, or a bag that
+cannot be begun.
 """
 
 GRAPH_PERIOD = 0.1
