@@ -4,6 +4,7 @@ A needle's edges are steep and as far apart as it is wide. What it throws on the
 edges; a glint on the shaft rises where an edge falls. So the edges still tell where the middle is
 when a shadow along the needle, or a bubble beside it, draws the centroid of what is dark to one
 side. Of two edges the steeper counts for more: one that borders on a shadow hardly stands out.
+Edges farther apart than the needle is wide are those of the needle and something else together.
 """
 
 # Compiled functions take plain numbers, one by one.
@@ -31,6 +32,8 @@ _LOOK_COLUMNS = 2  # an edge is so near where the needle's width has it
 _PEAK_COLUMNS, _PEAK_SHARE = 6, 0.4
 # What lies beside an edge, so far and so wide [columns], is something if it is so dark, or bright.
 _BESIDE_FROM, _BESIDE_COLUMNS, _LEAST_CONTRAST_BESIDE = 1.6, 4, 0.15
+# Width of a bell at half its height, over how far it takes from three quarters to one quarter.
+_BELL = 2.6
 
 
 @compiled
@@ -146,3 +149,52 @@ def peak_place(values: Array, top: int) -> float:
             moment += weight * k
             k += step
     return moment / total
+
+
+@compiled
+def dark_width(darkness: Array, row: int, middle: float) -> float:
+    """Return how wide what is dark in a row is, about a place, without its blur [px].
+
+    That is where it is half as dark as at its darkest; the sharper of its edges says what of that
+    is blur, as if bar and blur were both bell-shaped.
+
+    Parameters
+    ----------
+    darkness : ndarray, shape (rows, columns)
+        From `fine_strip`.
+    row : int
+        Which row.
+    middle : float
+        The place [px from the strip's middle].
+    """
+    columns = darkness.shape[1]
+    begin = min(max(round(middle / STEP_PX) + columns // 2, 0), columns - 1)
+    largest = max(darkness[row, begin], 1e-9)
+    edges = (begin, begin)
+    for _ in range(2):
+        # The second time with what is darkest between them.
+        edges = (
+            fall_from(darkness, row, begin, -1, 0.5 * largest),
+            fall_from(darkness, row, begin, 1, 0.5 * largest),
+        )
+        for j in range(edges[0] + 1, edges[1]):
+            largest = max(largest, darkness[row, j])
+    sharpest = np.inf
+    for k in range(2):
+        side = 2 * k - 1
+        outer = fall_from(darkness, row, edges[k] - side, side, 0.25 * largest)
+        inner = edges[k] - side
+        while inner != begin and darkness[row, inner] < 0.75 * largest:
+            inner -= side
+        sharpest = min(sharpest, STEP_PX * abs(outer - inner))
+    half = STEP_PX * (edges[1] - edges[0] - 1)
+    return math.sqrt(max(half * half - (_BELL * sharpest) ** 2, 0.0))
+
+
+@compiled
+def fall_from(darkness: Array, row: int, begin: int, side: int, level: float) -> int:
+    """Return the first column on a side, from another on, that is no darker than a level."""
+    j = begin
+    while 0 <= j < darkness.shape[1] and darkness[row, j] > level:
+        j += side
+    return j

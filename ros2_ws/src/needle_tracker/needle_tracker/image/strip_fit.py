@@ -25,7 +25,7 @@ from needle_tracker.image.strip import (
     row_masses,
     straight_line,
 )
-from needle_tracker.image.strip_edges import edges_middle
+from needle_tracker.image.strip_edges import dark_width, edges_middle
 from needle_tracker.image.strip_end import edge_fall, find_end, taper_beyond
 
 Array = NDArray[np.float64]
@@ -43,8 +43,6 @@ _FEW_ROWS = 4  # one row of so many may be as narrow as the needle where somethi
 # as the needle [its contrast]; how far their middles may be apart [px], and what more is worth.
 _FOOT, _TOP = (0.15, 0.4), (0.5, 0.8)
 _EVEN_PX, _LOPSIDED, _MOST_LOPSIDED_PX = 0.05, 0.8, 0.25
-# Width of a bell at half its height, over how far it takes from three quarters to one quarter.
-_BELL = 2.6
 # Edges that fall over more than this are blurred: what shape the end has, and what lies beside the
 # needle, then hardly shows, across and along [px]. A bevel draws the middle line aside, too.
 _SHARP_PX, _BLUR_ACROSS, _BLUR_ALONG, _TAPER_ACROSS = 1.7, 0.1, 1.7, 0.025
@@ -68,55 +66,6 @@ def vote_line(place: Array, centre: Array, length: float) -> tuple[float, float]
             if votes > largest:
                 largest, best_offset, best_slope = votes, offset, slope
     return best_offset, best_slope
-
-
-@compiled
-def dark_width(darkness: Array, row: int, middle: float) -> float:
-    """Return how wide what is dark in a row is, about a place, without its blur [px].
-
-    That is where it is half as dark as at its darkest; the sharper of its edges says what of that
-    is blur, as if bar and blur were both bell-shaped.
-
-    Parameters
-    ----------
-    darkness : ndarray, shape (rows, columns)
-        From `fine_strip`.
-    row : int
-        Which row.
-    middle : float
-        The place [px from the strip's middle].
-    """
-    columns = darkness.shape[1]
-    begin = min(max(round(middle / STEP_PX) + columns // 2, 0), columns - 1)
-    largest = max(darkness[row, begin], 1e-9)
-    edges = (begin, begin)
-    for _ in range(2):
-        # The second time with what is darkest between them.
-        edges = (
-            fall_from(darkness, row, begin, -1, 0.5 * largest),
-            fall_from(darkness, row, begin, 1, 0.5 * largest),
-        )
-        for j in range(edges[0] + 1, edges[1]):
-            largest = max(largest, darkness[row, j])
-    sharpest = np.inf
-    for k in range(2):
-        side = 2 * k - 1
-        outer = fall_from(darkness, row, edges[k] - side, side, 0.25 * largest)
-        inner = edges[k] - side
-        while inner != begin and darkness[row, inner] < 0.75 * largest:
-            inner -= side
-        sharpest = min(sharpest, STEP_PX * abs(outer - inner))
-    half = STEP_PX * (edges[1] - edges[0] - 1)
-    return math.sqrt(max(half * half - (_BELL * sharpest) ** 2, 0.0))
-
-
-@compiled
-def fall_from(darkness: Array, row: int, begin: int, side: int, level: float) -> int:
-    """Return the first column on a side, from another on, that is no darker than a level."""
-    j = begin
-    while 0 <= j < darkness.shape[1] and darkness[row, j] > level:
-        j += side
-    return j
 
 
 @compiled
