@@ -103,13 +103,16 @@ class Told:
 
     def __init__(self) -> None:
         self.tip: SpatialTip | None = None
+        self.reason = ""
         self.state = TrackState.SEARCHING
         self.ends: tuple[ImageTip | None, ImageTip | None] = (None, None)
         self.asked = 0
 
     def process(self, _: Image, __: Image, ___: float | None) -> Measurement:
         self.asked += 1
-        return Measurement(self.tip, self.state, "" if self.tip else "no needle", self.ends)
+        return Measurement(
+            self.tip, self.state, self.reason if self.tip else "no needle", self.ends
+        )
 
     def skip(self, reason: str) -> Measurement:
         return Measurement(None, TrackState.SEARCHING, reason)
@@ -243,6 +246,20 @@ def test_an_end_that_maps_deny_does_not_count(told: tuple[TipTracker, Told, Told
     # The finer one counts again when they have agreed three times in a row.
     lines.tip = tip_at(0.0601, 2e-5)
     assert [counts(tracker, lines) for _ in range(4)] == [False, False, True, True]
+
+
+def test_what_maps_have_of_one_view_denies_no_lines_of_both(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+    lines.tip, maps.tip = tip_at(0.0590, 2e-5), tip_at(0.0600, 2e-4)
+    maps.reason = "one view alone, too uncertain"
+    assert counts(tracker, lines)
+    lines.tip = None
+    assert counts(tracker, maps)
+    # Though maps count now.
+    lines.tip = tip_at(0.0590, 2e-5)
+    assert counts(tracker, lines)
 
 
 def test_lines_that_agreed_with_maps_are_denied_three_times_before_they_give_way(
