@@ -9,6 +9,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
+from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_common.files.bag_directory import METADATA_FILE
 from needle_common.files.plain_yaml import load_plain
@@ -87,4 +88,4 @@ def _said_lost(bag: Path) -> Counter[str]:
     """Return what metadata.yaml says of messages that are not in the bag."""
     content = load_plain((bag / METADATA_FILE).read_text(encoding="utf-8"))
     custom = content["rosbag2_bagfile_information"]["custom_data"] or {}
-    return Counter(json.loads(custom.get("messages_lost", "{}")))
+    return Counter(json.loads(custom.get(MESSAGES_LOST, "{}")))

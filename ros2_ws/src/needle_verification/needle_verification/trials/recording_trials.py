@@ -17,6 +17,7 @@ import numpy as np
 from rosbags.rosbag2 import Reader
 
 from needle_bags.reading.bag_files import read_contents
+from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
@@ -118,7 +119,7 @@ def record_full_rate(folder: Path, duration: float, *, burners: int = 2) -> Full
         bag,
         sent,
         {topic: count - kept.get(topic, 0) for topic, count in sent.items()},
-        json.loads(read_contents(bag).custom_data.get("messages_lost", "{}")),
+        json.loads(read_contents(bag).custom_data.get(MESSAGES_LOST, "{}")),
         share,
         memory[-1],
         float(growth),
