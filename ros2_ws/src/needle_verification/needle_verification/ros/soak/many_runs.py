@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import gc
 import itertools
+import logging
 import multiprocessing
 import os
 import shutil
@@ -22,11 +23,11 @@ _PART = 10
 
 
 def results_here(seeds: range) -> Iterator[RunResult]:
-    """Yield the results of seeds, run by as many processes as this machine has cores."""
+    """Yield the results of seeds, run by as many processes as there are cores for them."""
     if not seeds:
         return
     # Fresh interpreters: a fork would share what numerical libraries keep for their threads.
-    workers = min(len(seeds), os.cpu_count() or 1)
+    workers = min(len(seeds), len(os.sched_getaffinity(0)))
     context = multiprocessing.get_context("spawn")
     # Where a worker that is ended in mid-run leaves nothing behind.
     with (
@@ -61,6 +62,8 @@ def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResul
 def _begin_worker(folder: str) -> None:
     tempfile.tempdir = folder
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    # What the bus has to say comes as faults of the axes.
+    logging.getLogger("canopen").addHandler(logging.NullHandler())
     # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Each run is collected at its end; what is imported stays, and need not be looked at.
