@@ -1,58 +1,14 @@
 import pytest
 
 from needle_bringup.simulated_operator.operator_sequence import (
-    ASK_AGAIN,
-    ENABLE,
     HOME,
     PREPARATION,
     START,
     OperatorSequence,
-    Outcome,
     ServiceCall,
 )
 
-CONFIRM = PREPARATION[0]
-DISABLED = {"homed": "true", "state": "DISABLED"}
-
-
-def fresh() -> OperatorSequence:
-    """Return a sequence before a simulated device that is alone."""
-    sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
-    sequence.see_devices(["/sim_rig"])
-    see(sequence, {}, 0.0)
-    sequence.see_controller({"state": "IDLE", "starts": "0"}, 0.0)
-    return sequence
-
-
-def see(sequence: OperatorSequence, values: dict[str, str], now: float) -> None:
-    sequence.see_device({"simulated": "true"} | values, "/sim_rig", now)
-
-
-def outcome(sequence: OperatorSequence) -> Outcome | None:
-    """Return the outcome; a call, so that mypy does not take it for settled once it was None."""
-    return sequence.outcome
-
-
-def answer(sequence: OperatorSequence, message: str = "") -> None:
-    """Let the next call be made and agreed to."""
-    call = sequence.next_call(1.0)
-    assert call is not None
-    sequence.take_answer(call, True, message, 1.0)
-
-
-def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
-    sequence.see_missing([])
-    see(sequence, {"homed": "true", "state": "DISABLED"}, 1.0)
-    calls = []
-    while (call := sequence.next_call(now)) is not None:
-        calls.append(call)
-        sequence.take_answer(call, True, "", now)
-    return calls
-
-
-def steering(**values: str) -> dict[str, str]:
-    said = {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"}
-    return said | {"starts": "1"} | values
+from .sequences import CONFIRM, DISABLED, answer, fresh, outcome, prepare, reach, see, steering
 
 
 def test_calls_the_services_in_order_and_holds_only_after_all_have_agreed() -> None:
@@ -339,67 +295,6 @@ def test_before_it_acts_another_device_has_time_to_show_itself() -> None:
     see(sequence, {}, 0.1)
     assert sequence.next_call(1.9) is None
     assert sequence.next_call(2.0) == PREPARATION[0]
-
-
-def reach(wanted: ServiceCall) -> OperatorSequence:
-    """Return a sequence that has just made the call, for the first time, at 1.0 s."""
-    sequence = fresh()
-    sequence.see_missing([])
-    see(sequence, DISABLED, 1.0)
-    for _ in range(PREPARATION.index(wanted)):
-        answer(sequence)
-    assert sequence.next_call(1.0) == wanted
-    return sequence
-
-
-@pytest.mark.parametrize("call", PREPARATION)
-def test_a_call_whose_answer_was_lost_is_made_again(call: ServiceCall) -> None:
-    sequence = reach(call)
-    assert sequence.next_call(0.9 + ASK_AGAIN) is None
-    assert sequence.next_call(1.0 + ASK_AGAIN) == call
-    sequence.take_answer(call, True, "", 2.1)
-    assert sequence.next_call(2.1) != call
-
-
-@pytest.mark.parametrize("call", PREPARATION[:-1])
-def test_a_late_answer_is_to_its_own_call_alone(call: ServiceCall) -> None:
-    sequence = reach(call)
-    assert sequence.next_call(1.0 + ASK_AGAIN) == call
-    sequence.take_answer(call, True, "", 2.1)
-    following = sequence.next_call(2.1)
-    assert following == PREPARATION[PREPARATION.index(call) + 1]
-    sequence.take_answer(call, True, "", 2.2)
-    assert not sequence.steering
-    assert sequence.next_call(2.2) is None, "that one has not been answered"
-    sequence.take_answer(call, False, "the device is MOVING", 2.3)
-    assert sequence.next_call(2.5) is None
-
-
-def test_a_homing_whose_answer_was_lost_is_not_asked_for_again_while_it_moves() -> None:
-    sequence = reach(HOME)
-    see(sequence, {"homed": "true", "state": "MOVING"}, 1.2)
-    assert sequence.next_call(5.0) is None
-    see(sequence, DISABLED, 9.0)
-    assert sequence.next_call(9.0) == ENABLE
-
-
-def test_homed_from_before_the_call_is_no_answer_to_it() -> None:
-    sequence = reach(HOME)
-    # What was under way when the call was made.
-    see(sequence, DISABLED | {"needle_out_confirmed": "true"}, 1.1)
-    assert sequence.next_call(1.2) is None
-    assert sequence.next_call(1.0 + ASK_AGAIN) == HOME
-
-
-def test_a_start_whose_answer_was_lost_is_known_from_the_status() -> None:
-    sequence = reach(START)
-    sequence.see_controller(steering(starts="0", state="IDLE"), 1.1)
-    assert not sequence.hold()
-    sequence.see_controller(steering(), 1.2)
-    assert sequence.hold()
-    sequence.take_answer(START, False, "already steering", 1.3)
-    assert outcome(sequence) is None
-    assert sequence.next_call(9.0) is None
 
 
 def test_nothing_is_started_before_the_controller_has_said_how_often_it_was() -> None:

@@ -1,17 +1,15 @@
-"""The bank of filters: consistency, torsion recovered, late, missing and false tips, shapes."""
+"""The bank of filters: consistency, torsion recovered, shapes of noise, bad settings."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pytest
-from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
 from needle_common.errors import OutOfBoundsError, UserError
-from needle_controller.bank.estimate_tiles import OUTLIER, SCALE, WEIGHT, X, covariances, rows
+from needle_controller.bank.estimate_tiles import SCALE, rows
 from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.bank.hypotheses import (
     LASTING,
@@ -26,70 +24,23 @@ from needle_controller.bank.hypothesis_mixture import (
     T_LAG,
     T_PLAY,
     T_WEIGHT,
-    MixtureEstimate,
     mixture,
 )
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.laws.roll_turns import RollLawSettings, roll_turns
-from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_angles
 
-CURVATURE = 1.0 / 0.122
-STEP = 0.001
-RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0),)
-ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
-
-
-def path(
-    turns: Array,
-    pitch: float = 0.0,
-    roll: float = 0.0,
-    curvature: float = CURVATURE,
-    play: float = 0.0,
-    lag: float = 0.0,
-    start: npt.ArrayLike = (0.0, 0.0, 0.0),
-) -> Array:
-    """Poses (len(turns) + 1, 4, 4) of an exact needle, tip turned through play and lag."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_from_angles([0.0, pitch, roll])
-    pose[:3, 3] = start
-    poses, base, behind, tip = [pose], 0.0, 0.0, 0.0
-    for turn in turns:
-        before = tip
-        parts = 200 if play or lag else 1
-        for _ in range(parts):
-            base += turn / parts
-            behind = min(max(behind, base - play), base + play)
-            tip = tip + (behind - tip) * (1 - np.exp(-STEP / parts / lag)) if lag else behind
-        x, z = curvature * STEP, tip - before
-        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, STEP], [0, 0, 0, 0.0]])
-        pose = pose @ expm(twist)
-        poses.append(pose)
-    return np.array(poses)
-
-
-def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
-    rng = np.random.default_rng(seed)
-    return np.repeat(rng.uniform(-size, size, count // 4 + 1), 4)[:count]
-
-
-def drive(
-    estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
-) -> MixtureEstimate:
-    estimator.reset(tips[0], np.zeros(2))
-    for turn, tip in zip(turns, tips[1:], strict=True):
-        estimator.advance(STEP, turn)
-        estimator.correct(tip, covariance)
-    return estimator.estimate()
-
-
-def noisy(poses: Array, seed: int = 6, bound: float = 0.001) -> Array:
-    tips = poses[:, :3, 3]
-    return tips + np.random.default_rng(seed).uniform(-bound, bound, tips.shape)
-
-
-def rotation_error(estimate: MixtureEstimate, pose: Array) -> float:
-    return float(np.rad2deg(Rotation.from_matrix(estimate.rotation @ pose[:3, :3].T).magnitude()))
+from .needles import (
+    CURVATURE,
+    RIGID,
+    ROLL_AS_SET,
+    STEP,
+    drive,
+    noisy,
+    path,
+    rotation_error,
+    turns_for,
+)
 
 
 def test_finds_the_pose_from_positions() -> None:
@@ -159,158 +110,6 @@ def test_covariance_is_honest_for_gaussian_noise() -> None:
         error[5] = (error[5] + np.pi) % (2.0 * np.pi) - np.pi
         squares.append(error @ np.linalg.solve(estimate.covariance, error))
     assert 4.5 < np.mean(squares) < 7.5
-
-
-def test_a_late_tip_is_used_at_its_exposure() -> None:
-    """One step late all along is the on-time filter, seen one step ahead without its last tip."""
-    turns = turns_for(40)
-    tips = noisy(path(turns))
-    late, on_time = (HypothesisFilter(FilterSettings()) for _ in range(2))
-    late.reset(tips[0], np.zeros(2))
-    on_time.reset(tips[0], np.zeros(2))
-    for k, turn in enumerate(turns):
-        late.advance(STEP, turn)
-        if k > 0:
-            late.correct(tips[k], age=STEP)
-        on_time.advance(STEP, turn)
-        if k + 1 < len(turns):
-            on_time.correct(tips[k + 1])
-    for name in ("coordinates", "linearized", "curvature", "covariance"):
-        np.testing.assert_allclose(
-            getattr(late.estimate(), name),
-            getattr(on_time.estimate(), name),
-            atol=1e-9,
-            err_msg=name,
-        )
-
-
-def test_a_late_tip_between_two_stops() -> None:
-    """An exposure within an advance: as if the advance had been divided there."""
-    turns = turns_for(20)
-    tips = noisy(path(turns))
-    one, two = (HypothesisFilter(FilterSettings()) for _ in range(2))
-    for estimator in (one, two):
-        drive(estimator, turns, tips)
-    one.advance(STEP, 0.2)
-    one.correct(tips[-1] + [0.0, 0.0, 0.0006], age=0.0004)
-    two.advance(0.0006, 0.12)
-    two.correct(tips[-1] + [0.0, 0.0, 0.0006])
-    two.advance(0.0004, 0.08)
-    np.testing.assert_allclose(one.estimate().coordinates, two.estimate().coordinates, atol=1e-12)
-
-
-def test_late_tips_of_needles_that_are_inserted_by_lengths_of_their_own() -> None:
-    """Each is as if it were alone, whatever waits for the others."""
-    rng = np.random.default_rng(5)
-    tips = noisy(path(turns_for(30)))
-    lengths = rng.uniform(0.0, STEP, (30, 3)) * (rng.random((30, 3)) < 0.8)
-    turns, ages = rng.normal(0.0, 0.2, (30, 3)), np.array([0.0, 0.0013, 0.003])
-    many = HypothesisFilter(FilterSettings())
-    every = [HypothesisFilter(FilterSettings()) for _ in ages]
-    for estimator in (many, *every):
-        estimator.reset(np.tile(tips[0], (3, 1)) if estimator is many else tips[0], np.zeros(2))
-    for k in range(30):
-        many.advance(lengths[k], turns[k])
-        many.correct(np.tile(tips[k + 1], (3, 1)), age=ages)
-        for n, alone in enumerate(every):
-            alone.advance(lengths[k, n], turns[k, n])
-            alone.correct(tips[k + 1], age=ages[n])
-    for n, alone in enumerate(every):
-        seen, wanted = many.estimate().coordinates[n], alone.estimate().coordinates
-        np.testing.assert_allclose(seen, wanted, atol=1e-12, err_msg=str(n))
-
-
-def test_a_tip_older_than_the_last_is_dropped_and_reported() -> None:
-    turns = turns_for(20)
-    estimator = HypothesisFilter(FilterSettings())
-    before = drive(estimator, turns, noisy(path(turns)))
-    estimator.correct(np.array([0.0, 0.0, 0.015]), age=0.005)
-    after = estimator.estimate()
-    np.testing.assert_array_equal(after.coordinates, before.coordinates)
-    assert any("older" in warning for warning in after.warnings)
-    estimator.advance(STEP, 0.0)
-    estimator.correct(np.full(3, np.nan))
-    assert not any("older" in warning for warning in estimator.estimate().warnings)
-
-
-def test_missing_tips_change_nothing() -> None:
-    turns = turns_for(30)
-    tips = noisy(path(turns))
-    with_missing, without = (HypothesisFilter(FilterSettings()) for _ in range(2))
-    for estimator in (with_missing, without):
-        drive(estimator, turns[:20], tips[:21])
-    for turn in turns[20:]:
-        with_missing.advance(STEP, turn)
-        with_missing.correct(np.array([np.nan, 0.0, 0.0]))
-        without.advance(STEP, turn)
-    np.testing.assert_allclose(
-        with_missing.estimate().coordinates, without.estimate().coordinates, atol=1e-12
-    )
-    covariance = np.diag(with_missing.estimate().covariance)
-    np.testing.assert_allclose(covariance, np.diag(without.estimate().covariance), rtol=1e-9)
-    with_missing.correct(np.zeros(3), np.full((3, 3), np.inf))
-    np.testing.assert_allclose(np.diag(with_missing.estimate().covariance), covariance)
-
-
-def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
-    turns = turns_for(60)
-    tips = noisy(path(turns))
-    estimator = HypothesisFilter(FilterSettings())
-    before = drive(estimator, turns[:40], tips[:41])
-    far = np.array([0.003, 0.0, 0.0])
-    estimator.correct(tips[40] + far)
-    after = estimator.estimate()
-    assert any("outlier" in warning for warning in after.warnings)
-    np.testing.assert_allclose(after.position, before.position, atol=0.0006)
-    estimator.correct(tips[40])
-    np.testing.assert_allclose(estimator.estimate().position, before.position, atol=0.0003)
-    for turn, tip in zip(turns[40:46], tips[41:47], strict=True):
-        estimator.advance(STEP, turn)
-        estimator.correct(tip + far)
-    moved = estimator.estimate()
-    np.testing.assert_allclose(moved.position, path(turns)[46, :3, 3] + far, atol=0.0008)
-    assert not moved.warnings
-    assert not moved.doubtful
-
-
-def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -> None:
-    turns = turns_for(9)
-    tips = noisy(path(turns))
-    # Early, while several rolls are possible; the later ones have mostly ended.
-    tips[9, 0] += 0.0025
-
-    def estimates(jump_share: float, row: int) -> Array:
-        estimator = HypothesisFilter(FilterSettings(jump_share=jump_share))
-        drive(estimator, turns, tips)
-        return rows(estimator._bank.tiles, row, 1)[:, 0]
-
-    settings = FilterSettings()
-    wanted = settings.jump_share * estimates(1e-6, WEIGHT) * estimates(1e-6, OUTLIER)
-    wanted = np.sort(wanted[wanted > 1.0 / settings.prune_ratio])
-    weights = estimates(settings.jump_share, WEIGHT)
-    displaced = np.isclose(estimates(settings.jump_share, X), tips[9, 0], rtol=0.0, atol=1e-12)
-    seen = np.sort(weights[displaced & (weights > 0.0)])
-    # As far as there is room: the likeliest.
-    assert len(seen) > 5
-    np.testing.assert_allclose(seen, wanted[-len(seen) :])
-
-
-def test_what_comes_back_displaced_knows_its_place_as_well_as_the_tip() -> None:
-    turns = turns_for(20)
-    tips = path(turns)[:, :3, 3]
-    noise = 1e-8 * np.array([[4.0, 1.5, -1.0], [1.5, 3.0, 0.5], [-1.0, 0.5, 5.0]])
-    settings = FilterSettings()
-    estimator = HypothesisFilter(settings)
-    drive(estimator, turns, tips, noise)
-    seen = tips[20] + np.array([0.002, -0.001, 0.003])
-    estimator.correct(seen, noise)
-    tiles = estimator._bank.tiles
-    displaced = np.all(np.isclose(rows(tiles, X, 3), seen, atol=1e-12), axis=1)
-    assert np.count_nonzero(displaced) > 0
-    wanted = noise + np.eye(3) * settings.model_error**2
-    for covariance in covariances(tiles)[displaced]:
-        np.testing.assert_allclose(covariance[:3, :3], wanted, rtol=1e-9)
-        np.testing.assert_allclose(covariance[:3, 3:], 0.0)
 
 
 def test_learns_that_the_needle_lags_behind_the_stage() -> None:

@@ -389,12 +389,7 @@ def main() -> int:
             node.close()
         return EXIT_DONE
 
-    return run_node(
-        SimRigNode,
-        help_text=HELP,
-        parameters=SimRigParameters,
-        spin=spin,
-    )
+    return run_node(SimRigNode, help_text=HELP, parameters=SimRigParameters, spin=spin)
 
 
 if __name__ == "__main__":

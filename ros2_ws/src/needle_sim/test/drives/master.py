@@ -15,6 +15,7 @@ from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
 INSERTION, ROTATION, MASTER = 1, 2, 127
+CSP, PP, HM = 8, 1, 6  # modes of operation
 COUNTS_PER_METRE = 2.0e7
 COUNTS_PER_RADIAN = 65536 / math.tau
 SYNC_PERIOD = 0.02

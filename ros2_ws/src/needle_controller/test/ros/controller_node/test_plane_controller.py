@@ -2,198 +2,30 @@
 
 from __future__ import annotations
 
-import time
-from collections import defaultdict
-from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import (
-    PointStamped,
-    PoseStamped,
     PoseWithCovarianceStamped,
-    Vector3Stamped,
 )
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Header
-from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory
-from visualization_msgs.msg import Marker, MarkerArray
 
-from needle_common.diagnostics import Diagnostic, Level
+from needle_common.diagnostics import Level
 from needle_common.errors import UserError
 from needle_common.ros.conversions import (
-    JOINT_STATES,
-    LATCHED,
     RELIABLE,
-    to_diagnostic_status,
     to_nanoseconds,
     to_stamp,
-    values_of,
 )
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.protocol.joint_history import CONFIRMED_BY
 from needle_controller.ros.conversions import to_tip_covariance
-from needle_controller.ros.plane_controller import PlaneControllerNode, main
-from own_context import own_context
+from needle_controller.ros.plane_controller import main
 
-LIMIT = 20.0
-TICK = 20_000_000
-
-
-@pytest.fixture
-def context() -> Iterator[Context]:
-    with own_context() as context:
-        yield context
-
-
-class Bench:
-    """The node under test, a scripted device and a scripted tracker, on one executor."""
-
-    def __init__(self, context: Context, **parameters: Any) -> None:
-        # most tests send tips alone
-        given = {"tip_covariance": "configured", **parameters}
-        self.node = PlaneControllerNode(
-            context=context,
-            parameter_overrides=[Parameter(name, value=v) for name, v in given.items()],
-        )
-        self.outside = outside = Node("outside", context=context)
-        self._executor = SingleThreadedExecutor(context=context)
-        for node in (self.node, outside):
-            self._executor.add_node(node)
-        self.received: defaultdict[str, list[Any]] = defaultdict(list)
-        for kind, topic, qos in (
-            (JointTrajectory, "device/joint_trajectory", RELIABLE),
-            (PoseWithCovarianceStamped, "needle/estimate", RELIABLE),
-            (Vector3Stamped, "needle/reduced_state", RELIABLE),
-            (Vector3Stamped, "needle/linearized_state", RELIABLE),
-            (Vector3Stamped, "needle/control_input", RELIABLE),
-            (DiagnosticStatus, "needle/controller_status", LATCHED),
-            (DiagnosticArray, "/diagnostics", RELIABLE),
-        ):
-            outside.create_subscription(kind, topic, self.received[topic].append, qos)
-        self._joints = outside.create_publisher(JointState, "joint_states", JOINT_STATES)
-        self._tips = outside.create_publisher(PointStamped, "needle/tip", RELIABLE)
-        self._results = outside.create_publisher(Header, "device/result", RELIABLE)
-        self._device = outside.create_publisher(DiagnosticStatus, "device/status", LATCHED)
-        self._planes = outside.create_publisher(PoseStamped, "target_plane", LATCHED)
-        self._points = outside.create_publisher(PointStamped, "target_point", LATCHED)
-        self.obstacles = outside.create_publisher(MarkerArray, "obstacles", LATCHED)
-        self.now = TICK
-        self.insertion = self.rotation = 0.0
-        publishers = (
-            self._joints,
-            self._tips,
-            self._results,
-            self._device,
-            self._planes,
-            self._points,
-        )
-        self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        commands = self.node._outputs["device/joint_trajectory"]
-        self.until(lambda: commands.get_subscription_count() > 0)
-        self.until(lambda: bool(self.received["needle/controller_status"]))
-
-    def close(self) -> None:
-        for node in (self.node, self.outside):
-            self._executor.remove_node(node)
-            node.destroy_node()
-        self._executor.shutdown()
-
-    def until(self, condition: Callable[[], bool]) -> None:
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, f"waited in vain; {self.status}"
-            self._executor.spin_once(timeout_sec=0.05)
-
-    @property
-    def status(self) -> dict[str, str]:
-        messages = self.received["needle/controller_status"]
-        return values_of(messages[-1]) if messages else {}
-
-    @property
-    def commands(self) -> list[JointTrajectory]:
-        return self.received["device/joint_trajectory"]
-
-    def health(self, part: str) -> tuple[int, str]:
-        for array in reversed(self.received["/diagnostics"]):
-            for status in array.status:
-                if status.name == f"plane_controller: {part}":
-                    return status.level[0], status.message
-        return -1, ""
-
-    def device(self, state: str = "HOLDING", owner: str = "operator") -> None:
-        values = {"state": state, "homed": "true", "hold_owner": owner}
-        health = Diagnostic(Level.OK, state, values)
-        self._device.publish(to_diagnostic_status("device: device", "device", health))
-
-    def joints(self) -> None:
-        message = JointState(
-            name=["rotation_joint", "insertion_joint"], position=[self.rotation, self.insertion]
-        )
-        message.header.stamp = to_stamp(self.now)
-        self._joints.publish(message)
-
-    def call(self, service: str) -> Trigger.Response:
-        client = self.outside.create_client(Trigger, f"plane_controller/{service}")
-        self.until(client.service_is_ready)
-        future = client.call_async(Trigger.Request())
-        self.until(future.done)
-        return future.result()
-
-    def start(self) -> None:
-        self.device()
-        self.joints()
-        steering = self.node._steering
-        self.until(
-            lambda: steering.intake.joints.latest is not None and steering._device is not None
-        )
-        response = self.call("start")
-        assert response.success, response.message
-        self.until(lambda: self.status["awaiting"] == "tip")
-
-    def tip(self, position: list[float], frame: str = "rig", stamp: int | None = None) -> int:
-        """Publish a tip one tick later, joints first; its stamp."""
-        self.now += TICK
-        self.joints()
-        message = PointStamped()
-        stamp = self.now if stamp is None else stamp
-        message.header.stamp, message.header.frame_id = to_stamp(stamp), frame
-        message.point.x, message.point.y, message.point.z = position
-        self._tips.publish(message)
-        return stamp
-
-    def step(self) -> JointTrajectory:
-        """One good tip and the command it leads to."""
-        wanted = len(self.commands) + 1
-        stamp = self.tip([0.0, 0.0, self.insertion])
-        self.until(lambda: len(self.commands) >= wanted)
-        command = self.commands[-1]
-        assert to_nanoseconds(command.header.stamp) == stamp
-        return command
-
-    def run(self, command: JointTrajectory) -> None:
-        """Carry it out, and answer."""
-        self.insertion, self.rotation = command.points[0].positions
-        self.now += TICK
-        self.joints()
-        answer = Header(stamp=command.header.stamp, frame_id="succeeded")
-        self._results.publish(answer)
-        self.until(lambda: self.status["tip_after_ns"] == str(self.now))
-
-
-@pytest.fixture
-def bench(context: Context) -> Iterator[Bench]:
-    bench = Bench(context, target_offset=0.003)
-    yield bench
-    bench.close()
+from .node_bench import TICK, Bench
 
 
 def test_steers_step_by_step(bench: Bench) -> None:
@@ -402,81 +234,6 @@ def test_a_recorded_start_waits_for_the_tips_sources_too(context: Context) -> No
     # Each source has to have said that it knows this node, too.
     bench.until(lambda: bench.call("start").message.startswith("waiting for recorder of"))
     bench.close()
-
-
-def test_a_plane_given_at_run_time_and_planes_refused(bench: Bench) -> None:
-    message = PoseStamped()
-    message.header.frame_id = "rig"
-    message.pose.position.x = 0.005
-    message.pose.orientation.w = 1.0
-    bench._planes.publish(message)
-    bench.until(lambda: bench.status["target_offset_m"] == "0.005")
-    message.pose.position.x = float("nan")
-    bench._planes.publish(message)
-    bench.until(lambda: bench.health("target_plane")[0] == Level.WARN)
-    assert "not finite" in bench.health("target_plane")[1]
-    assert bench.status["target_offset_m"] == "0.005"
-
-
-def test_a_point_given_at_run_time_until_a_plane_is(bench: Bench) -> None:
-    message = PointStamped()
-    message.header.frame_id = "rig"
-    message.point.x, message.point.z = 0.01, 0.1
-    bench._points.publish(message)
-    bench.until(lambda: bench.status["target_point_m"] == "0.01, 0.0, 0.1")
-    message.point.x = 0.09
-    bench._points.publish(message)
-    bench.until(lambda: bench.health("target_point")[0] == Level.WARN)
-    assert "entering at" in bench.health("target_point")[1]
-    assert bench.status["target_point_m"] == "0.01, 0.0, 0.1"
-    plane = PoseStamped()
-    plane.header.frame_id = "rig"
-    plane.pose.orientation.w = 1.0
-    bench._planes.publish(plane)
-    bench.until(lambda: not bench.status["target_point_m"])
-
-
-def at_offset(bench: Bench, offset: float) -> bool:
-    return bench.status["target_offset_m"] == str(offset)
-
-
-def test_obstacles_given_at_run_time_and_obstacles_refused(bench: Bench) -> None:
-    assert bench.status["obstacles"] == "0"
-    made = Marker(type=Marker.SPHERE)
-    made.header.frame_id = "rig"
-    made.scale.x = made.scale.y = made.scale.z = 0.004
-    made.pose.position.z = 0.06
-    bench.obstacles.publish(MarkerArray(markers=[made]))
-    bench.until(lambda: bench.status["obstacles"] == "1")
-    bad = Marker(type=Marker.CUBE, header=made.header)
-    bench.obstacles.publish(MarkerArray(markers=[bad]))
-    bench.until(lambda: bench.health("obstacles")[0] == Level.WARN)
-    assert "the last obstacles stay" in bench.health("obstacles")[1]
-    assert bench.status["obstacles"] == "1"
-    bench.obstacles.publish(MarkerArray())
-    bench.until(lambda: bench.status["obstacles"] == "0")
-
-
-def test_a_plane_from_a_plain_publisher_is_taken_and_each_plane_once(
-    bench: Bench, capfd: pytest.CaptureFixture[str]
-) -> None:
-    plain = bench.outside.create_publisher(PoseStamped, "target_plane", RELIABLE)
-    bench.until(lambda: plain.get_subscription_count() == 1)
-    message = PoseStamped()
-    message.header.frame_id = "rig"
-    message.pose.orientation.w = 1.0
-    # Of the latched publisher both subscriptions hear: a plane that came before must not come back.
-    for offset, publisher in ((0.001, bench._planes), (0.002, plain), (0.004, bench._planes)):
-        message.pose.position.x = offset
-        publisher.publish(message)
-        bench.until(partial(at_offset, bench, offset))
-    message.pose.position.x = 0.005
-    plain.publish(message)
-    bench.until(partial(at_offset, bench, 0.005))
-    said = capfd.readouterr().err
-    assert said.count("target_plane at offset") == 4
-    ours = [line for line in said.splitlines() if "[plane_controller]" in line]
-    assert not any("incompatible" in line for line in ours)
 
 
 def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:

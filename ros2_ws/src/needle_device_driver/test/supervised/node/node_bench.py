@@ -33,7 +33,7 @@ from needle_common.ros.conversions import (
 )
 from needle_device_driver.ros.device_driver import DeviceDriverNode
 
-from .scripted_drives import ScriptedDrive
+from ..scripted_drives import ScriptedDrive
 
 LIMIT = 20.0
 CHANNELS = itertools.count()

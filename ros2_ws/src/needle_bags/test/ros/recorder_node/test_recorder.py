@@ -1,119 +1,24 @@
 from __future__ import annotations
 
 import json
-import os
-import signal
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
-import rclpy
 import yaml
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader
-from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Int32, String
 from std_srvs.srv import Trigger
 
-from needle_common.process.ros_domain import own_domain
-
-STORE = get_typestore(Stores.ROS2_JAZZY)
-PATIENCE = 20.0
-RECORDER = (sys.executable, "-m", "needle_bags.ros.recorder")
-
-
-class Source:
-    """A node in this process that publishes into the domain."""
-
-    def __init__(self, domain: int) -> None:
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain)
-        self.node = Node("source", context=self.context)
-        self.node.declare_parameter("gain", 1.5)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-
-    def wait(self, condition: Callable[[], object], what: str) -> None:
-        end = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < end, f"waited in vain for {what}"
-            self.executor.spin_once(timeout_sec=0.02)
-
-    def publisher(self, kind: type, topic: str, qos: QoSProfile | int = 1000) -> Any:
-        return self.node.create_publisher(kind, topic, qos)
-
-    def wait_matched(self, *publishers: Any) -> None:
-        self.wait(
-            lambda: all(p.get_subscription_count() for p in publishers), "the recorder to subscribe"
-        )
-
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-
-@pytest.fixture
-def domain() -> Iterator[int]:
-    with own_domain() as number:
-        yield number
-
-
-@pytest.fixture
-def source(domain: int) -> Iterator[Source]:
-    one = Source(domain)
-    yield one
-    one.close()
-
-
-def start(domain: int, *parameters: str, largest_file: int = 0) -> subprocess.Popen[str]:
-    arguments = ["--ros-args"]
-    for parameter in parameters:
-        arguments += ["-r" if parameter.startswith("__") else "-p", parameter]
-    limit = ["prlimit", f"--fsize={largest_file}:unlimited"] if largest_file else []
-    return subprocess.Popen(
-        [*limit, *RECORDER, *arguments],
-        env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
-def end(process: subprocess.Popen[str], number: int = signal.SIGTERM) -> tuple[int, str, str]:
-    process.send_signal(number)
-    try:
-        printed, errors = process.communicate(timeout=PATIENCE)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.communicate()
-        raise
-    return process.returncode, printed, errors
-
-
-def numbers(bag: Path, topic: str) -> list[int]:
-    with AnyReader([bag]) as reader:
-        connections = [c for c in reader.connections if c.topic == topic]
-        return [
-            int(reader.deserialize(data, c.msgtype).data)  # type: ignore[attr-defined]
-            for c, _, data in reader.messages(connections=connections)
-            if c.topic == topic  # no connections stand for all
-        ]
+from .recorder_process import PATIENCE, STORE, Source, end, numbers, start
 
 
 def test_nothing_is_lost(domain: int, source: Source, tmp_path: Path) -> None:
@@ -230,83 +135,6 @@ def test_split_compressed_and_parameters_that_change(
     assert yaml.safe_load(custom["parameters"])["/source"]["ros__parameters"]["gain"] == 1.5
     (change,) = yaml.safe_load(custom["parameter_changes"])
     assert (change["node"], change["name"], change["value"]) == ("/source", "gain", 2.5)
-
-
-def test_topics_with_subscribers_only_are_recorded_from_the_first_message(
-    domain: int, source: Source, tmp_path: Path
-) -> None:
-    """A publisher that says one thing and ends would be missed if the recorder came after it."""
-    bag = tmp_path / "bag"
-    source.node.create_subscription(Int32, "estop", lambda _: None, 10)
-    process = start(domain, f"bag:={bag}")
-    graph = source.node
-    source.wait(lambda: graph.count_subscribers("/estop") == 2, "the recorder to subscribe")
-    publisher = source.publisher(Int32, "estop")
-    source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
-    publisher.publish(Int32(data=1))
-    # What is not acknowledged goes with its publisher.
-    assert publisher.wait_for_all_acked(Duration(seconds=PATIENCE))
-    source.node.destroy_publisher(publisher)
-    source.wait(lambda: not graph.count_publishers("/estop"), "the publisher to go")
-    assert end(process, signal.SIGINT)[0] == 0
-    assert numbers(bag, "/estop") == [1]
-
-
-def test_a_latched_publisher_is_served_although_the_topic_was_volatile_before(
-    domain: int, source: Source, tmp_path: Path
-) -> None:
-    bag = tmp_path / "bag"
-    source.node.create_subscription(Int32, "plane", lambda _: None, 10)
-    process = start(domain, f"bag:={bag}")
-    graph = source.node
-    source.wait(lambda: graph.count_subscribers("/plane") == 2, "the recorder to subscribe")
-    latched = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    publisher = source.publisher(Int32, "plane", latched)
-    source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
-    publisher.publish(Int32(data=7))
-    durable = DurabilityPolicy.TRANSIENT_LOCAL
-    source.wait(
-        lambda: (
-            durable
-            in [
-                info.qos_profile.durability
-                for info in graph.get_subscriptions_info_by_topic("/plane")
-                if info.node_name == "recorder"
-            ]
-        ),
-        "the recorder to ask for the latched message",
-    )
-    source.wait_matched(publisher)
-    publisher.publish(Int32(data=8))
-    assert end(process)[0] == 0
-    assert numbers(bag, "/plane") == [7, 8]
-
-
-def test_a_best_effort_publisher_that_comes_last_is_not_told_of_incompatible_requests(
-    domain: int, source: Source, tmp_path: Path
-) -> None:
-    bag = tmp_path / "bag"
-    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    source.node.create_subscription(Int32, "hold", lambda _: None, best_effort)
-    process = start(domain, f"bag:={bag}")
-    source.wait(lambda: source.node.count_subscribers("/hold") == 2, "the recorder to subscribe")
-    refused: list[Any] = []
-    callbacks = PublisherEventCallbacks(incompatible_qos=refused.append)
-    publisher = source.node.create_publisher(Int32, "hold", best_effort, event_callbacks=callbacks)
-    source.wait(lambda: publisher.get_subscription_count() == 2, "the match")
-
-    def heard() -> bool:
-        # A best effort message is lost where the recorder has not learnt of its publisher yet.
-        publisher.publish(Int32(data=1))
-        return b"/hold" in (bag / "bag_0.mcap").read_bytes()
-
-    source.wait(heard, "the recorder to hear it")
-    source.wait(lambda: source.node.count_subscribers("/hold") == 2, "one subscription each")
-    code, _, errors = end(process)
-    assert code == 0
-    assert refused == []
-    assert "incompatible" not in errors
-    assert set(numbers(bag, "/hold")) == {1}
 
 
 class Health:

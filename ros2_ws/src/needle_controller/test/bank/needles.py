@@ -1,0 +1,76 @@
+"""Exact needles, their turns and noisy tips, and a filter that is driven along them."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from needle_controller.bank.hypotheses import (
+    RollHypothesis,
+    TorsionHypothesis,
+)
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.bank.hypothesis_mixture import (
+    MixtureEstimate,
+)
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import rotation_from_angles
+
+CURVATURE = 1.0 / 0.122
+STEP = 0.001
+RIGID = (TorsionHypothesis(0.0, 0.0, 0.0, 1.0),)
+ROLL_AS_SET = (RollHypothesis(0.0, np.deg2rad(30.0), 1.0),)
+
+
+def path(
+    turns: Array,
+    pitch: float = 0.0,
+    roll: float = 0.0,
+    curvature: float = CURVATURE,
+    play: float = 0.0,
+    lag: float = 0.0,
+    start: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> Array:
+    """Poses (len(turns) + 1, 4, 4) of an exact needle, tip turned through play and lag."""
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_from_angles([0.0, pitch, roll])
+    pose[:3, 3] = start
+    poses, base, behind, tip = [pose], 0.0, 0.0, 0.0
+    for turn in turns:
+        before = tip
+        parts = 200 if play or lag else 1
+        for _ in range(parts):
+            base += turn / parts
+            behind = min(max(behind, base - play), base + play)
+            tip = tip + (behind - tip) * (1 - np.exp(-STEP / parts / lag)) if lag else behind
+        x, z = curvature * STEP, tip - before
+        twist = np.array([[0, -z, 0, 0], [z, 0, -x, 0], [0, x, 0, STEP], [0, 0, 0, 0.0]])
+        pose = pose @ expm(twist)
+        poses.append(pose)
+    return np.array(poses)
+
+
+def turns_for(count: int, seed: int = 5, size: float = 0.3) -> Array:
+    rng = np.random.default_rng(seed)
+    return np.repeat(rng.uniform(-size, size, count // 4 + 1), 4)[:count]
+
+
+def drive(
+    estimator: HypothesisFilter, turns: Array, tips: Array, covariance: Array | None = None
+) -> MixtureEstimate:
+    estimator.reset(tips[0], np.zeros(2))
+    for turn, tip in zip(turns, tips[1:], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip, covariance)
+    return estimator.estimate()
+
+
+def noisy(poses: Array, seed: int = 6, bound: float = 0.001) -> Array:
+    tips = poses[:, :3, 3]
+    return tips + np.random.default_rng(seed).uniform(-bound, bound, tips.shape)
+
+
+def rotation_error(estimate: MixtureEstimate, pose: Array) -> float:
+    return float(np.rad2deg(Rotation.from_matrix(estimate.rotation @ pose[:3, :3].T).magnitude()))

@@ -1,0 +1,79 @@
+"""Wrong tips, and needles that are displaced."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from needle_controller.bank.estimate_tiles import OUTLIER, WEIGHT, X, covariances, rows
+from needle_controller.bank.filter_settings import FilterSettings
+from needle_controller.bank.hypothesis_filter import HypothesisFilter
+from needle_controller.model.arrays import Array
+
+from .needles import (
+    STEP,
+    drive,
+    noisy,
+    path,
+    turns_for,
+)
+
+
+def test_an_outlier_is_refused_and_a_jump_is_believed() -> None:
+    turns = turns_for(60)
+    tips = noisy(path(turns))
+    estimator = HypothesisFilter(FilterSettings())
+    before = drive(estimator, turns[:40], tips[:41])
+    far = np.array([0.003, 0.0, 0.0])
+    estimator.correct(tips[40] + far)
+    after = estimator.estimate()
+    assert any("outlier" in warning for warning in after.warnings)
+    np.testing.assert_allclose(after.position, before.position, atol=0.0006)
+    estimator.correct(tips[40])
+    np.testing.assert_allclose(estimator.estimate().position, before.position, atol=0.0003)
+    for turn, tip in zip(turns[40:46], tips[41:47], strict=True):
+        estimator.advance(STEP, turn)
+        estimator.correct(tip + far)
+    moved = estimator.estimate()
+    np.testing.assert_allclose(moved.position, path(turns)[46, :3, 3] + far, atol=0.0008)
+    assert not moved.warnings
+    assert not moved.doubtful
+
+
+def test_what_takes_a_tip_for_an_outlier_comes_back_displaced_with_its_share() -> None:
+    turns = turns_for(9)
+    tips = noisy(path(turns))
+    # Early, while several rolls are possible; the later ones have mostly ended.
+    tips[9, 0] += 0.0025
+
+    def estimates(jump_share: float, row: int) -> Array:
+        estimator = HypothesisFilter(FilterSettings(jump_share=jump_share))
+        drive(estimator, turns, tips)
+        return rows(estimator._bank.tiles, row, 1)[:, 0]
+
+    settings = FilterSettings()
+    wanted = settings.jump_share * estimates(1e-6, WEIGHT) * estimates(1e-6, OUTLIER)
+    wanted = np.sort(wanted[wanted > 1.0 / settings.prune_ratio])
+    weights = estimates(settings.jump_share, WEIGHT)
+    displaced = np.isclose(estimates(settings.jump_share, X), tips[9, 0], rtol=0.0, atol=1e-12)
+    seen = np.sort(weights[displaced & (weights > 0.0)])
+    # As far as there is room: the likeliest.
+    assert len(seen) > 5
+    np.testing.assert_allclose(seen, wanted[-len(seen) :])
+
+
+def test_what_comes_back_displaced_knows_its_place_as_well_as_the_tip() -> None:
+    turns = turns_for(20)
+    tips = path(turns)[:, :3, 3]
+    noise = 1e-8 * np.array([[4.0, 1.5, -1.0], [1.5, 3.0, 0.5], [-1.0, 0.5, 5.0]])
+    settings = FilterSettings()
+    estimator = HypothesisFilter(settings)
+    drive(estimator, turns, tips, noise)
+    seen = tips[20] + np.array([0.002, -0.001, 0.003])
+    estimator.correct(seen, noise)
+    tiles = estimator._bank.tiles
+    displaced = np.all(np.isclose(rows(tiles, X, 3), seen, atol=1e-12), axis=1)
+    assert np.count_nonzero(displaced) > 0
+    wanted = noise + np.eye(3) * settings.model_error**2
+    for covariance in covariances(tiles)[displaced]:
+        np.testing.assert_allclose(covariance[:3, :3], wanted, rtol=1e-9)
+        np.testing.assert_allclose(covariance[:3, 3:], 0.0)
