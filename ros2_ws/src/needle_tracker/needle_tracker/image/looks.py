@@ -263,6 +263,7 @@ class MapLook:
             bright=True,
             allowance=_ALLOWANCE * width,
             come=self._has_come(image, point, direction, width),
+            all_new=self.background is not None and self.background.is_empty,
         )
 
 

@@ -55,6 +55,8 @@ class ImageTip:
         it is seen to end, and finely; a map's covers what a ground face hides.
     come : bool
         Whether it is seen where there was nothing of it in an earlier image.
+    all_new : bool
+        Whether that image is one without any needle.
     """
 
     point: Array
@@ -68,6 +70,7 @@ class ImageTip:
     bright: bool = False
     allowance: float = 1.0
     come: bool = False
+    all_new: bool = False
 
     @property
     def doubt_across(self) -> float:

@@ -312,7 +312,7 @@ class Acquisition:
             possible=self._usual.allows(found),
             near=near,
             guided=guided,
-            come=come,
+            come=come or (not track.has_begun and all(tip.all_new for tip in found)),
         )
 
     def _is_borne_out(

@@ -227,7 +227,8 @@ def sights_to_confirm(
     guided : bool
         Whether one view's end was found from what the other shows and the needle's way.
     come : bool
-        Whether nothing says how far the needle goes but an end that has come.
+        Whether an end that has come needs no further sight: nothing else says how far the needle
+        goes, or the phantom was seen without it and it has not been found yet.
 
     Returns
     -------

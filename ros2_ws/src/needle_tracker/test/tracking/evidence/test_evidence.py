@@ -12,7 +12,7 @@ import pytest
 
 from needle_tracker.image.corridor import within_corridor
 from needle_tracker.image.search_grid import make_search_grid
-from needle_tracker.image.tip_fit import hidden
+from needle_tracker.image.tip_fit import ImageTip, hidden
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking import acquisition
@@ -26,6 +26,7 @@ from needle_tracker.tracking.evidence import (
     sights_to_contradict,
     sights_to_exclude,
 )
+from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -84,6 +85,27 @@ def test_what_has_come_is_new_in_both_views_and_seen_in_both() -> None:
     for other in (GOOD, hidden(new), dataclasses.replace(new, sigma_along=3.5), None):
         assert not has_come((new, other))
         assert not has_come((other, new))
+
+
+def test_once_the_phantom_was_seen_empty_one_sight_finds_the_needle(
+    settings: TrackerSettings, calibration: StereoCalibration
+) -> None:
+    tracker = StereoTracker(calibration, settings)
+    kept = dataclasses.replace(POOR, come=True)
+    new = dataclasses.replace(kept, all_new=True)
+
+    def wanted(left: ImageTip, right: ImageTip) -> int | None:
+        measured = Measurement(tip(), tracker.track.state, "", (left, right))
+        return tracker._acquisition._sights_wanted(measured, (left, right), 0.05, on_way=False)
+
+    assert wanted(new, new) == 0
+    # What a first pair with a needle has had already may hide some of it.
+    assert wanted(kept, kept) == wanted(new, kept) == 3
+    assert wanted(new, dataclasses.replace(new, sigma_along=3.5)) is None
+    # Later it is known where it is, and what comes may be a hand.
+    tracker.track.__dict__.update(established(settings).__dict__)
+    measured = Measurement(tip(x=0.004), tracker.track.state, "", (new, new))
+    assert tracker._acquisition._sights_wanted(measured, (new, new), 0.06, on_way=False) != 0
 
 
 def test_one_sight_will_do_where_the_needle_must_be_only() -> None:
