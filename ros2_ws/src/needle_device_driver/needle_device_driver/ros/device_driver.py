@@ -173,8 +173,8 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
         self._timer.reset()
         state = self._supervisor.state
-        # A fault from before the configuration, such as another device: the start names it.
-        if state is State.UNCONFIGURED or (self._autostart and state is State.FAULT):
+        # A stop from before the configuration does not end the search for drives.
+        if state is State.UNCONFIGURED or self._autostart:
             self._start_by_itself()
             return
         if self._sim_time:
