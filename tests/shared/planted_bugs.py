@@ -20,6 +20,7 @@ from needle_controller.ros import conversions
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
+from needle_device_driver.ros.device_driver import DeviceDriverNode
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
@@ -255,6 +256,16 @@ def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(JoySource, "take", unstamped)
 
 
+def _emergency_stop_ends_the_search(patch: pytest.MonkeyPatch) -> None:
+    start = DeviceDriverNode._start_by_itself
+
+    def unless_stopped(node: DeviceDriverNode) -> None:
+        if node._supervisor.state is not State.ESTOPPED:
+            start(node)
+
+    patch.setattr(DeviceDriverNode, "_start_by_itself", unless_stopped)
+
+
 def _set(owner: Any, **values: Any) -> Plant:
     def plant(patch: pytest.MonkeyPatch) -> None:
         for name, value in values.items():
@@ -274,6 +285,9 @@ def _judge_forgets(**values: float) -> Plant:
 
 
 MENDED = {
+    "an_emergency_stop_while_drives_are_waited_for": MendedBug(
+        "the_way_goes_on", _emergency_stop_ends_the_search
+    ),
     "a_recorder_begins_on_a_broken_disk": MendedBug(
         "nothing_recorded_is_lost", _bag_begins_without_writing
     ),
