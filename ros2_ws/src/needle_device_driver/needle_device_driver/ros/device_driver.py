@@ -172,9 +172,8 @@ class DeviceDriverNode(WholeLifecycleNode):
     def _on_timer(self) -> None:
         self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
         self._timer.reset()
-        state = self._supervisor.state
         # A stop from before the configuration does not end the search for drives.
-        if state is State.UNCONFIGURED or self._autostart:
+        if self._supervisor.state is State.UNCONFIGURED or self._autostart:
             self._start_by_itself()
             return
         if self._sim_time:
@@ -258,9 +257,10 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._device.others:
             raise UserError(f"{self.get_fully_qualified_name()}: {self._device.others}")
         why_not = self._drives.probe()
+        if not why_not and self._supervisor.state is not State.UNCONFIGURED:
+            reply = self._supervisor.reset(now)
+            why_not = "" if reply.success else reply.message
         if not why_not:
-            # Once: afterwards the lifecycle is in somebody's hands.
-            self._autostart = False
             self._ends_if_refused = True
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                 self._ends_if_refused = False
@@ -275,10 +275,9 @@ class DeviceDriverNode(WholeLifecycleNode):
 
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Open the link and set both drives up; moves nothing."""
-        now = time.monotonic()
         if self._supervisor.state is not State.UNCONFIGURED:
             # A fault from before the configuration; an emergency stop that is pressed stays.
-            self._supervisor.reset(now)
+            self._supervisor.reset(time.monotonic())
         why_not = self._drives.probe()
         simulated = not why_not and self._is_simulated()
         if self._settings.lock_step and not (why_not or simulated):
@@ -288,8 +287,9 @@ class DeviceDriverNode(WholeLifecycleNode):
             why_not = "" if reply.success else reply.message
         if not why_not:
             self._device.simulated = simulated
+            # Once, whoever did it: afterwards the lifecycle is in somebody's hands.
+            self._autostart = False
         elif self._ends_if_refused:
-            # Its last words are these.
             self._refusal = why_not
             return TransitionCallbackReturn.FAILURE
         self._device.report()

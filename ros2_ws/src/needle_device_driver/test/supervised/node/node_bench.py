@@ -285,3 +285,6 @@ class Rig:
         self.driver.destroy_node()
         self.partner.destroy_node()
         self.peer.close()
+
+
+Make = Callable[..., Rig]

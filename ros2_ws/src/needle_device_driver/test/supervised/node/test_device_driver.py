@@ -7,7 +7,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import pytest
@@ -21,9 +21,7 @@ from needle_common.errors import UserError
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import to_nanoseconds
 
-from .node_bench import Rig
-
-Make = Callable[..., Rig]
+from .node_bench import Make, Rig
 
 
 def test_steps_end_where_they_should_and_each_tick_is_one_sync(make_rig: Make) -> None:
@@ -215,6 +213,33 @@ def test_drives_that_come_later_are_waited_for(make_rig: Make) -> None:
     rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
     rig.peer.drives[1].silent = False
     rig.until(lambda: rig.partner.status.get("state") == "DISABLED", "configured")
+
+
+def test_an_emergency_stop_does_not_end_the_search_for_drives(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.peer.drives[1].silent = True
+    rig.matched()
+    rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
+    rig.partner.estops.publish(Bool(data=True))
+    rig.until(lambda: rig.partner.status.get("state") == "ESTOPPED", "the stop")
+    rig.peer.drives[1].silent = False
+    rig.until(lambda: "still pressed" in rig.call("reset").message, "the drives")
+    rig.partner.estops.publish(Bool(data=False))
+    rig.until(lambda: rig.call("reset").success, "the reset")
+    rig.until(lambda: rig.partner.status.get("state") == "DISABLED", "configured")
+
+
+def test_who_configures_it_meanwhile_has_it_watched_all_the_same(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.peer.drives[1].silent = True
+    rig.matched()
+    rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
+    rig.driver._retry_at = math.inf
+    rig.peer.drives[1].silent = False
+    assert rig.transition(Transition.TRANSITION_CONFIGURE)
+    assert rig.transition(Transition.TRANSITION_ACTIVATE)
+    rig.peer.drives[1].silent = True
+    rig.until(lambda: rig.partner.status.get("state") == "FAULT", "the lost drive")
 
 
 def test_between_words_on_what_the_drives_lack_their_watchdogs_are_fed(

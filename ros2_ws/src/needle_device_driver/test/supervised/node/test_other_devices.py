@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import pytest
 import rclpy
@@ -16,9 +15,7 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE
 from needle_device_driver.ros import device_driver as device_driver_node
 
-from .node_bench import Rig
-
-Make = Callable[..., Rig]
+from .node_bench import Make
 
 
 def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:

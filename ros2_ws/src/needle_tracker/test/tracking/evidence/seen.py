@@ -7,10 +7,12 @@ import dataclasses
 import numpy as np
 
 from needle_tracker.image.tip_fit import ImageTip
+from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
+Views = tuple[RefractedCamera, RefractedCamera]
 GOOD = ImageTip(np.zeros(2), np.array([1.0, 0.0]), 0.05, 0.15, 0.005, 100.0, 0.6)
 POOR = dataclasses.replace(GOOD, sigma_across=0.7)
 AHEAD = np.array([0.0, 0.0, 1.0])

@@ -14,7 +14,6 @@ from needle_tracker.image.corridor import within_corridor
 from needle_tracker.image.search_grid import make_search_grid
 from needle_tracker.image.tip_fit import ImageTip, hidden
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking import acquisition
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
@@ -31,9 +30,7 @@ from needle_tracker.tracking.track import Track, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
-from .seen import GOOD, POOR, established, tip
-
-Views = tuple[RefractedCamera, RefractedCamera]
+from .seen import GOOD, POOR, Views, established, tip
 
 
 @pytest.mark.parametrize("state", [TrackState.TRACKING, TrackState.LOST])

@@ -11,7 +11,6 @@ import pytest
 
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import (
     VisibilityAverage,
     is_sound,
@@ -22,9 +21,7 @@ from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
-from .seen import AHEAD, GOOD, established, tip
-
-Views = tuple[RefractedCamera, RefractedCamera]
+from .seen import AHEAD, GOOD, Views, established, tip
 
 
 def test_what_stands_out_more_than_the_needle_can_must_be_seen_again() -> None:
