@@ -1,6 +1,7 @@
 """The whole graph, short runs."""
 
 import json
+import random
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,6 +12,7 @@ from needle_analysis.ros import rerun
 from needle_verification.checking import SimulateRun, Workbench, payloads, unreadable
 
 SHORT = ("--depth-mm", "10")
+SIMULATE = (sys.executable, "-m", "needle_bringup.simulation.simulate")
 TOPICS = ("/needle/tip", "/device/joint_trajectory", "/sim/tip_pose")
 
 Run = Callable[..., SimulateRun]
@@ -19,8 +21,7 @@ Run = Callable[..., SimulateRun]
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Return a function that runs `simulate` to its end; a name that has run gives its run."""
-    command = [sys.executable, "-m", "needle_bringup.simulation.simulate"]
-    bench = Workbench(command, tmp_path_factory.mktemp("runs"))
+    bench = Workbench(SIMULATE, tmp_path_factory.mktemp("runs"))
 
     def finish(name: str, *arguments: str) -> SimulateRun:
         figures = bench.folder / f"{name}.json"
@@ -85,6 +86,19 @@ def test_a_continuous_run_goes_on_and_repeats(run: Run) -> None:
     assert summary["insertion_final_mm"] == pytest.approx(6.0, abs=0.01)
     assert summary["state"] == "DONE"
     assert rerun.main([str(one.bag)]) == 0
+
+
+def test_a_continuous_run_whose_nodes_stand_still_is_the_same(run: Run, tmp_path: Path) -> None:
+    arguments = ("--level", "tip", "--insertion", "continuous", "--depth-mm", "6")
+    usual = payloads(run("goes_on", *arguments).bag, TOPICS)
+    bench = Workbench(SIMULATE, tmp_path)
+    nodes = ("simulated_operator", "plane_controller", "sim_rig")
+    patience = tmp_path / "patience.yaml"
+    patience.write_text("sim_rig: {ros__parameters: {reexpose_after: 60.0}}")
+    patient = (*arguments, "--params", str(patience))
+    paused = bench.run_with_pauses("paused", nodes, random.Random(4), *patient)
+    assert paused.code == 1, paused.output
+    assert payloads(paused.bag, TOPICS) == usual
 
 
 @pytest.mark.parametrize(

@@ -100,15 +100,15 @@ class MotionSupervisor:
         at = self._core.snapshot
         return None if at is None or at.age(now) > self._limits.reply_age_limit else at
 
+    def held(self, now: float) -> bool:
+        """Return whether somebody holds who was heard within the time-out, at a speed above 0."""
+        return self._hold.is_fresh(now) and self._hold.speed_scale > 0.0
+
     def may_move(self, now: float) -> bool:
         """Return whether what is under way would go on if `drive` were called now."""
         if self._core.activity is Activity.HOMING:
             return True
-        return (
-            self._core.activity is not Activity.NONE
-            and self._hold.is_fresh(now)
-            and self._hold.speed_scale > 0.0
-        )
+        return self._core.activity is not Activity.NONE and self.held(now)
 
     def status(self, now: float) -> DeviceStatus:
         """Return the device's status."""

@@ -145,12 +145,13 @@ class LockStep:
         may_move : bool
             Whether it would go on now (hold fresh, speed not 0).
         held : bool
-            Whether somebody's fresh hold counts.
+            Whether somebody's hold counts.
         now : float
             Steady time [s].
         """
         if self._continuous and self._tip_wanted_after_ns is not None:
-            if not held:
+            # Frames of a needle that is paused would come as often as the pause is long.
+            if not held or (under_way and not may_move):
                 return Action.WAIT
             return self._next_of_continuous(time_ns + self._tick_ns, heard_command_ns, now)
         if under_way:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -76,6 +76,7 @@ class DriveFollower:
         self._on_step_end = on_step_end
         self._status: dict[str, str] = {}
         self._motors_turn = False
+        self._paused = False
         self._trips = 0
         self._estop = node.create_publisher(Bool, "device/estop", RELIABLE)
         subscribe = node.create_subscription
@@ -170,6 +171,11 @@ class DriveFollower:
                 f"{self._node.get_fully_qualified_name()}: the device is real, or not in simulated "
                 f"time ({message.name} says simulated = false): no part of a simulation; {WAY_OUT}"
             )
+        paused = is_paused(self._status)
+        if paused and not self._paused:
+            # Unlike simulated axes, drives take a tick or more to come to rest and to go on.
+            self._tell_trips("a hold fell silent: the drives paused")
+        self._paused = paused
 
     def _on_joint_states(self, message: JointState) -> None:
         self._tick.heard()
@@ -181,6 +187,15 @@ class DriveFollower:
         self._tick.drives_moved()
         self._motors_turn = any(velocity != 0.0 for velocity in message.velocity)
         self._bench.move_to(at["insertion_joint"], at["rotation_joint"])
+
+
+def is_paused(status: Mapping[str, str]) -> bool:
+    """Return whether a motion waits for a hold that nobody let go of."""
+    return (
+        status.get("activity", "none") != "none"
+        and status.get("needs_time") != "true"
+        and float(status.get("speed_scale") or 0.0) > 0.0
+    )
 
 
 def places_of(message: JointState) -> dict[str, float]:

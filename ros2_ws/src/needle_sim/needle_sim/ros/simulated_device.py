@@ -110,8 +110,8 @@ class SimulatedDevice:
         return self._supervisor.may_move(now)
 
     def held(self, now: float) -> bool:
-        """Return whether somebody's hold counts."""
-        return bool(self._supervisor.status(now).hold_owner)
+        """Return whether somebody's hold counts, and was heard of late."""
+        return self._supervisor.held(now)
 
     def heard_command(self) -> int:
         """Return the stamp of the newest command that the device has heard [ns]."""

@@ -206,6 +206,13 @@ def test_continuously_a_tip_that_was_not_found_is_an_answer() -> None:
     assert next_action(lock_step, time_ns=STAMP + TICK) is Action.EXPOSE
 
 
+def test_continuously_a_needle_that_is_paused_gets_no_frames() -> None:
+    lock_step = new_lock_step(answered=False)
+    continuous(lock_step)
+    assert next_action(lock_step, under_way=True) is Action.WAIT
+    assert next_action(lock_step, under_way=True, may_move=True) is Action.EXPOSE
+
+
 def test_continuously_time_stands_still_without_hold_and_goes_on_after_a_long_silence() -> None:
     lock_step = new_lock_step(answered=False)
     continuous(lock_step)

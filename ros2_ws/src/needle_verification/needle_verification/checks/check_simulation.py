@@ -119,6 +119,31 @@ def same_seed(bench: Workbench) -> Iterator[Finding]:
     )
 
 
+def stood_still(bench: Workbench) -> Iterator[Finding]:
+    """Nodes that stand still now and then change nothing, or the run says that they may have."""
+    nodes = ("simulated_operator", "plane_controller", "sim_rig")
+    for level in ("tip", "camera", "drive"):
+        for insertion in ("stepwise", "continuous"):
+            arguments = ("--level", level, "--insertion", insertion, *SHORT)
+            name = f"{level}_{insertion}_12"
+            usual = bench.run(name, *arguments)
+            # A driver that hears nothing of its drives ends in a fault, as on hardware.
+            halting = nodes if level != "drive" else nodes[:1]
+            paused = bench.run_with_pauses(
+                f"{name}_paused", halting, random.Random(SEED), *arguments
+            )
+            differ = _differences(usual.bag, paused.bag)
+            trips = paused.summary.get("watchdog_trips", 0)
+            same = f"different: {', '.join(differ)}" if differ else "the same"
+            yield Finding(
+                f"stood_still_{level}_{insertion}",
+                f"level {level}, {insertion}: with {', '.join(halting)} stopped again and again",
+                "the same bit for bit, or watchdog trips told",
+                f"{same}; {trips} trips",
+                not differ or trips > 0,
+            )
+
+
 def tip_speed(bench: Workbench) -> Iterator[Finding]:
     """Run the graph without images quickly."""
     run = bench.run("tip_1", "--level", "tip")
@@ -221,6 +246,7 @@ CHECKS: tuple[Check, ...] = (
     camera,
     open_loop,
     same_seed,
+    stood_still,
     tip_speed,
     interrupt,
     bad_parameter,

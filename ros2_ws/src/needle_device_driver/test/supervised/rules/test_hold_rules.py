@@ -82,8 +82,9 @@ def test_hold_age_a_message_counts_for_a_quarter_of_a_second(bench: Bench) -> No
     bench.ready()
     bench.command(0.002, 0.1, duration=2.0)
     arrival = bench.now
-    assert bench.supervisor.may_move(arrival + 0.249)
-    assert not bench.supervisor.may_move(arrival + 0.251)
+    for lasts in (bench.supervisor.may_move, bench.supervisor.held):
+        assert lasts(arrival + 0.249)
+        assert not lasts(arrival + 0.251)
     bench.supervisor.drive(bench.period, arrival + 0.251)
     assert in_state(bench, State.HOLDING)
     assert bench.last_rule is Rule.HOLD_AGE
@@ -253,6 +254,7 @@ def test_speed_scale_slows_and_0_stands_still(bench: Bench) -> None:
     bench.cycle(10, holding=True, scale=0.0)
     assert bench.insertion.position == pytest.approx(0.0002)
     assert not bench.supervisor.may_move(bench.now)
+    assert not bench.supervisor.held(bench.now)
 
 
 def test_no_motion_by_itself_on_configure_enable_reset(bench: Bench) -> None:
