@@ -194,7 +194,7 @@ def is_paused(status: Mapping[str, str]) -> bool:
     return (
         status.get("activity", "none") != "none"
         and status.get("needs_time") != "true"
-        and float(status.get("speed_scale") or 0.0) > 0.0
+        and status.get("speed_scale", "0") != "0"
     )
 
 
