@@ -63,7 +63,7 @@ def free_port() -> int:
 
 
 class Heard:
-    """What a rig's joints and its controller say, heard by a thread of its own."""
+    """What a rig's joints, device and controller say, heard by a thread of its own."""
 
     def __init__(self, domain: int) -> None:
         self._context = Context()
@@ -74,6 +74,10 @@ class Heard:
         self._node = Node("listening_test", context=self._context)
         self._node.create_subscription(JointState, "joint_states", self._take, JOINT_STATES)
         self._told: dict[str, str] = {}
+        self._device: dict[str, str] = {}
+        self._node.create_subscription(
+            DiagnosticStatus, "device/status", self._take_device, LATCHED
+        )
         self._node.create_subscription(
             DiagnosticStatus, "needle/controller_status", self._take_status, LATCHED
         )
@@ -121,6 +125,19 @@ class Heard:
         """Wait until the controller's status says so."""
         with self._heard:
             assert self._heard.wait_for(lambda: self._told.get(key) == text, LIMIT), self._told
+
+    def wait_until_let_go(self) -> None:
+        """Wait until nobody's hold counts and the device is ready, as it is between steps too."""
+        with self._heard:
+            assert self._heard.wait_for(self._is_let_go, LIMIT), self._device
+
+    def _is_let_go(self) -> bool:
+        return self._device.get("state") == "HOLDING" and self._device["hold_owner"] == ""
+
+    def _take_device(self, message: DiagnosticStatus) -> None:
+        with self._heard:
+            self._device = values_of(message)
+            self._heard.notify_all()
 
     def _take_status(self, message: DiagnosticStatus) -> None:
         with self._heard:
@@ -205,7 +222,8 @@ def press(page: Page, name: str) -> None:
 
 
 def check_stands_still(rig: Rig, page: Page) -> float:
-    """Fail unless the needle stays where it is once nothing moves; return where [m]."""
+    """Fail unless the needle stays where it is once nobody holds; return where [m]."""
+    rig.heard.wait_until_let_go()
     expect(reading(page, "Device")).to_have_text("HOLDING")
     places = rig.heard.next_ones(STANDS)
     assert max(places) - min(places) < 1e-6

@@ -35,6 +35,9 @@ def results_here(seeds: range) -> Iterator[RunResult]:
         context.Pool(workers, _begin_worker, (folder,)) as pool,
     ):
         yield from pool.imap(_run_seed, seeds)
+        # A worker that ends by itself leaves no semaphore for its tracker to complain of.
+        pool.close()
+        pool.join()
 
 
 def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
@@ -45,7 +48,7 @@ def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
 
 def run_part(seeds: range) -> list[RunResult]:
     """Run some seeds, on a worker."""
-    _freeze_once()
+    _settle_in()
     return [_run_seed(seed) for seed in seeds]
 
 
@@ -62,19 +65,20 @@ def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResul
 def _begin_worker(folder: str) -> None:
     tempfile.tempdir = folder
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
-    # What the bus has to say comes as faults of the axes.
-    logging.getLogger("canopen").addHandler(logging.NullHandler())
     # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    # Each run is collected at its end; what is imported stays, and need not be looked at.
-    gc.freeze()
+    _settle_in()
+    # Each run is collected at its end.
     gc.disable()
 
 
 @functools.lru_cache(maxsize=1)
-def _freeze_once() -> None:
-    """Look no more at what a worker has imported; the worker's own garbage goes on to be found."""
+def _settle_in() -> None:
+    """Prepare this process for runs, once."""
+    # What is imported stays, and need not be looked at for garbage.
     gc.freeze()
+    # What the bus has to say comes as faults of the axes.
+    logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 def _run_seed(seed: int) -> RunResult:
