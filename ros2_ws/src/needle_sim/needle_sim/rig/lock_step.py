@@ -149,6 +149,9 @@ class LockStep:
         now : float
             Steady time [s].
         """
+        if not held:
+            # Silence counts from when somebody holds.
+            self._heard_at = now
         if self._continuous and self._tip_wanted_after_ns is not None:
             # Frames of a needle that is paused would come as often as the pause is long.
             if not held or (under_way and not may_move):

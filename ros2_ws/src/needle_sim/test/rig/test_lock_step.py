@@ -115,12 +115,13 @@ def test_rule_4_silence_is_broken_and_counted_only_while_steering_and_held(
     lock_step.take_controller_status("STEERING", "tip", 0, 10.0)
     assert next_action(lock_step, now=11.9) is Action.WAIT
     assert next_action(lock_step, now=12.0, held=False) is Action.WAIT
+    assert next_action(lock_step, now=13.9) is Action.WAIT
     assert lock_step.watchdog_trips == 0
-    assert next_action(lock_step, now=12.0) is Action.EXPOSE
+    assert next_action(lock_step, now=14.0) is Action.EXPOSE
     assert lock_step.watchdog_trips == 1
-    lock_step.exposed(2 * STAMP, 12.0)
-    assert next_action(lock_step, now=13.0) is Action.WAIT
-    lock_step.take_controller_status("DONE", "nothing", 0, 13.0)
+    lock_step.exposed(2 * STAMP, 14.0)
+    assert next_action(lock_step, now=15.0) is Action.WAIT
+    lock_step.take_controller_status("DONE", "nothing", 0, 15.0)
     assert next_action(lock_step, now=99.0) is Action.WAIT
 
 
@@ -204,6 +205,21 @@ def test_continuously_a_tip_that_was_not_found_is_an_answer() -> None:
     assert next_action(lock_step, time_ns=STAMP + TICK) is Action.WAIT
     lock_step.take_answer(STAMP, False, 0.0)
     assert next_action(lock_step, time_ns=STAMP + TICK) is Action.EXPOSE
+
+
+@pytest.mark.parametrize("insertion", ["stepwise", "continuous"])
+def test_silence_while_nobody_holds_is_none(insertion: str) -> None:
+    lock_step = new_lock_step(answered=True)
+    lock_step.take_controller_status(
+        "STEERING", "tip", 0, 0.0, continuous=insertion == "continuous"
+    )
+    lock_step.exposed(STAMP, 0.0)
+    time_ns = STAMP + TICK
+    for now in (1.0, 9.0):
+        assert next_action(lock_step, held=False, time_ns=time_ns, now=now) is Action.WAIT
+    assert next_action(lock_step, time_ns=time_ns, now=9.1) is Action.WAIT
+    assert next_action(lock_step, time_ns=time_ns, now=11.1) is Action.EXPOSE
+    assert lock_step.watchdog_trips == 1
 
 
 def test_continuously_a_needle_that_is_paused_gets_no_frames() -> None:
