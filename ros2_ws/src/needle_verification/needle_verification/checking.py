@@ -113,6 +113,13 @@ def _heed_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
+def _signal(pids: Sequence[int], number: signal.Signals) -> None:
+    """Send a signal to those of the processes that are still there."""
+    for pid in pids:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, number)
+
+
 class StartedRun:
     """A run of `scripts/simulate` under way.
 
@@ -182,12 +189,11 @@ class StartedRun:
     def stand_still(self, node: str, duration: float) -> None:
         """Let a node do nothing for a while [s], as on a machine that has no time for it."""
         pids = [pid for pid, command in self.running() if node in command]
-        for number in (signal.SIGSTOP, signal.SIGCONT):
-            for pid in pids:
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(pid, number)
-            if number == signal.SIGSTOP:
-                time.sleep(duration)
+        _signal(pids, signal.SIGSTOP)
+        try:
+            time.sleep(duration)
+        finally:
+            _signal(pids, signal.SIGCONT)
 
     def running(self) -> list[tuple[int, str]]:
         """Return (pid, command) of every process of this run."""

@@ -168,7 +168,7 @@ class LockStep:
         if due:
             return Action.EXPOSE
         silent = now - self._heard_at >= self._reexpose_after
-        if held and silent and self._state in _STEERING:
+        if silent and self._state in _STEERING:
             self.watchdog_trips += 1
             return Action.EXPOSE
         return Action.WAIT

@@ -206,20 +206,22 @@ def test_without_autostart_nothing_is_configured_until_it_is_asked_for(make_rig:
     assert rig.label == "inactive"
 
 
-def test_drives_that_come_later_are_waited_for(make_rig: Make) -> None:
+def waiting_for_a_drive(make_rig: Make) -> Rig:
     rig = make_rig()
     rig.peer.drives[1].silent = True
     rig.matched()
     rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
+    return rig
+
+
+def test_drives_that_come_later_are_waited_for(make_rig: Make) -> None:
+    rig = waiting_for_a_drive(make_rig)
     rig.peer.drives[1].silent = False
     rig.until(lambda: rig.partner.status.get("state") == "DISABLED", "configured")
 
 
 def test_an_emergency_stop_does_not_end_the_search_for_drives(make_rig: Make) -> None:
-    rig = make_rig()
-    rig.peer.drives[1].silent = True
-    rig.matched()
-    rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
+    rig = waiting_for_a_drive(make_rig)
     rig.partner.estops.publish(Bool(data=True))
     rig.until(lambda: rig.partner.status.get("state") == "ESTOPPED", "the stop")
     rig.peer.drives[1].silent = False
@@ -230,10 +232,7 @@ def test_an_emergency_stop_does_not_end_the_search_for_drives(make_rig: Make) ->
 
 
 def test_who_configures_it_meanwhile_has_it_watched_all_the_same(make_rig: Make) -> None:
-    rig = make_rig()
-    rig.peer.drives[1].silent = True
-    rig.matched()
-    rig.until(lambda: "node 2 does not answer" in rig.call("home").message, "a name")
+    rig = waiting_for_a_drive(make_rig)
     rig.driver._retry_at = math.inf
     rig.peer.drives[1].silent = False
     assert rig.transition(Transition.TRANSITION_CONFIGURE)
