@@ -55,8 +55,10 @@ class SqliteData:
     ) -> Iterator[tuple[str, int, int, bytes]]:
         """Yield topic, log time, publish time [ns] and data, in order of log time."""
         connections = [c for c in self._reader.connections if c.topic in topics]
+        # The limit itself is no number of SQLite's.
+        end = stop if stop < TIME_LIMIT else None
         if connections:
-            for connection, log_time, data in self._reader.messages(connections, start, stop):
+            for connection, log_time, data in self._reader.messages(connections, start, end):
                 yield connection.topic, log_time, log_time, bytes(data)
 
 

@@ -17,6 +17,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.records import Chunk, Message
 from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_common.errors import UserError
@@ -91,6 +93,36 @@ def test_all_is_read_in_order(tmp_path: Path, compression: CompressionType, chun
     write(tmp_path / "bag", swapped, compression=compression, use_chunking=chunked)
     assert read(tmp_path / "bag") == [number ^ 1 for number in range(COUNT)]
     assert read(tmp_path / "bag", ("/a",), start=1010, stop=1020) == [10, 12, 14, 16, 18]
+
+
+def write_elsewhere(path: Path, storage: StoragePlugin, mode: CompressionMode) -> None:
+    """The same messages as another program's bag."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    writer = BagWriter(path, version=9, storage_plugin=storage)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections = [writer.add_connection(name, TYPE, typestore=store) for name in TOPICS]
+        for number in range(COUNT):
+            writer.write(connections[number % 2], 1000 + number, payload(number))
+
+
+@pytest.mark.parametrize(
+    ("storage", "mode"),
+    [
+        *((StoragePlugin.MCAP, mode) for mode in CompressionMode),
+        *((StoragePlugin.SQLITE3, mode) for mode in CompressionMode if mode.name != "STORAGE"),
+    ],
+)
+def test_a_bag_of_another_recorder_is_read(
+    tmp_path: Path, storage: StoragePlugin, mode: CompressionMode
+) -> None:
+    path = tmp_path / "bag"
+    write_elsewhere(path, storage, mode)
+    assert read(path) == list(range(COUNT))
+    assert read(path, ("/b",), start=1010, stop=1020) == [11, 13, 15, 17, 19]
+    with BagDirectory(path) as bag:
+        assert (bag.start, bag.end) == (1000, 1000 + COUNT - 1)
+        assert bag.counts == dict.fromkeys(TOPICS, COUNT // 2)
 
 
 def test_a_definition_is_read_part_by_part_as_it_is_as_a_whole() -> None:
