@@ -77,8 +77,13 @@ def bag_information(
     topics: Sequence[BagTopic],
     custom_data: Mapping[str, str],
     distribution: str,
+    *,
+    is_packed: bool = False,
 ) -> dict[str, Any]:
-    """Return the content of metadata.yaml below `rosbag2_bagfile_information`."""
+    """Return the content of metadata.yaml below `rosbag2_bagfile_information`.
+
+    Messages that were compressed one by one (`is_packed`) are read so by every tool.
+    """
     starts = [file.first for file in files if file.first is not None]
     start = min(starts, default=0)
     last = max((file.last for file in files), default=0)
@@ -95,8 +100,8 @@ def bag_information(
             }
             for topic in topics
         ],
-        "compression_format": "",
-        "compression_mode": "",
+        "compression_format": "zstd" if is_packed else "",
+        "compression_mode": "message" if is_packed else "",
         "relative_file_paths": [file.name for file in files],
         "files": [
             {

@@ -132,7 +132,9 @@ def _by_gaps(files: Mapping[str, McapScan]) -> Counter[str]:
 
 def _missing(old: Mapping[str, Any], files: Mapping[str, McapScan]) -> list[str]:
     told = old.get("relative_file_paths")
-    names = [PurePath(str(name)).name for name in told] if isinstance(told, list) else []
+    paths = [PurePath(str(name)) for name in told] if isinstance(told, list) else []
+    # Those that were compressed as a whole are unpacked by now.
+    names = [path.name.removesuffix(".zstd") for path in paths]
     numbered = [match for name in files if (match := _NUMBER.match(name))]
     if numbered:
         stem, _, ending = numbered[0].groups()

@@ -147,7 +147,8 @@ def _recover(path: Path, names: Sequence[Path], stack: contextlib.ExitStack) -> 
     for file in files:
         for channel in file.found.channels.values():
             topics.setdefault(channel.topic, _topic(channel, file.found))
-    is_told = is_readable and _agrees(old, list(content.values()), topics)
+    is_packed = any(file.found.packed for file in files)
+    is_told = is_readable and _agrees(old, list(content.values()), topics, is_packed)
     is_changed = bool(foreign) or any(file.new is not None for file in files)
     losses = find_losses(
         old, {file.path.name: file.found for file in files}, [file.name for file in foreign]
@@ -167,7 +168,7 @@ def _recover(path: Path, names: Sequence[Path], stack: contextlib.ExitStack) -> 
     if is_changed or not is_told:
         kept += _set_aside_metadata(path)
     information = bag_information(
-        list(content.values()), list(topics.values()), custom, distribution
+        list(content.values()), list(topics.values()), custom, distribution, is_packed=is_packed
     )
     write_metadata(path, information)
     with BagDirectory(path):  # what is left must be what every tool reads
@@ -295,6 +296,10 @@ def _data_files(path: Path) -> list[Path]:
     if not files:
         if any(path.glob("*.db3")):
             raise UserError(f"{path} is an SQLite bag: run `ros2 bag reindex {path}`")
+        if any(path.glob("*.mcap.zstd")):
+            raise UserError(
+                f"{path}: its files are compressed as a whole: run `unzstd --rm {path}/*.mcap.zstd`"
+            )
         raise UserError(f"{path} is not a bag: it has no .mcap file")
     for file in files:
         if is_being_recorded(file):
@@ -316,9 +321,14 @@ def _old_information(path: Path) -> tuple[dict[str, Any], bool]:
 
 
 def _agrees(
-    old: Mapping[str, Any], files: Sequence[DataFile], topics: Mapping[str, BagTopic]
+    old: Mapping[str, Any],
+    files: Sequence[DataFile],
+    topics: Mapping[str, BagTopic],
+    is_packed: bool,
 ) -> bool:
     """Return whether metadata.yaml tells of just these files, topics, types, counts and times."""
+    if (str(old.get("compression_mode")).lower() == "message") is not is_packed:
+        return False
     counts: Counter[str] = Counter()
     for file in files:
         counts.update(file.counts)

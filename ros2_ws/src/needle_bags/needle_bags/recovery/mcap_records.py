@@ -57,6 +57,8 @@ class McapScan:
         What is whole, in order.
     counts : Counter
         Messages that can be read, by channel.
+    packed : int
+        Those that were compressed by themselves.
     damage : list of Loose
         Where nothing could be read.
     mended : int
@@ -74,6 +76,7 @@ class McapScan:
     channels: dict[int, Channel] = dataclasses.field(default_factory=dict)
     parts: list[StoredChunk | Loose] = dataclasses.field(default_factory=list)
     counts: Counter[int] = dataclasses.field(default_factory=Counter)
+    packed: int = 0
     damage: list[Loose] = dataclasses.field(default_factory=list)
     mended: int = 0
     gaps: DamageGaps = dataclasses.field(default_factory=DamageGaps)

@@ -32,6 +32,7 @@ from needle_bags.recovery.mcap_records import (
     read_record,
 )
 from needle_bags.recovery.message_fit import MessageFit, mended_schema
+from needle_common.files.bag_data import is_packed
 from needle_common.files.mcap_file import (
     RECORD_HEADER,
     SUMMARY_LIMIT,
@@ -265,6 +266,7 @@ class _Scanner:
     def _count(self, message: Message) -> None:
         found = self.found
         found.counts[message.channel_id] += 1
+        found.packed += is_packed(message.data)
         found.gaps.take(message.channel_id, message.sequence, len(found.damage))
 
     def _define(self, record: Schema | Channel) -> None:

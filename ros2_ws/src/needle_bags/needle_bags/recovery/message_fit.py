@@ -9,6 +9,7 @@ from mcap.records import Channel, Schema
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from needle_common.files.bag_data import is_packed, unpack
 from needle_common.files.bag_directory import parsed_types
 
 _TYPE_HASH = "topic_type_hash"
@@ -52,7 +53,7 @@ class MessageFit:
             return True
         name, store = found
         try:
-            store.deserialize_cdr(data, name)
+            store.deserialize_cdr(unpack(data) if is_packed(data) else data, name)
         # whatever rosbags' generated code meets in bytes of another type
         except Exception:  # noqa: BLE001
             return False

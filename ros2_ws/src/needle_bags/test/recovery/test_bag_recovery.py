@@ -8,7 +8,13 @@ from pathlib import Path
 import pytest
 import yaml
 from rosbags.interfaces import QosDurability
-from rosbags.rosbag2 import Reader
+from rosbags.rosbag2 import (
+    CompressionFormat,
+    CompressionMode,
+    Reader,
+    StoragePlugin,
+)
+from rosbags.rosbag2 import Writer as OtherWriter
 
 from needle_analysis.report import report
 from needle_bags.format.bag_metadata import USUAL_QOS
@@ -18,6 +24,8 @@ from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import recover
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_common.errors import UserError
+from needle_common.files.bag_data import unpack_file
+from needle_common.files.bag_directory import BagDirectory
 from needle_common.files.bag_topic import BagTopic
 
 MakeRun = Callable[..., Path]
@@ -142,6 +150,49 @@ def test_a_bag_that_is_being_recorded_is_left_alone(tmp_path: Path) -> None:
             with pytest.raises(UserError, match="still being recorded"):
                 act(path)
     recover_bag(path)
+
+
+def write_compressed(path: Path, mode: CompressionMode) -> Path:
+    """A bag of 300 messages as another recorder compresses it."""
+    writer = OtherWriter(path, version=9, storage_plugin=StoragePlugin.MCAP)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        topic = writer.add_connection("/a", TYPE, msgdef=DEFINITION, rihs01=HASH)
+        for number in range(300):
+            text = f"message {number}".encode()
+            data = bytes([0, 1, 0, 0]) + (len(text) + 1).to_bytes(4, "little") + text + b"\0"
+            writer.write(topic, 1000 + number, data)
+    return path
+
+
+def texts(path: Path) -> list[str]:
+    with BagDirectory(path) as bag:
+        store = bag.typestore()
+        return [str(bag.deserialize(store, m).data) for m in bag.messages(lambda _: True)]
+
+
+def test_messages_that_were_compressed_one_by_one_come_back(tmp_path: Path) -> None:
+    path = write_compressed(tmp_path / "bag", CompressionMode.MESSAGE)
+    assert recover_bag(path).was_whole
+    (path / "metadata.yaml").unlink()
+    assert recover_bag(path).kept == []
+    assert texts(path) == [f"message {number}" for number in range(300)]
+    assert numbers_kept(path) == 300
+    recovery = recover_bag(kill(path))
+    found = texts(path)
+    assert len(found) == recovery.messages > 150
+    assert found == [f"message {number}" for number in range(len(found))]
+
+
+def test_files_that_were_compressed_as_a_whole_are_to_be_unpacked_first(tmp_path: Path) -> None:
+    path = write_compressed(tmp_path / "bag", CompressionMode.FILE)
+    with pytest.raises(UserError, match=r"run `unzstd --rm .*/bag/\*\.mcap\.zstd`"):
+        recover_bag(path)
+    (packed,) = path.glob("*.zstd")
+    unpack_file(packed, path)
+    packed.unlink()
+    assert recover_bag(path).losses.lines() == []
+    assert len(texts(path)) == 300
 
 
 def sqlite(path: Path) -> None:

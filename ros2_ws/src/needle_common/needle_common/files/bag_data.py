@@ -62,6 +62,11 @@ class SqliteData:
                 yield connection.topic, log_time, log_time, bytes(data)
 
 
+def is_packed(data: bytes) -> bool:
+    """Return whether a message was compressed by itself; none in CDR begins so."""
+    return data.startswith(zstandard.FRAME_HEADER)
+
+
 def unpack(data: bytes) -> bytes:
     """Return a message that was compressed by itself.
 
