@@ -117,10 +117,12 @@ def read_record(path: Path, insertion_file: Path | None = None) -> InsertionReco
 def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
     """Read a CSV of tips; see `read_record`."""
     rows = _rows(path)
-    columns = set(rows[0][1]) if rows else set()
+    if not rows:
+        raise UserError(f"{path}: there is no row in it")
+    columns = set(rows[0][1])
     missing = [name for name in _COORDINATES if name not in columns]
     if missing:
-        there = ", ".join(sorted(columns)) or "nothing"
+        there = ", ".join(sorted(columns))
         raise UserError(f"{path}: column {missing[0]} is missing (has {there})")
     of_name = None if insertion_file is None else _insertions(insertion_file)
     if of_name is not None and "name" not in columns:
@@ -234,7 +236,11 @@ def _insertions(path: Path) -> dict[str, float]:
     for column in ("name", "insertion_m"):
         if rows and column not in rows[0][1]:
             raise UserError(f"{path}: column {column} is missing")
-    return {row["name"]: _number(path, line, row, "insertion_m") for line, row in rows}
+    return {
+        row["name"]: _number(path, line, row, "insertion_m")
+        for line, row in rows
+        if row["insertion_m"].strip()  # as `track_images` takes the same file
+    }
 
 
 def _number(path: Path, line: int, row: Mapping[str, str], name: str) -> float:

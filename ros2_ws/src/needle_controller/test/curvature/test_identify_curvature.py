@@ -104,7 +104,7 @@ def test_command_takes_insertions_by_name(tmp_path: Path, needle: tuple[Array, A
     record = read_record(path, by_name)
     assert record.insertion is not None
     np.testing.assert_allclose(record.insertion, insertion)
-    by_name.write_text("name,insertion_m\n" + "\n".join(lines[:-1]))
+    by_name.write_text("name,insertion_m\n" + "\n".join([*lines[:-1], "image_120.png,"]))
     with pytest.raises(UserError, match=r"no insertion for image_120\.png"):
         read_record(path, by_name)
 
@@ -127,7 +127,8 @@ def test_a_turned_base_is_refused_but_for_the_part_before(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "x_m is missing"),
+        ("", "there is no row in it"),
+        ("x_m,y_m,z_m\n", "there is no row in it"),
         ("a,b\n1,2\n", "x_m is missing"),
         ("x_m,y_m,z_m\n0,0,0.01\n", "1 tips are too few"),
         ("x_m,y_m,z_m\n0,0,nan\n", "z_m = nan is not finite"),
