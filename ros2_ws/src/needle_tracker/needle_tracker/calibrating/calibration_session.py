@@ -75,13 +75,12 @@ class Session:
         Parameters
         ----------
         name : str
-            The image's file name.
+            The image's file name without its ending.
         """
-        stem = Path(name).stem
-        if stem in self.places:
-            return self.places[stem]
+        if name in self.places:
+            return self.places[name]
         for pattern, place in self.places.items():
-            if fnmatch.fnmatchcase(stem, pattern):
+            if fnmatch.fnmatchcase(name, pattern):
                 return place
         return None
 

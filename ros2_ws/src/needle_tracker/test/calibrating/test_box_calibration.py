@@ -140,7 +140,7 @@ def test_a_camera_that_was_turned_is_found(path: Path, rig: TrueRig) -> None:
 def test_a_session_says_windows_and_what_is_held_in_the_box() -> None:
     session = parse_session(box_content())
     assert [w.normal.tolist() for w in session.windows] == [[1, 0, 0], [0, 1, 0]]
-    held, stands = session.place_of("box_07.png"), session.place_of("stand")
+    held, stands = session.place_of("box_07"), session.place_of("stand")
     assert held is not None
     assert stands is not None
     assert (held.under_surface, held.is_known) == (True, False)

@@ -20,18 +20,26 @@ def test_a_place_written_is_the_place_read() -> None:
     places = {**surface_places(0.0175), **under_places(0.0175)}
     read = parse_session(session_content(places))
     for name, place in places.items():
-        found = read.place_of(f"{name}.png")
+        found = read.place_of(name)
         assert found is not None
         np.testing.assert_allclose(found.T_rig_board, place.T_rig_board, atol=1e-12)
         assert (found.under_surface, found.sigma) == (place.under_surface, place.sigma)
-    assert read.place_of("free_1.png") is None
+    assert read.place_of("free_1") is None
 
 
 def test_by_default_a_board_lies_flat_along_the_insertion() -> None:
     session = parse_session(content(**{"on_*": {"origin": [0.018, -0.04, 0.01]}}))
-    place = session.place_of("on_top_3.png")
+    place = session.place_of("on_top_3")
     assert place is not None
     np.testing.assert_allclose(place.T_rig_board, flat_pose([0.018, -0.04, 0.01]), atol=1e-12)
+
+
+def test_a_name_may_have_dots() -> None:
+    flat = {"origin": [0.018, -0.04, 0.01]}
+    session = parse_session(content(**{"on_17.5": flat, "on_18.*": flat}))
+    assert session.place_of("on_17.5") is session.places["on_17.5"]
+    assert session.place_of("on_18.25") is session.places["on_18.*"]
+    assert session.place_of("on_17") is None
 
 
 @pytest.mark.parametrize(
