@@ -139,9 +139,11 @@ def read_csv(path: Path, insertion_file: Path | None = None) -> InsertionRecord:
                 bound = _LARGEST_COORDINATE
                 raise OutOfBoundsError(f"{path}:{line}: {name}", value, -bound, bound, "m")
         if of_name is not None:
-            if row["name"] not in of_name:
+            # By the image's name with its ending or without, as `track_images` takes the same file.
+            told = of_name.get(row["name"], of_name.get(Path(row["name"]).stem))
+            if told is None:
                 raise UserError(f"{insertion_file}: no insertion for {row['name']}")
-            insertion.append(of_name[row["name"]])
+            insertion.append(told)
         elif "insertion_m" in columns:
             insertion.append(_number(path, line, row, "insertion_m"))
         if "rotation_rad" in columns:
@@ -239,7 +241,7 @@ def _insertions(path: Path) -> dict[str, float]:
     return {
         row["name"]: _number(path, line, row, "insertion_m")
         for line, row in rows
-        if row["insertion_m"].strip()  # as `track_images` takes the same file
+        if row["insertion_m"].strip()
     }
 
 

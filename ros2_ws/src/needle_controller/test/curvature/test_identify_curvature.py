@@ -104,6 +104,10 @@ def test_command_takes_insertions_by_name(tmp_path: Path, needle: tuple[Array, A
     record = read_record(path, by_name)
     assert record.insertion is not None
     np.testing.assert_allclose(record.insertion, insertion)
+    by_name.write_text("name,insertion_m\n" + "\n".join(lines).replace(".png", ""))
+    without = read_record(path, by_name).insertion
+    assert without is not None
+    np.testing.assert_allclose(without, insertion)
     by_name.write_text("name,insertion_m\n" + "\n".join([*lines[:-1], "image_120.png,"]))
     with pytest.raises(UserError, match=r"no insertion for image_120\.png"):
         read_record(path, by_name)
