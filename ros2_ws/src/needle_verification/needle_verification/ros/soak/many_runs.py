@@ -11,8 +11,11 @@ import os
 import shutil
 import signal
 import tempfile
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+
+from tqdm import tqdm
 
 from needle_verification.cluster import on_cluster
 from needle_verification.ros.soak.process_run import run_processes
@@ -35,9 +38,6 @@ def results_here(seeds: range) -> Iterator[RunResult]:
         context.Pool(workers, _begin_worker, (folder,)) as pool,
     ):
         yield from pool.imap(_run_seed, seeds)
-        # A worker that ends by itself leaves no semaphore for its tracker to complain of.
-        pool.close()
-        pool.join()
 
 
 def results_of_cluster(address: str, seeds: range) -> Iterator[RunResult]:
@@ -65,6 +65,9 @@ def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResul
 def _begin_worker(folder: str) -> None:
     tempfile.tempdir = folder
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    # Bars of recovered bags would share theirs with other processes: a semaphore, and who is ended
+    # in mid-run leaves it behind.
+    tqdm.set_lock(threading.RLock())
     # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _settle_in()
