@@ -28,7 +28,6 @@ from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.ros.soak import rig_run
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
 from needle_verification.soak import invariants
 from needle_verification.soak.hold_witness import HoldWitness
@@ -275,14 +274,6 @@ def _set(owner: Any, **values: Any) -> Plant:
     return plant
 
 
-def _both(one: Plant, other: Plant) -> Plant:
-    def plant(patch: pytest.MonkeyPatch) -> None:
-        one(patch)
-        other(patch)
-
-    return plant
-
-
 def _judge_forgets(**values: float) -> Plant:
     see_device = Watch.see_device
 
@@ -313,13 +304,7 @@ MENDED = {
     "set_points_come_twice": MendedBug(
         "none_beyond_limits", _set(invariants, _SPEED_TICKS=4, _SPEED_ROOM=1.25)
     ),
-    "old_set_points_come_after_new_ones": MendedBug(
-        "none_beyond_limits", _set(rig_run, _BRINGS_OLD=())
-    ),
-    "set_points_come_late": MendedBug(
-        "none_beyond_limits",
-        _both(_set(invariants, _SPEED_ROOM=1.25), _set(rig_run, _BRINGS_OLD=())),
-    ),
+    "set_points_come_late": MendedBug("none_beyond_limits", _set(invariants, _SPEED_ROOM=1.25)),
     "a_fault_ends_homing_on_a_late_bus": MendedBug(
         "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)
     ),

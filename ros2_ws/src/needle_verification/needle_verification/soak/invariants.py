@@ -98,8 +98,6 @@ class Watch:
         Of the rig.
     release_bound : float
         From a release, or a loss, to the last motion [s].
-    held_back : float
-        By how much a bus may hold the insertion drive back, which then catches up [m].
 
     Attributes
     ----------
@@ -109,12 +107,9 @@ class Watch:
         Of the holds that reach the device; it is asked where it hears any.
     """
 
-    def __init__(
-        self, bounds: Bounds, release_bound: float = RELEASE_BOUND, held_back: float = 0.0
-    ) -> None:
+    def __init__(self, bounds: Bounds, release_bound: float = RELEASE_BOUND) -> None:
         self._bounds = bounds
         self._release_bound = release_bound
-        self._held_back = held_back
         self.violations: list[Violation] = []
         self.witness = HoldWitness()
         self._before: tuple[float, float, float] | None = None
@@ -294,15 +289,12 @@ class Watch:
         then, inserted, turned = self._track[0]
         period = max(at - then, 1e-3)
         speed, rate = (insertion - inserted) / period, (rotation - turned) / period
-        fastest = bounds.max_speed + max(
-            bounds.max_speed * (_SPEED_ROOM - 1.0), self._held_back / period
-        )
         places = (
             ("insertion [mm]", insertion * 1e3, (bounds.max_depth + _PLACE_ROOM) * 1e3),
             ("rotation [rad]", abs(rotation), bounds.max_rotation + 0.3),
         )
         speeds = (
-            ("speed [mm/s]", abs(speed) * 1e3, fastest * 1e3),
+            ("speed [mm/s]", abs(speed) * 1e3, bounds.max_speed * _SPEED_ROOM * 1e3),
             ("rotation rate [rad/s]", abs(rate), bounds.max_rotation_rate * _SPEED_ROOM),
         )
         for name, value, bound in (*places, *(speeds if at > self._catches_up_until else ())):

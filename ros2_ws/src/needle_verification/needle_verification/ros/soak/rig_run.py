@@ -25,7 +25,6 @@ from needle_verification.ros.soak.virtual_rig import (
 )
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import (
-    BUS,
     CONSOLE,
     DISK,
     PAGE,
@@ -54,7 +53,6 @@ _HOLD_LINKS = ("/joy", _HOLD)
 _AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)
 _RECORDED = (RECORDER, DISK)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
-_BRINGS_OLD = (Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
 
@@ -177,10 +175,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         for fault in faults
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
-    # A drive that gets old set-points after new ones stays behind, and goes on with the next.
-    comes_again = any(fault.part == BUS and fault.kind in _BRINGS_OLD for fault in faults)
-    held_back = SafetyLimits().insertion_following_error if comes_again else 0.0
-    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late, held_back)
+    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 
