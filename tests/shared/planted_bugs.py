@@ -28,10 +28,11 @@ from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
+from needle_verification.ros.soak import rig_run
 from needle_verification.ros.soak.virtual_topics import VirtualPublisher
-from needle_verification.soak import invariants
-from needle_verification.soak.hold_witness import HoldWitness
-from needle_verification.soak.invariants import Watch
+from needle_verification.soak.judging import limit_witness
+from needle_verification.soak.judging.hold_witness import HoldWitness
+from needle_verification.soak.judging.invariants import Watch
 
 Plant = Callable[[pytest.MonkeyPatch], None]
 
@@ -105,6 +106,16 @@ def _screw_of_twice_the_lead(patch: pytest.MonkeyPatch) -> None:
         return true | {"insertion": AxisState(2.0 * along.position, 2.0 * along.velocity)}
 
     patch.setattr(EmulatedBus, "axes", doubled)
+
+
+def _cycle_that_orders_twice(patch: pytest.MonkeyPatch) -> None:
+    drive = DeviceCore.drive
+
+    def twice(core: DeviceCore, period: float, speed_scale: float, now: float) -> None:
+        drive(core, period, speed_scale, now)
+        drive(core, period, speed_scale, now)
+
+    patch.setattr(DeviceCore, "drive", twice)
 
 
 def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
@@ -193,6 +204,7 @@ PLANTED = {
         "hold_is_of_now", _lost_press_of_a_page_goes_on, 215
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
+    "a cycle that orders twice": PlantedBug("none_beyond_limits", _cycle_that_orders_twice, 1),
     "a motion kept quiet": PlantedBug("status_is_true", _motion_kept_quiet, 1),
     "a fault without a word": PlantedBug("faults_are_named", _fault_without_a_word, 7),
     "an insertion told too deep": PlantedBug("belief_equals_joints", _insertion_told_too_deep, 2),
@@ -284,6 +296,14 @@ def _judge_forgets(**values: float) -> Plant:
     return _set(Watch, see_device=forgetful)
 
 
+def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
+    bounds = dataclasses.replace(
+        rig_run.bounds_of_the_rig(), insertion_following_error=0.0, rotation_following_error=0.0
+    )
+    patch.setattr(rig_run, "bounds_of_the_rig", lambda: bounds)
+    patch.setattr(limit_witness, "_SET_POINTS_BEHIND", 1)
+
+
 MENDED = {
     "an_emergency_stop_while_drives_are_waited_for": MendedBug(
         "the_way_goes_on", _emergency_stop_ends_the_search
@@ -298,13 +318,12 @@ MENDED = {
         "the_way_goes_on", _start_within_set_up_forgotten
     ),
     "a_reliable_topic_out_of_order": MendedBug("the_way_goes_on", _reliable_messages_overtake),
-    "a_blocked_drive_catches_up": MendedBug(
-        "none_beyond_limits", _set(invariants, CATCH_UP_BOUND=-1.0, _SPEED_ROOM=1.25)
+    "a_blocked_drive_catches_up": MendedBug("none_beyond_limits", _judge_of_drives_never_behind),
+    "set_points_come_twice": MendedBug("none_beyond_limits", _judge_of_drives_never_behind),
+    "set_points_come_late": MendedBug("none_beyond_limits", _judge_of_drives_never_behind),
+    "old_set_points_come_after_new_ones": MendedBug(
+        "none_beyond_limits", _judge_of_drives_never_behind
     ),
-    "set_points_come_twice": MendedBug(
-        "none_beyond_limits", _set(invariants, _SPEED_TICKS=4, _SPEED_ROOM=1.25)
-    ),
-    "set_points_come_late": MendedBug("none_beyond_limits", _set(invariants, _SPEED_ROOM=1.25)),
     "a_fault_ends_homing_on_a_late_bus": MendedBug(
         "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)
     ),

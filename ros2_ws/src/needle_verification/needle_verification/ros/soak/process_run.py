@@ -22,7 +22,7 @@ from needle_verification.ros.listening_node import ros
 from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
 from needle_verification.ros.soak.virtual_person import OUT
 from needle_verification.soak.faults import Fault, Kind
-from needle_verification.soak.invariants import RELEASE_BOUND, Watch
+from needle_verification.soak.judging.invariants import RELEASE_BOUND, Watch
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
 PERSON = "simulated_operator"

@@ -36,7 +36,9 @@ from needle_verification.soak.faults import (
     draw_schedule,
     strange_topic,
 )
-from needle_verification.soak.invariants import RELEASE_BOUND, Bounds, Violation, Watch
+from needle_verification.soak.judging.invariants import RELEASE_BOUND, Violation, Watch
+from needle_verification.soak.judging.limit_witness import Bounds
+from needle_verification.soak.judging.set_point_frames import SetPointFrames
 from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS
 
 # So long moments are waited for whose faults shall follow them [s].
@@ -104,7 +106,14 @@ def schedule_of(seed: int) -> list[Fault]:
 def bounds_of_the_rig() -> Bounds:
     """Return the limits that the driver has unless it is told others."""
     limits = SafetyLimits()
-    return Bounds(limits.max_depth, limits.max_speed, limits.max_rotation, limits.max_rotation_rate)
+    return Bounds(
+        limits.max_depth,
+        limits.max_speed,
+        limits.max_rotation,
+        limits.max_rotation_rate,
+        limits.insertion_following_error,
+        limits.rotation_following_error,
+    )
 
 
 def run(seed: int, faults: Sequence[Fault]) -> RunResult:
@@ -189,7 +198,6 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         rig.graph.digest.update(_rounded((at.insertion, at.rotation)))
         watch.see_hand(at_s, holds=rig.hand_presses)
         watch.see_driver(at_s, speaks=speaks)
-        watch.see_drives(at_s, blocked=rig.bench.has_blocked_motor)
         watch.see_motors(at_s, at.insertion, at.rotation)
         if rig.recorders is not None:
             watch.see_waiting(at_s, rig.recorders.bytes_waiting)
@@ -226,6 +234,7 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         watch.witness.hear(now(), message.header.frame_id, pressed=pressed, lifetime=lifetime)
 
     rig.bench.watchers.append(see_motors)
+    _watch_set_points(rig, watch)
     rig.graph.watch("/device/status", see_device)
     rig.graph.watch("/needle/controller_status", see_belief)
     rig.graph.watch("/device/joint_trajectory", see_command)
@@ -234,6 +243,20 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
     if _HOLD in strange or any(fault.part == SECOND_PERSON for fault in faults):
         rig.graph.listen_at("/device_driver", hear)
     return watch
+
+
+def _watch_set_points(rig: VirtualRig, watch: Watch) -> None:
+    """Let the watch see all set-points that the driver sends."""
+    settings = [rig.bench.bus.drives[axis].settings for axis in ("insertion", "rotation")]
+    axes = {its.node_id: axis for axis, its in enumerate(settings)}
+    frames = SetPointFrames({its.node_id: its.motor.counts_per_unit for its in settings})
+
+    def see(identifier: int, data: bytes) -> None:
+        if (set_point := frames.take(identifier, data)) is not None:
+            node, place = set_point
+            watch.see_set_point(_seconds(rig.world.steady_ns), axes[node], place)
+
+    rig.can.sent_watchers.append(see)
 
 
 def _rounded(place: Sequence[float]) -> bytes:

@@ -24,7 +24,7 @@ from needle_verification.ros.soak.many_runs import (
 )
 from needle_verification.ros.soak.rig_run import RunResult, run
 from needle_verification.soak.faults import Fault, read_schedule, write_schedule
-from needle_verification.soak.invariants import Violation
+from needle_verification.soak.judging.invariants import Violation
 from needle_verification.soak.shrinking import shrink
 from needle_verification.soak.tally import Tally
 

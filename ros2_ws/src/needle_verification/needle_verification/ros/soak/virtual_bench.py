@@ -84,11 +84,6 @@ class Bench:
         self._tick()
 
     @property
-    def has_blocked_motor(self) -> bool:
-        """Whether one of the motors cannot move."""
-        return any(drive.motor.stalled for drive in self.bus.drives.values())
-
-    @property
     def tip(self) -> np.ndarray:
         """The true tip in `rig`, shape (3,) [m]."""
         self._follow_motors()

@@ -42,6 +42,8 @@ class VirtualCan:
         Whether the adapter is gone.
     watchers : list of callable
         Called whenever somebody opens it.
+    sent_watchers : list of callable
+        Called with the identifier and the data of each frame that is sent to the drives.
     """
 
     def __init__(self, world: VirtualWorld, bus: EmulatedBus, faults: LinkFaults) -> None:
@@ -50,6 +52,7 @@ class VirtualCan:
         self.bus = bus
         self.unplugged = False
         self.watchers: list[Callable[[], None]] = []
+        self.sent_watchers: list[Callable[[int, bytes], None]] = []
         self._links: list[VirtualLink] = []
         self._last_ns = dict.fromkeys(LINKS, 0)
         self._ways: dict[tuple[str, str], Way] = {}
@@ -75,6 +78,8 @@ class VirtualCan:
 
     def send(self, identifier: int, data: bytes) -> None:
         """Put a frame of the computer's on the bus."""
+        for watch in self.sent_watchers:
+            watch(identifier, data)
         for due_ns, arrived in self._arrivals(TO_DRIVES, identifier, data):
             frame = CanFrame(identifier, arrived)
             self._world.call_at(due_ns, partial(self._take, frame))

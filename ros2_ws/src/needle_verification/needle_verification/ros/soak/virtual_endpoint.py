@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
-from needle_verification.soak.invariants import DISCOVERED_WITHIN
+from needle_verification.soak.judging.invariants import DISCOVERED_WITHIN
 from needle_verification.soak.virtual_world import NANOSECONDS, VirtualProcess
 
 # From an endpoint's creation until another process knows it [ns], at least and at most.

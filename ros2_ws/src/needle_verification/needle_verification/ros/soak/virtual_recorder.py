@@ -11,8 +11,8 @@ from typing import Any
 from needle_bags.ros.recorder import Recorder
 from needle_verification.ros.soak.virtual_endpoint import Sample
 from needle_verification.ros.soak.virtual_topics import VirtualGraph
-from needle_verification.soak.bag_witness import BagWitness
 from needle_verification.soak.faults import RECORDER
+from needle_verification.soak.judging.bag_witness import BagWitness
 from needle_verification.soak.virtual_disk import DiskUser, VirtualDisk
 from needle_verification.soak.virtual_world import VirtualProcess
 

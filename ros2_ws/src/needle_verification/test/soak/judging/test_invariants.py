@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from needle_verification.soak.invariants import PAGE_LIFETIME, WATCHDOG_BOUND, Bounds, Watch
+from needle_verification.soak.judging.invariants import PAGE_LIFETIME, WATCHDOG_BOUND, Watch
+from needle_verification.soak.judging.limit_witness import Bounds
 
-BOUNDS = Bounds(0.2, 0.005, 63.0, 3.14)
+BOUNDS = Bounds(0.2, 0.005, 63.0, 3.14, 0.0005, 0.1)
 
 
 def moves_after_homing_for(time: float) -> set[str]:

@@ -6,11 +6,10 @@ import dataclasses
 from collections import deque
 from collections.abc import Mapping, Sequence
 
-from needle_verification.soak.hold_witness import HoldWitness
+from needle_verification.soak.judging.hold_witness import HoldWitness
+from needle_verification.soak.judging.limit_witness import Bounds, LimitWitness
 from needle_verification.soak.virtual_disk import WAITING_LIMIT
 
-# Speeds are judged over so many ticks, 0.1 s.
-_SPEED_TICKS = 20
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
 # So near its set-point an axis has arrived [m], [rad] (config/drives.yaml); blocked there and freed
@@ -22,9 +21,6 @@ _ARRIVED_INSERTION, _ARRIVED_ROTATION = 5e-6, 1e-3
 RELEASE_BOUND = 0.35
 # A stop by the watchdog of the drives, and the ramp [s].
 WATCHDOG_BOUND = 0.2
-# From the moment in which a blocked motor is free until it is where it should be [s]: it is behind
-# by no more than its drive's following error allows, and goes as fast as it can (docs/safety.md).
-CATCH_UP_BOUND = 0.3
 # Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
 # hold_new_press) [s].
 DISCOVERED_WITHIN = 0.2
@@ -33,9 +29,6 @@ DISCOVERED_WITHIN = 0.2
 PAGE_LIFETIME = 0.11
 # How long a status may be behind the motors [s].
 _STATUS_LAG = 0.15
-# Beyond the limits themselves: of set-points that a bus brings late, three of 0.02 s may come at
-# once; what drives of such a rig swing over [m].
-_SPEED_ROOM, _PLACE_ROOM = 1.0 + 3 * 0.02 / 0.1, 0.0011
 # The controller knows of a motion when its next tip has come: two steps.
 _BELIEF = 0.0045
 # A needle may still be on its way by one of so many commands: a path ends when its tip is 2 s old,
@@ -67,28 +60,6 @@ class Violation:
     text: str
 
 
-@dataclasses.dataclass(frozen=True)
-class Bounds:
-    """The rig's own limits.
-
-    Attributes
-    ----------
-    max_depth : float
-        [m].
-    max_speed : float
-        [m/s].
-    max_rotation : float
-        Either way [rad].
-    max_rotation_rate : float
-        [rad/s].
-    """
-
-    max_depth: float
-    max_speed: float
-    max_rotation: float
-    max_rotation_rate: float
-
-
 class Watch:
     """Watches one run. Times are seconds from its start.
 
@@ -108,10 +79,10 @@ class Watch:
     """
 
     def __init__(self, bounds: Bounds, release_bound: float = RELEASE_BOUND) -> None:
-        self._bounds = bounds
         self._release_bound = release_bound
         self.violations: list[Violation] = []
         self.witness = HoldWitness()
+        self._limits = LimitWitness(bounds)
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0
@@ -123,13 +94,12 @@ class Watch:
         self._status_at = 0.0
         self._homing_until = -1.0
         self._silent_since: float | None = None
-        self._catches_up_until = self._ends_until = -1.0
+        self._ends_until = -1.0
         self._estop_since: float | None = None
         self._zero = 0.0
         self._commands: deque[tuple[tuple[float, float], ...]] = deque(maxlen=_COMMANDS)
         self._moving_since: float | None = None
         self._rest = (0.0, 0.0)
-        self._track: deque[tuple[float, float, float]] = deque(maxlen=_SPEED_TICKS + 1)
 
     def violate(self, invariant: str, at: float, text: str) -> None:
         """Note a violation; of each invariant the first counts."""
@@ -218,10 +188,10 @@ class Watch:
         """Take what is said of the emergency stop."""
         self._estop_since = (self._estop_since or at) if pressed else None
 
-    def see_drives(self, at: float, *, blocked: bool) -> None:
-        """Take whether a motor is blocked: freed, it catches up as fast as it can."""
-        if blocked:
-            self._catches_up_until = at + CATCH_UP_BOUND
+    def see_set_point(self, at: float, axis: int, place: float | None) -> None:
+        """Take what is sent to a drive; see `LimitWitness.see_set_point`."""
+        for text in self._limits.see_set_point(at, axis, place):
+            self.violate("none_beyond_limits", at, text)
 
     def see_drives_go_on(self, at: float) -> None:
         """Take that the drives' own time stood still until now: what was under way ends by it."""
@@ -230,11 +200,11 @@ class Watch:
     def see_motors(self, at: float, insertion: float, rotation: float) -> None:
         """Take where the motors really are."""
         before, self._before = self._before, (at, insertion, rotation)
-        self._track.append((at, insertion, rotation))
+        for text in self._limits.see_motors(at, insertion, rotation):
+            self.violate("none_beyond_limits", at, text)
         if before is None:
             return
         along, around = insertion - before[1], rotation - before[2]
-        self._judge_limits(at, insertion, rotation)
         moves = abs(along) > _REST_INSERTION or abs(around) > _REST_ROTATION
         if self._moving_since is None:
             moves = moves and (
@@ -283,25 +253,6 @@ class Watch:
     @property
     def _is_homing(self) -> bool:
         return self._status.get("activity") == "homing"
-
-    def _judge_limits(self, at: float, insertion: float, rotation: float) -> None:
-        bounds = self._bounds
-        then, inserted, turned = self._track[0]
-        period = max(at - then, 1e-3)
-        speed, rate = (insertion - inserted) / period, (rotation - turned) / period
-        places = (
-            ("insertion [mm]", insertion * 1e3, (bounds.max_depth + _PLACE_ROOM) * 1e3),
-            ("rotation [rad]", abs(rotation), bounds.max_rotation + 0.3),
-        )
-        speeds = (
-            ("speed [mm/s]", abs(speed) * 1e3, bounds.max_speed * _SPEED_ROOM * 1e3),
-            ("rotation rate [rad/s]", abs(rate), bounds.max_rotation_rate * _SPEED_ROOM),
-        )
-        for name, value, bound in (*places, *(speeds if at > self._catches_up_until else ())):
-            if value > bound:
-                self.violate(
-                    "none_beyond_limits", at, f"{name} is {value:.4g}, at most {bound:.4g}"
-                )
 
     def _judge_hold(self, at: float, *, begins: bool) -> None:
         if self._estop_since is not None and at - self._estop_since > self._release_bound:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from needle_verification.soak.hold_witness import HoldWitness
+from needle_verification.soak.judging.hold_witness import HoldWitness
 
 ONE, OTHER = "one", "other"
 

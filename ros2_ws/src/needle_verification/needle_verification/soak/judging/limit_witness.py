@@ -1,0 +1,167 @@
+"""Limits of a rig, judged from outside: set-points as they are sent, and the motors' ways."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator
+
+# From one set-point to the next [s].
+_SET_POINT_PERIOD = 0.02
+# A drive may be behind by its following error, which is judged by a position of a cycle ago, one
+# cycle later, and by what was on its way meanwhile: so many set-points more.
+_SET_POINTS_BEHIND = 3
+# What drives of such a rig swing over beyond its limits [m], [rad].
+_PLACE_ROOM, _TURN_ROOM = 0.0011, 0.3
+
+
+@dataclasses.dataclass(frozen=True)
+class Bounds:
+    """The rig's own limits.
+
+    Attributes
+    ----------
+    max_depth : float
+        [m].
+    max_speed : float
+        [m/s].
+    max_rotation : float
+        Either way [rad].
+    max_rotation_rate : float
+        [rad/s].
+    insertion_following_error, rotation_following_error : float
+        [m], [rad].
+    """
+
+    max_depth: float
+    max_speed: float
+    max_rotation: float
+    max_rotation_rate: float
+    insertion_following_error: float
+    rotation_following_error: float
+
+
+class Pace:
+    """Judges a way by the time that it took, over all spans of it at once.
+
+    Parameters
+    ----------
+    speed : float
+        At which it may go on, in its unit a second.
+    """
+
+    def __init__(self, speed: float) -> None:
+        self._speed = speed
+        self.forget()
+
+    def forget(self) -> None:
+        """Begin anew at the next place."""
+        self._least = {1.0: math.inf, -1.0: math.inf}
+
+    def ahead(self, at: float, place: float) -> float:
+        """Return by how much the way to a place is longer than `speed` allows.
+
+        That is the most over all spans that end now: in each, the way less what its time allows.
+
+        Parameters
+        ----------
+        at : float
+            When it is there [s].
+        place : float
+            In any unit.
+        """
+        most = 0.0
+        for sign, least in self._least.items():
+            beyond = sign * place - self._speed * at
+            self._least[sign] = min(least, beyond)
+            most = max(most, beyond - self._least[sign])
+        return most
+
+
+@dataclasses.dataclass(frozen=True)
+class _Axis:
+    """One axis; `scale` is units for people in one of SI, `behind` the most that it may be [SI]."""
+
+    name: str
+    unit: str
+    scale: float
+    speed: float
+    behind: float
+    set_points: Pace
+    motor: Pace
+
+
+class LimitWitness:
+    """Says what is beyond the limits.
+
+    Parameters
+    ----------
+    bounds : Bounds
+        Of the rig.
+    """
+
+    def __init__(self, bounds: Bounds) -> None:
+        self._bounds = bounds
+
+        def axis(name: str, unit: str, scale: float, speed: float, behind: float) -> _Axis:
+            behind += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
+            return _Axis(name, unit, scale, speed, behind, Pace(speed), Pace(speed))
+
+        self._axes = (
+            axis("insertion", "mm", 1e3, bounds.max_speed, bounds.insertion_following_error),
+            axis("rotation", "rad", 1.0, bounds.max_rotation_rate, bounds.rotation_following_error),
+        )
+
+    def see_set_point(self, at: float, axis: int, place: float | None) -> Iterator[str]:
+        """Take what is sent to a drive, whatever a bus makes of it.
+
+        Parameters
+        ----------
+        at : float
+            When [s].
+        axis : int
+            0 is insertion, 1 rotation.
+        place : float or None
+            Where to [m], [rad]; None if the drive is told not to go there.
+
+        Yields
+        ------
+        str
+            What is beyond the limits.
+        """
+        its = self._axes[axis]
+        if place is None:
+            its.set_points.forget()
+            return
+        # One may be early by all of its period.
+        ahead, bound = its.set_points.ahead(at, place), its.speed * _SET_POINT_PERIOD
+        if ahead > bound:
+            yield (
+                f"set-points of {its.name} are {ahead * its.scale:.4g} {its.unit} ahead of its "
+                f"speed limit, at most {bound * its.scale:.4g}"
+            )
+
+    def see_motors(self, at: float, insertion: float, rotation: float) -> Iterator[str]:
+        """Take where the motors really are; yields what is beyond the limits.
+
+        Parameters
+        ----------
+        at : float
+            When [s].
+        insertion, rotation : float
+            [m], [rad].
+        """
+        deepest = self._bounds.max_depth + _PLACE_ROOM
+        if insertion > deepest:
+            yield f"insertion is {insertion * 1e3:.4g} mm, at most {deepest * 1e3:.4g}"
+        farthest = self._bounds.max_rotation + _TURN_ROOM
+        if abs(rotation) > farthest:
+            yield f"rotation is {rotation:.4g} rad, at most {farthest:.4g} either way"
+        for its, place in zip(self._axes, (insertion, rotation), strict=True):
+            # Who is behind goes on as fast as it can (docs/safety.md, following_error).
+            ahead = its.motor.ahead(at, place)
+            if ahead > its.behind:
+                yield (
+                    f"{its.name} went {ahead * its.scale:.4g} {its.unit} farther than its speed "
+                    f"limit allows, at most {its.behind * its.scale:.4g}"
+                )
