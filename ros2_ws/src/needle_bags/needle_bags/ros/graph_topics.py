@@ -27,6 +27,9 @@ TURN = 0.02
 DEPTH = 5000
 # A second of a camera's. Fast DDS keeps the memory of as many for good, at their largest.
 IMAGE_DEPTH = 30
+# A subscription that another one has replaced is listened to for so long still [s]: until that one
+# is found by all publishers, and until what waits for it and what it has lost are told.
+OVERLAP = 1.0
 # Stamps that fit a bag: nanoseconds since the epoch, as a signed number.
 _LATEST = 2**63 - 1
 
@@ -41,17 +44,19 @@ class _Topic:
         self.subscription: Subscription | None = None
         self.publishers = -1
         self.described = False
-        self.lost_events = 0
+        # What each of its subscriptions, one after the other, has lost.
+        self.lost_events: list[int] = []
         self.gaps = SequenceGaps()
-        # Source stamps of the last messages: a subscription that replaces another may get some
-        # of them again.
+        self.replaced: Subscription | None = None
+        self.replaced_until = 0.0
+        # Source stamps of the last messages, and of all while two subscriptions get them.
         self.recent: collections.deque[int] = collections.deque(maxlen=64)
-        self.check_repeats_until = 0.0
+        self.repeated: set[int] | None = None
 
     @property
     def lost(self) -> int:
         """Messages that did not arrive: as DDS tells, or as the numbers of the others show."""
-        return max(self.lost_events, self.gaps.missing)
+        return max(sum(self.lost_events), self.gaps.missing)
 
 
 class GraphTopics:
@@ -99,6 +104,9 @@ class GraphTopics:
 
     def poll(self) -> None:
         """Look at the graph, as far as there is time."""
+        for topic in self._topics.values():
+            if topic.replaced is not None and time.monotonic() > topic.replaced_until:
+                self._leave_replaced(topic)
         until = time.monotonic() + GRAPH_TIME
         for name, types in self._node.get_topic_names_and_types():
             # What waits on the topics that are there comes first; the rest at the next poll.
@@ -122,6 +130,7 @@ class GraphTopics:
     def leave(self) -> None:
         """Stop listening."""
         for topic in self._topics.values():
+            self._leave_replaced(topic)
             if topic.subscription is not None:
                 self._node.destroy_subscription(topic.subscription)
                 topic.subscription = None
@@ -158,27 +167,56 @@ class GraphTopics:
             now = before.qos_profile
             if (now.reliability, now.durability) == (qos.reliability, qos.durability):
                 return
-            topic.check_repeats_until = time.monotonic() + 2.0
+        number = len(topic.lost_events)
+        topic.lost_events.append(0)
 
         def count_lost(event: Any) -> None:
-            topic.lost_events = event.total_count
+            topic.lost_events[number] = event.total_count
 
-        topic.subscription = self._node.create_subscription(
+        def take_all(data: bytes, info: dict[str, int]) -> None:
+            if number == len(topic.lost_events) - 1:
+                # What it got before the other one was there comes first.
+                self._take_replaced(topic)
+            self._take_all(topic, data, info)
+
+        following = self._node.create_subscription(
             topic.message_class,
             topic.name,
-            lambda data, info: self._take_all(topic, data, info),
+            take_all,
             qos,
             event_callbacks=SubscriptionEventCallbacks(message_lost=count_lost),
             raw=True,
         )
         if before is not None:
-            self._node.destroy_subscription(before)
+            self._leave_replaced(topic)
+            topic.replaced, topic.replaced_until = before, time.monotonic() + OVERLAP
+            topic.repeated = {*topic.recent, *(topic.repeated or ())}
+        topic.subscription = following
 
     def _is_taken_best_effort(self, name: str) -> bool:
         return any(
             info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
             for info in self._node.get_subscriptions_info_by_topic(name)
         )
+
+    def _leave_replaced(self, topic: _Topic) -> None:
+        """Take what waits for the subscription that another has replaced, and end it."""
+        self._take_replaced(topic)
+        if topic.replaced is not None:
+            self._node.destroy_subscription(topic.replaced)
+            topic.replaced = None
+
+    def _take_replaced(self, topic: _Topic) -> None:
+        if topic.replaced is None:
+            return
+        handle = topic.replaced.handle
+        with handle:
+            # What comes meanwhile comes to the other one, too.
+            for _ in range(topic.replaced.qos_profile.depth):
+                taken = handle.take_message(topic.message_class, True)
+                if taken is None:
+                    return
+                self._take_one(topic, *taken)
 
     def _take_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         """Take a message and those that wait behind it: a turn costs more than they."""
@@ -191,13 +229,17 @@ class GraphTopics:
             while time.monotonic() < until:
                 taken = handle.take_message(topic.message_class, True)
                 if taken is None:
+                    if topic.replaced is None:
+                        topic.repeated = None
                     return
                 self._take_one(topic, *taken)
 
     def _take_one(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         sent = info["source_timestamp"]
-        if sent in topic.recent and time.monotonic() < topic.check_repeats_until:
-            return
+        if topic.repeated is not None:
+            if sent in topic.repeated:
+                return
+            topic.repeated.add(sent)
         topic.recent.append(sent)
         if not topic.described:
             self._describe(topic)

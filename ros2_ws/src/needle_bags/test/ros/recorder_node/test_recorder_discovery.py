@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -89,3 +90,31 @@ def test_a_best_effort_publisher_that_comes_last_is_not_told_of_incompatible_req
     assert refused == []
     assert "incompatible" not in errors
     assert set(numbers(bag, "/hold")) == {1}
+
+
+def test_nothing_is_lost_where_another_request_replaces_the_first(
+    domain: int, source: Source, tmp_path: Path
+) -> None:
+    bag = tmp_path / "bag"
+    process = start(domain, f"bag:={bag}")
+    reliable = source.publisher(Int32, "joints")
+    source.wait_matched(reliable)
+    sent = count()
+
+    def asks(reliability: ReliabilityPolicy) -> bool:
+        reliable.publish(Int32(data=next(sent)))
+        infos = source.node.get_subscriptions_info_by_topic("/joints")
+        return [info.qos_profile.reliability for info in infos] == [reliability]
+
+    source.wait(lambda: asks(ReliabilityPolicy.RELIABLE), "the recorder to ask for all")
+    # What comes while it stands still waits for its first subscription.
+    process.send_signal(signal.SIGSTOP)
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    source.publisher(Int32, "joints", best_effort)
+    for _ in range(500):
+        reliable.publish(Int32(data=next(sent)))
+    process.send_signal(signal.SIGCONT)
+    source.wait(lambda: asks(ReliabilityPolicy.BEST_EFFORT), "the recorder to ask for less")
+    assert reliable.wait_for_all_acked(Duration(seconds=PATIENCE))
+    assert end(process)[0] == 0
+    assert numbers(bag, "/joints") == list(range(next(sent)))
