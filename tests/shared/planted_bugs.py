@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -29,7 +30,7 @@ from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
 from needle_verification.ros.soak import rig_run
-from needle_verification.ros.soak.virtual_topics import VirtualPublisher
+from needle_verification.ros.soak.virtual_topics import VirtualPublisher, VirtualSubscription
 from needle_verification.soak.judging import limit_witness
 from needle_verification.soak.judging.hold_witness import HoldWitness
 from needle_verification.soak.judging.invariants import Watch
@@ -296,6 +297,16 @@ def _judge_forgets(**values: float) -> Plant:
     return _set(Watch, see_device=forgetful)
 
 
+def _each_loss_is_told_by_itself(patch: pytest.MonkeyPatch) -> None:
+    def lose(subscription: Any) -> None:
+        subscription.graph.overflows[subscription.node_name, subscription.topic_name] += 1
+        subscription._lost += 1
+        told = SimpleNamespace(total_count=subscription._lost)
+        subscription.process.do(lambda: subscription._on_lost and subscription._on_lost(told))
+
+    patch.setattr(VirtualSubscription, "_lose_one", lose)
+
+
 def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
     bounds = dataclasses.replace(
         rig_run.bounds_of_the_rig(), insertion_following_error=0.0, rotation_following_error=0.0
@@ -323,6 +334,9 @@ MENDED = {
     "set_points_come_late": MendedBug("none_beyond_limits", _judge_of_drives_never_behind),
     "old_set_points_come_after_new_ones": MendedBug(
         "none_beyond_limits", _judge_of_drives_never_behind
+    ),
+    "a_flood_while_the_recorder_stands_still": MendedBug(
+        "nothing_recorded_is_lost", _each_loss_is_told_by_itself
     ),
     "a_fault_ends_homing_on_a_late_bus": MendedBug(
         "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)

@@ -245,6 +245,7 @@ class VirtualSubscription(Endpoint):
         self._raw = raw
         self._on_lost = on_lost
         self._lost = 0
+        self._tells_loss = False
         self._with_info = _takes_two(callback)
         self._queue: deque[Sample] = deque()
         self.careful: Careful = plainly
@@ -267,9 +268,14 @@ class VirtualSubscription(Endpoint):
     def _lose_one(self) -> None:
         self.graph.overflows[self.node_name, self.topic_name] += 1
         self._lost += 1
-        if self._on_lost is not None:
-            event = SimpleNamespace(total_count=self._lost)
-            self.process.do(partial(self._on_lost, event))
+        # Like a status of DDS: told once, with all that was lost until it is taken.
+        if not self._tells_loss and self._on_lost is not None:
+            self._tells_loss = True
+            self.process.do(self._tell_loss)
+
+    def _tell_loss(self) -> None:
+        self._tells_loss = False
+        self._on_lost(SimpleNamespace(total_count=self._lost))
 
     def get_publisher_count(self) -> int:
         """Return how many publishers it knows."""
