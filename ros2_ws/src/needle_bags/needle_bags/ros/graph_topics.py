@@ -173,16 +173,18 @@ class GraphTopics:
         def count_lost(event: Any) -> None:
             topic.lost_events[number] = event.total_count
 
-        def take_all(data: bytes, info: dict[str, int]) -> None:
-            if number == len(topic.lost_events) - 1:
-                # What it got before the other one was there comes first.
-                self._take_replaced(topic)
+        def take(data: bytes, info: dict[str, int]) -> None:
+            if following is topic.replaced:
+                self._take_one(topic, data, info)
+                return
+            # What the one before got before this one was there comes first.
+            self._take_replaced(topic)
             self._take_all(topic, data, info)
 
         following = self._node.create_subscription(
             topic.message_class,
             topic.name,
-            take_all,
+            take,
             qos,
             event_callbacks=SubscriptionEventCallbacks(message_lost=count_lost),
             raw=True,

@@ -39,13 +39,13 @@ class SetPointFrames:
             [m] or [rad]; None in its place if the drive shall not go there. None for other frames.
         """
         node, function = identifier & 0x7F, identifier & ~0x7F
-        if node not in self._operates:
+        if node not in self._operates or function not in (_CONTROL, _TARGET):
             return None
         if function == _CONTROL:
             self._operates[node] = data[0] & _OPERATE == _OPERATE and data[2] == _CYCLIC_POSITION
-        elif function == _TARGET and self._operates[node]:
-            counts = int.from_bytes(data[:4], "little", signed=True)
-            return node, counts / self._counts_per_unit[node]
-        if function in (_CONTROL, _TARGET) and not self._operates[node]:
+        if not self._operates[node]:
             return node, None
-        return None
+        if function == _CONTROL:
+            return None
+        counts = int.from_bytes(data[:4], "little", signed=True)
+        return node, counts / self._counts_per_unit[node]
