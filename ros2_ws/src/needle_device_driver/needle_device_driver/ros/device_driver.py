@@ -199,7 +199,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             return
         if self._cycle_clock.tell(ros_ns):
             # A clock that stands still is repeated for whoever comes late; so are the joints.
-            self._device.publish_joint_states(ros_ns)
+            self._device.publish_joint_states(ros_ns, time.monotonic())
         self._supervisor.note_time(ros_ns, time.monotonic())
         self._cycle_when_due()
 
@@ -219,10 +219,11 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._drives.collect()
         self._supervisor.drive(PERIOD, now)
         self._drives.exchange(wait)
-        self._supervisor.observe(time.monotonic())
+        observed = time.monotonic()
+        self._supervisor.observe(observed)
         self._device.report()
         # Last: whoever waits for this cycle's joints has heard all that came of it.
-        self._device.publish_joint_states(ros_ns)
+        self._device.publish_joint_states(ros_ns, observed)
 
     def _tell_health(self) -> None:
         link = self._link

@@ -180,9 +180,17 @@ class DeviceInterface:
         self._supervisor.see_others(self.others)
         self.report()
 
-    def publish_joint_states(self, stamp_ns: int) -> None:
-        """Publish the measured joints, sampled at `stamp_ns`, unless they are stale."""
-        joints = self._supervisor.joints(time.monotonic())
+    def publish_joint_states(self, stamp_ns: int, now: float) -> None:
+        """Publish the measured joints, unless they are stale.
+
+        Parameters
+        ----------
+        stamp_ns : int
+            When they were sampled [ns].
+        now : float
+            Steady time at which they must not be stale [s].
+        """
+        joints = self._supervisor.joints(now)
         if joints is not None:
             self.joint_states.publish(to_joint_state(joints, to_stamp(stamp_ns)))
 

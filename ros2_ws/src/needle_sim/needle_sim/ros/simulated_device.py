@@ -126,9 +126,10 @@ class SimulatedDevice:
         self._bench.move_to(self._insertion.position, self._rotation.position)
         self._supervisor.observe(now)
 
-    def end_tick(self, time_ns: int, _: float) -> bool:
+    def end_tick(self, time_ns: int, now: float) -> bool:
         """Tell what the tick came to; returns whether it is over."""
-        self._interface.publish_joint_states(time_ns)
+        # Of the tick, whose joints stay what they are however long this process stood still in it.
+        self._interface.publish_joint_states(time_ns, now)
         self._interface.report()
         return True
 
@@ -152,7 +153,7 @@ class SimulatedDevice:
         self._supervisor.note_time(time_ns, now)
         self._interface.report()
         if repeat:
-            self._interface.publish_joint_states(time_ns)
+            self._interface.publish_joint_states(time_ns, now)
 
     def count_watchdog_trip(self) -> None:
         """Count a watchdog of sim_rig's."""

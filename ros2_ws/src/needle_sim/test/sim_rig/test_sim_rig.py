@@ -19,6 +19,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE, to_nanoseconds
+from needle_sim.rig.bench import SimulatedBench
 from needle_sim.ros.sim_rig import SimRigNode
 from own_context import own_context
 
@@ -58,6 +59,26 @@ def test_five_steps_repeat_bit_for_bit_with_one_seed_and_differ_with_another() -
         assert tip.header.frame_id == "rig"
         assert abs(tip.point.x - truth.pose.position.x) <= 1e-3
     assert truths[-1].pose.position.z == pytest.approx(0.005, abs=1e-5)
+
+
+def test_a_rig_that_stands_still_within_a_tick_leaves_no_joints_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    usual = five_steps(1)
+    steady, move_to = time.monotonic, SimulatedBench.move_to
+    moves, slept = itertools.count(), itertools.accumulate(itertools.repeat(1.0))
+    late = 0.0
+
+    def move_late(bench: SimulatedBench, insertion: float, rotation: float) -> None:
+        nonlocal late
+        move_to(bench, insertion, rotation)
+        if next(moves) % 10 == 0:
+            late = next(slept)
+
+    monkeypatch.setattr(SimulatedBench, "move_to", move_late)
+    monkeypatch.setattr(time, "monotonic", lambda: steady() + late)
+    assert five_steps(1) == usual
+    assert late > 10.0
 
 
 def test_it_does_not_begin_beside_another_device() -> None:
