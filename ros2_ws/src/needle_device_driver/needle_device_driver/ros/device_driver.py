@@ -286,16 +286,15 @@ class DeviceDriverNode(WholeLifecycleNode):
         if not why_not:
             reply = self._supervisor.configure(time.monotonic())
             why_not = "" if reply.success else reply.message
+        self._refusal = why_not
         if not why_not:
             self._device.simulated = simulated
             # Once, whoever did it: afterwards the lifecycle is in somebody's hands.
             self._autostart = False
         elif self._ends_if_refused:
-            self._refusal = why_not
             return TransitionCallbackReturn.FAILURE
         self._device.report()
         if why_not:
-            self._refusal = why_not
             self.get_logger().error(f"not configured: {why_not}")
             return TransitionCallbackReturn.FAILURE
         for text in self._drives.missing_optional_objects:
