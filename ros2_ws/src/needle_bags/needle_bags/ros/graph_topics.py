@@ -49,9 +49,10 @@ class _Topic:
         self.gaps = SequenceGaps()
         self.replaced: Subscription | None = None
         self.replaced_until = 0.0
-        # Source stamps of the last messages, and of all while two subscriptions get them.
-        self.recent: collections.deque[int] = collections.deque(maxlen=64)
-        self.repeated: set[int] | None = None
+        # Source stamps and numbers, which tell messages apart, of the last ones, and of all while
+        # two subscriptions get them.
+        self.recent: collections.deque[tuple[int, int]] = collections.deque(maxlen=64)
+        self.repeated: set[tuple[int, int]] | None = None
 
     @property
     def lost(self) -> int:
@@ -238,14 +239,14 @@ class GraphTopics:
 
     def _take_one(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         sent = info["source_timestamp"]
+        number = info["publication_sequence_number"] or 0
         if topic.repeated is not None:
-            if sent in topic.repeated:
+            if (sent, number) in topic.repeated:
                 return
-            topic.repeated.add(sent)
-        topic.recent.append(sent)
+            topic.repeated.add((sent, number))
+        topic.recent.append((sent, number))
         if not topic.described:
             self._describe(topic)
-        number = info["publication_sequence_number"] or 0
         if number and topic.publishers == 1:
             topic.gaps.take(number)
         received = info["received_timestamp"] or time.time_ns()

@@ -185,4 +185,6 @@ def _spin(node: Node, end: EndRequest) -> int:
 def main(open_device: Callable[[str], Device] = InputDevice) -> int:
     """Run the operator; returns its exit code."""
     create = functools.partial(OperatorNode, open_device)
-    return run_node(create, help_text=HELP, parameters=OperatorParameters, spin=_spin)
+    return run_node(
+        create, help_text=HELP, parameters=OperatorParameters, spin=_spin, shared_memory=False
+    )

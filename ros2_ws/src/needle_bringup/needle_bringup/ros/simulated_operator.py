@@ -252,4 +252,5 @@ def main() -> int:
         parameters=SimulatedOperatorParameters,
         spin=_spin,
         interrupted=EXIT_INTERRUPTED,
+        shared_memory=False,
     )

@@ -10,10 +10,13 @@ import pytest
 from needle_common.process.reach import (
     DISCOVERY_RANGE,
     NETWORK,
+    NETWORK_UDP,
     PROFILES,
     THIS_MACHINE,
+    THIS_MACHINE_UDP,
     is_open,
     keep_to_this_machine,
+    leave_shared_memory,
 )
 
 _NAMES = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
@@ -46,19 +49,60 @@ def test_profiles_of_the_users_own_stay(tmp_path: Path) -> None:
     assert kept(**{PROFILES: str(own)})[PROFILES] == str(own)
 
 
-def test_the_two_files_differ_in_the_list_of_interfaces_only() -> None:
-    closed, opened = (ElementTree.parse(file).getroot() for file in (THIS_MACHINE, NETWORK))
-    lists = [
-        (parent, child)
-        for parent in closed.iter()
-        for child in parent
-        if child.tag == f"{_NAMES}interfaceWhiteList"
-    ]
-    assert [address.text for _, one in lists for address in one] == ["127.0.0.1"]
-    for parent, child in lists:
-        parent.remove(child)
+@pytest.mark.parametrize(
+    ("asked", "profiles", "opened"),
+    [
+        ("LOCALHOST", THIS_MACHINE_UDP, False),
+        ("OFF", THIS_MACHINE, False),
+        ("SUBNET", NETWORK_UDP, True),
+        ("SYSTEM_DEFAULT", NETWORK_UDP, True),
+    ],
+)
+def test_without_shared_memory_as_many_are_reached(
+    asked: str, profiles: Path, opened: bool
+) -> None:
+    environment = kept(**{DISCOVERY_RANGE: asked})
+    leave_shared_memory(environment)
+    assert environment[PROFILES] == str(profiles)
+    assert is_open(environment) is opened
+    # What such a node starts has it again.
+    keep_to_this_machine(environment)
+    assert environment == kept(**{DISCOVERY_RANGE: asked.upper()})
 
-    def flat(root: ElementTree.Element) -> list[tuple[str, dict[str, str], str]]:
-        return [(e.tag, e.attrib, (e.text or "").strip()) for e in root.iter()]
 
-    assert flat(closed) == flat(opened)
+def test_profiles_of_the_users_own_keep_their_shared_memory(tmp_path: Path) -> None:
+    own = tmp_path / "profiles.xml"
+    own.touch()
+    environment = kept(**{PROFILES: str(own)})
+    before = dict(environment)
+    leave_shared_memory(environment)
+    assert environment == before
+
+
+def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:
+    """Return the elements of profiles, tag and text; but some, and what is in those."""
+
+    def is_left_out(element: ElementTree.Element) -> bool:
+        name = element.tag.removeprefix(_NAMES)
+        described = name == "transport_descriptor" and element.findtext(f"{_NAMES}transport_id")
+        return {name, described or element.text} & {*left_out} != set()
+
+    def walk(element: ElementTree.Element) -> list[tuple[str, str]]:
+        found = [(element.tag, (element.text or "").strip())]
+        for child in element:
+            if not is_left_out(child):
+                found += walk(child)
+        return found
+
+    return walk(ElementTree.parse(file).getroot())
+
+
+def test_the_files_differ_in_interfaces_and_shared_memory_only() -> None:
+    assert elements(THIS_MACHINE, "interfaceWhiteList") == elements(NETWORK)
+    for file in (THIS_MACHINE, THIS_MACHINE_UDP):
+        listed = ElementTree.parse(file).getroot().iter(f"{_NAMES}interfaceWhiteList")
+        assert [address.text for one in listed for address in one] == ["127.0.0.1"]
+    assert elements(NETWORK, "needle_shm") == elements(NETWORK_UDP)
+    # What it means for ROS's layer on Fast DDS to discover this machine alone.
+    discovery = ("maxInitialPeersRange", "metatrafficUnicastLocatorList", "initialPeersList")
+    assert elements(THIS_MACHINE, "needle_shm") == elements(THIS_MACHINE_UDP, *discovery)

@@ -90,8 +90,7 @@ class DeviceDriverNode(WholeLifecycleNode):
     ) -> None:
         # A long request would hold the cycle up: `ParameterDesk` answers.
         super().__init__("device_driver", start_parameter_services=False, **node_arguments)
-        values = NodeParameters(self, DeviceDriverParameters).values
-        self._settings = values
+        self._settings = values = NodeParameters(self, DeviceDriverParameters).values
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         if values.lock_step and not self._sim_time:
             raise UserError(f"{self.get_fully_qualified_name()}: lock_step wants use_sim_time")
@@ -393,6 +392,7 @@ def main() -> int:
         parameters=DeviceDriverParameters,
         spin=spin,
         grace=_GRACE,
+        shared_memory=False,
     )
 
 

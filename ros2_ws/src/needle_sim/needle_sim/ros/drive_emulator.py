@@ -203,6 +203,7 @@ def main() -> int:
         help_text=HELP,
         parameters=DriveEmulatorParameters,
         spin=spin,
+        shared_memory=False,
     )
 
 
