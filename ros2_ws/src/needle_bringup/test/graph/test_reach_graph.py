@@ -55,17 +55,13 @@ print(json.dumps({"heard": heard, "found": found}))
 
 Start = Callable[..., NodeProcess]
 
-# Package, words of its log once it is there, parameters.
-NODES: dict[str, tuple[str, str, tuple[str, ...]]] = {
-    "device_driver": (
-        "needle_device_driver",
-        "waiting for the drives",
-        ("channel:={}/none", "connect_timeout:=600.0"),
-    ),
-    "drive_emulator": ("needle_sim", "emulates both drives", ("pty:={}/can",)),
-    "operator": ("needle_bringup", "(ROS_DOMAIN_ID", ("source:=joy", "key:=0")),
-    "simulated_operator": ("needle_bringup", "(ROS_DOMAIN_ID", ()),
-    "plane_controller": ("needle_controller", "preset best", ()),
+# Package and parameters of each node.
+NODES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "device_driver": ("needle_device_driver", ("channel:={}/none", "connect_timeout:=600.0")),
+    "drive_emulator": ("needle_sim", ("pty:={}/can",)),
+    "operator": ("needle_bringup", ("source:=joy", "key:=0")),
+    "simulated_operator": ("needle_bringup", ()),
+    "plane_controller": ("needle_controller", ()),
 }
 
 
@@ -91,7 +87,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
     def begin(
         name: str, environment: dict[str, str], *before: str, node: str = "device_driver"
     ) -> NodeProcess:
-        package, says, parameters = NODES[node]
+        package, parameters = NODES[node]
         command = [*before, find_executable(package, node), "--ros-args"]
         for parameter in parameters:
             command += ["-p", parameter.format(tmp_path)]
@@ -99,7 +95,7 @@ def start(tmp_path: Path) -> Iterator[Start]:
         process = NodeProcess(name, command, environment=environment, log=tmp_path / f"{name}.log")
         processes.append(process)
         deadline = time.monotonic() + LIMIT
-        while says not in process.log.read_text("utf-8"):
+        while "ROS_DOMAIN_ID" not in process.log.read_text("utf-8"):
             assert process.exit_code is None, process.tail(5)
             assert time.monotonic() < deadline, process.tail(5)
         return process

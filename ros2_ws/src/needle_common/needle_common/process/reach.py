@@ -15,11 +15,13 @@ NETWORK_UDP = Path(__file__).with_name("needle_fastdds_network_udp.xml")
 # How long a device on another machine has to show itself before anything begins here [s].
 DISCOVERY = 2.0
 
-_CLOSED = ("LOCALHOST", "OFF")
+_LOCALHOST = "LOCALHOST"
 _OURS = [file.name for file in (THIS_MACHINE, NETWORK, THIS_MACHINE_UDP, NETWORK_UDP)]
 
 
-def keep_to_this_machine(environment: MutableMapping[str, str] = os.environ) -> None:
+def keep_to_this_machine(
+    environment: MutableMapping[str, str] = os.environ, *, shared_memory: bool = True
+) -> None:
     """Set what is not set, so that a node started from here reaches this machine only.
 
     Where the user's discovery range asks for a network, the node is open to it. A file of profiles
@@ -29,32 +31,24 @@ def keep_to_this_machine(environment: MutableMapping[str, str] = os.environ) -> 
     ----------
     environment : mutable mapping
         Read by ROS and Fast DDS when the first node is made.
+    shared_memory : bool
+        Whether messages may go through shared memory, if the profiles are ours: opening that of a
+        process which appears may hold this one up for 0.33 s.
     """
     given = Path(environment.get(PROFILES) or THIS_MACHINE)
     if given.name == THIS_MACHINE_UDP.name:
-        # Of a process that has left shared memory, and has started this one.
-        environment[DISCOVERY_RANGE] = _CLOSED[0]
-    environment.setdefault(DISCOVERY_RANGE, _CLOSED[0])
-    if given.name in _OURS or not given.is_file():
-        environment[PROFILES] = str(NETWORK if is_open(environment) else THIS_MACHINE)
-
-
-def leave_shared_memory(environment: MutableMapping[str, str] = os.environ) -> None:
-    """Keep a node's messages out of shared memory, whose opening may hold a process up for 0.33 s.
-
-    For who must not be held up and has no images; reached as `keep_to_this_machine` has set it.
-
-    Parameters
-    ----------
-    environment : mutable mapping
-        Read by ROS and Fast DDS when the first node is made.
-    """
-    profiles = environment[PROFILES]
-    if profiles == str(NETWORK):
-        environment[PROFILES] = str(NETWORK_UDP)
-    elif profiles == str(THIS_MACHINE) and environment[DISCOVERY_RANGE].upper() == _CLOSED[0]:
+        # Of a process without shared memory that has started this one.
+        environment[DISCOVERY_RANGE] = _LOCALHOST
+    reach = environment.setdefault(DISCOVERY_RANGE, _LOCALHOST).upper()
+    if given.name not in _OURS and given.is_file():
+        return
+    if is_open(environment):
+        environment[PROFILES] = str(NETWORK if shared_memory else NETWORK_UDP)
+    elif shared_memory or reach != _LOCALHOST:
+        environment[PROFILES] = str(THIS_MACHINE)
+    else:
         environment[PROFILES] = str(THIS_MACHINE_UDP)
-        # For LOCALHOST rmw_fastrtps adds shared memory; the profiles keep to it by themselves.
+        # For LOCALHOST rmw_fastrtps adds shared memory; these profiles keep to it by themselves.
         environment[DISCOVERY_RANGE] = "SYSTEM_DEFAULT"
 
 
@@ -62,4 +56,4 @@ def is_open(environment: Mapping[str, str] = os.environ) -> bool:
     """Return whether the user has asked for a network."""
     if environment.get(PROFILES) == str(THIS_MACHINE_UDP):
         return False
-    return environment.get(DISCOVERY_RANGE, _CLOSED[0]).upper() not in _CLOSED
+    return environment.get(DISCOVERY_RANGE, _LOCALHOST).upper() not in (_LOCALHOST, "OFF")

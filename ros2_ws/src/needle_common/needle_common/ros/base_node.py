@@ -26,7 +26,7 @@ from needle_common.commands.cli import (
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import GRACE, EndRequest
-from needle_common.process.reach import keep_to_this_machine, leave_shared_memory
+from needle_common.process.reach import keep_to_this_machine
 from needle_common.process.shared_memory import make_private
 from needle_common.ros.conversions import RELIABLE, to_diagnostic_status, to_stamp
 from needle_common.ros.discovery import signature
@@ -145,8 +145,7 @@ def run_node(
     interrupted : int
         Exit code of a process that just ends.
     shared_memory : bool
-        Whether messages may go through shared memory, as images must: opening that of a node which
-        appears may hold the process up for 0.33 s.
+        Whether messages may go through shared memory, as images must: see `keep_to_this_machine`.
 
     Returns
     -------
@@ -167,9 +166,7 @@ def run_node(
                 raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
             for line in foreign_nodes(argv):
                 print(line, file=sys.stderr)
-            keep_to_this_machine()
-            if not shared_memory:
-                leave_shared_memory()
+            keep_to_this_machine(shared_memory=shared_memory)
             # rclpy's own handlers would shut the context down in the middle of what is under way.
             rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
         # rclpy raises its own private types for a bad command line

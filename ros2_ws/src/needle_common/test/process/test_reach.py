@@ -16,7 +16,6 @@ from needle_common.process.reach import (
     THIS_MACHINE_UDP,
     is_open,
     keep_to_this_machine,
-    leave_shared_memory,
 )
 
 _NAMES = "{http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles}"
@@ -61,22 +60,21 @@ def test_profiles_of_the_users_own_stay(tmp_path: Path) -> None:
 def test_without_shared_memory_as_many_are_reached(
     asked: str, profiles: Path, opened: bool
 ) -> None:
-    environment = kept(**{DISCOVERY_RANGE: asked})
-    leave_shared_memory(environment)
+    environment = {DISCOVERY_RANGE: asked}
+    keep_to_this_machine(environment, shared_memory=False)
     assert environment[PROFILES] == str(profiles)
     assert is_open(environment) is opened
     # What such a node starts has it again.
     keep_to_this_machine(environment)
-    assert environment == kept(**{DISCOVERY_RANGE: asked.upper()})
+    assert environment == kept(**{DISCOVERY_RANGE: asked})
 
 
 def test_profiles_of_the_users_own_keep_their_shared_memory(tmp_path: Path) -> None:
     own = tmp_path / "profiles.xml"
     own.touch()
-    environment = kept(**{PROFILES: str(own)})
-    before = dict(environment)
-    leave_shared_memory(environment)
-    assert environment == before
+    environment = {PROFILES: str(own)}
+    keep_to_this_machine(environment, shared_memory=False)
+    assert environment == kept(**{PROFILES: str(own)})
 
 
 def elements(file: Path, *left_out: str) -> list[tuple[str, str]]:

@@ -11,7 +11,7 @@ import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
 from needle_common.errors import UserError
-from needle_common.process.reach import keep_to_this_machine, leave_shared_memory
+from needle_common.process.reach import keep_to_this_machine
 from needle_common.ros.base_node import executor_of
 from needle_common.ros.whole_node import WholeNode
 
@@ -21,9 +21,8 @@ PATIENCE = 20.0
 @contextmanager
 def ros(domain: int) -> Iterator[None]:
     """Start ROS in this process and in this domain, and shut it down in the end."""
-    keep_to_this_machine()
     # Its hold must not lapse where a node appears.
-    leave_shared_memory()
+    keep_to_this_machine(shared_memory=False)
     rclpy.init(args=[], domain_id=domain)
     try:
         yield
