@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import collections
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import islice
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -212,14 +213,9 @@ class GraphTopics:
     def _take_replaced(self, topic: _Topic) -> None:
         if topic.replaced is None:
             return
-        handle = topic.replaced.handle
-        with handle:
-            # What comes meanwhile comes to the other one, too.
-            for _ in range(topic.replaced.qos_profile.depth):
-                taken = handle.take_message(topic.message_class, True)
-                if taken is None:
-                    return
-                self._take_one(topic, *taken)
+        # What comes meanwhile comes to the other one, too.
+        for taken in islice(_waiting(topic, topic.replaced), topic.replaced.qos_profile.depth):
+            self._take_one(topic, *taken)
 
     def _take_all(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         """Take a message and those that wait behind it: a turn costs more than they."""
@@ -227,15 +223,12 @@ class GraphTopics:
         if topic.subscription is None:
             return
         until = time.monotonic() + TURN
-        handle = topic.subscription.handle
-        with handle:
-            while time.monotonic() < until:
-                taken = handle.take_message(topic.message_class, True)
-                if taken is None:
-                    if topic.replaced is None:
-                        topic.repeated = None
-                    return
-                self._take_one(topic, *taken)
+        for taken in _waiting(topic, topic.subscription):
+            self._take_one(topic, *taken)
+            if time.monotonic() >= until:
+                return
+        if topic.replaced is None:
+            topic.repeated = None
 
     def _take_one(self, topic: _Topic, data: bytes, info: dict[str, int]) -> None:
         sent = info["source_timestamp"]
@@ -267,3 +260,11 @@ class GraphTopics:
                 offered_qos=tuple(offered_qos(offer) for offer in offers),
             )
         )
+
+
+def _waiting(topic: _Topic, subscription: Subscription) -> Iterator[tuple[bytes, dict[str, int]]]:
+    """Take one after the other what waits for a subscription."""
+    handle = subscription.handle
+    with handle:
+        while (taken := handle.take_message(topic.message_class, True)) is not None:
+            yield taken
