@@ -49,9 +49,11 @@ class EndRequest:
         self.wanted = False
         self._before = _handle(self._take)
         self._exit: LateExit | None = None
-        if LeaveAtOnce.began and grace is not None:
-            self._exit = LateExit(grace, code)
-            self._exit.start_with_signal()
+        if LeaveAtOnce.began:
+            LateExit.leave_signals_alone()
+            if grace is not None:
+                self._exit = LateExit(grace, code)
+                self._exit.start_with_signal()
 
     def __enter__(self) -> EndRequest:
         return self
@@ -77,7 +79,8 @@ class EndRequest:
 class LeaveAtOnce:
     """Ends the process with this exit code when a signal of `ENDING_SIGNALS` comes.
 
-    For the time before anything has begun that must be ended in order: while modules are loaded.
+    For the time before anything has begun that must be ended in order: while modules are loaded,
+    which may keep the interpreter for seconds where they come from a slow disk.
 
     Attributes
     ----------
@@ -91,6 +94,7 @@ class LeaveAtOnce:
         LeaveAtOnce.began = True
         self._code = code
         _handle(self._take)
+        LateExit(TAKE_APART, code).start_with_signal()
 
     def _take(self, _number: int, _frame: FrameType | None) -> None:
         os._exit(self._code)
@@ -120,6 +124,8 @@ def interruptible() -> Iterator[None]:
             raised = time.monotonic()
             raise KeyboardInterrupt
 
+    if LeaveAtOnce.began:
+        LateExit.leave_signals_alone()
     before = {
         number: signal.signal(number, take)
         for number in ENDING_SIGNALS

@@ -93,6 +93,11 @@ class LateExit:
         self._read(self._signal)
         signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
 
+    @staticmethod
+    def leave_signals_alone() -> None:
+        """Undo `start_with_signal` for signals that have not come yet."""
+        signal.set_wakeup_fd(-1)
+
     def set_code(self, code: int) -> None:
         """Take another exit code."""
         self._end.event.value = code

@@ -80,21 +80,37 @@ with EndRequest() as end:
     assert run(code) == (5, "")
 
 
-def test_an_end_after_a_signal_needs_no_interpreter() -> None:
+@pytest.mark.parametrize("begin", ["LeaveAtOnce(7)", "LeaveAtOnce(1); EndRequest(0.1, code=7)"])
+def test_an_end_after_a_signal_needs_no_interpreter(begin: str) -> None:
     # The signal comes while compiled code keeps the lock for good: a mutex is taken twice.
-    code = """
+    code = f"""
 import ctypes, subprocess
 from needle_common.process.end_request import EndRequest, LeaveAtOnce
-LeaveAtOnce(1)
+{begin}
 wait = 'read go; until grep -q "^State:.S" /proc/$0/status; do :; done; kill -TERM $0'
-with EndRequest(0.1, code=7):
-    held, mutex = ctypes.PyDLL(None), ctypes.create_string_buffer(64)
-    held.pthread_mutex_lock(mutex)
-    sender = subprocess.Popen(["sh", "-c", wait, str(os.getpid())], stdin=subprocess.PIPE)
-    sender.stdin.write(b"go\\n"); sender.stdin.flush()
-    held.pthread_mutex_lock(mutex)
+held, mutex = ctypes.PyDLL(None), ctypes.create_string_buffer(64)
+held.pthread_mutex_lock(mutex)
+sender = subprocess.Popen(["sh", "-c", wait, str(os.getpid())], stdin=subprocess.PIPE)
+sender.stdin.write(b"go\\n"); sender.stdin.flush()
+held.pthread_mutex_lock(mutex)
 """
     assert run(code) == (7, "")
+
+
+def test_a_command_that_was_loaded_takes_its_time_to_clean_up() -> None:
+    code = """
+from needle_common.process.end_request import TAKE_APART, LeaveAtOnce, interruptible
+LeaveAtOnce(1)
+try:
+    with interruptible():
+        send(signal.SIGTERM)
+        while True: pass
+except KeyboardInterrupt:
+    until = time.monotonic() + 2 * TAKE_APART
+    while time.monotonic() < until: pass
+    print("cleaned up")
+"""
+    assert run(code) == (0, "cleaned up\n")
 
 
 def test_the_end_after_a_signal_has_the_code_that_was_said_last() -> None:

@@ -272,14 +272,18 @@ def _signal_finding(key: str, found: list[Ended], load: str) -> Finding:
         for one in found
         if one.wrong or one.code not in _END_CODES
     ]
-    late = [node for node, s in slowest.items() if s > LONGEST_END.get(node, LONGEST_END_OF_OTHERS)]
+    late = [
+        f"{one.node} {one.seconds:.2f} s after {one.kind} at {one.moment:.1f} s"
+        for one in found
+        if one.seconds > LONGEST_END.get(one.node, LONGEST_END_OF_OTHERS)
+    ]
     times = ", ".join(f"{node} {seconds:.2f} s" for node, seconds in slowest.items())
     return Finding(
         key,
         f"signals at random moments at 2 x 30 Hz, {load}: {len(found)} ends",
         f"exit code 0 or 130, no traceback, within {LONGEST_END_OF_OTHERS:g} s "
         f"(recorder {LONGEST_END['recorder']:g} s, its bag whole)",
-        f"{len(wrong)} otherwise; slowest: {times} " + "; ".join(wrong[:3]),
+        f"{len(wrong)} otherwise; slowest: {times} " + "; ".join(wrong[:3] + late[:3]),
         not wrong and not late,
     )
 
