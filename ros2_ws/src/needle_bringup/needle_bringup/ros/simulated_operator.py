@@ -240,8 +240,8 @@ def _spin(node: Node, end: EndRequest) -> int:
         code = node.finish(executor)
     finally:
         executor.shutdown()
-    # Others end on the same signal: a run that failed for want of them was interrupted.
-    return EXIT_INTERRUPTED if end.wanted and code == EXIT_MISSED else code
+    # Others end on the same signal: what failed for want of them was interrupted.
+    return EXIT_INTERRUPTED if end.wanted and code != EXIT_DONE else code
 
 
 def main() -> int:

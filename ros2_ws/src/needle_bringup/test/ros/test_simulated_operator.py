@@ -146,12 +146,20 @@ def test_a_fault_ends_it_with_the_reason_in_one_line(scene: Scene) -> None:
     assert lines == ["simulated_operator: plane_controller FAULT: the needle is gone"]
 
 
-def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(scene: Scene) -> None:
+@pytest.mark.parametrize("prepared", [True, False])
+def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(
+    scene: Scene, prepared: bool
+) -> None:
     rig = scene.rig
-    scene.until(lambda: rig.asked == STARTED)
+    if prepared:
+        scene.until(lambda: rig.asked == STARTED)
+        rig.tell_controller("FAULT", 7, "the device is gone")
+    else:
+        scene.until(lambda: "device/home" in rig.asked)
+        rig.refusal = "the device is gone"
+        scene.until(lambda: rig.asked[-1] == "device/enable True")
     # No answer comes: the stand-in waits for it while the signal comes.
     rig.mute = {"device/enable"}
-    rig.tell_controller("FAULT", 7, "the device is gone")
     scene.until(lambda: rig.asked[-1] == "device/enable False")
     scene.operator.send_signal(signal.SIGINT)
     code, said = scene.end()

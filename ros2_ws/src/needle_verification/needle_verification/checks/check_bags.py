@@ -268,7 +268,8 @@ def _signal_finding(key: str, found: list[Ended], load: str) -> Finding:
         for node in sorted({one.node for one in found})
     }
     wrong = [
-        f"{one.node} after {one.kind}: {one.wrong or f'exit code {one.code}'}"
+        f"{one.node} {one.seconds:.2f} s after {one.kind} at {one.moment:.1f} s: "
+        f"{one.wrong or f'exit code {one.code}, {one.said}'}"
         for one in found
         if one.wrong or one.code not in _END_CODES
     ]

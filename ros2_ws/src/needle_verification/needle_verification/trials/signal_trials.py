@@ -47,6 +47,8 @@ class Ended:
         Exit code.
     wrong : str
         What it wrote that no node must write, or why the recorder's bag cannot be read.
+    said : str
+        The last line that it wrote.
     """
 
     node: str
@@ -55,6 +57,7 @@ class Ended:
     seconds: float
     code: int
     wrong: str
+    said: str
 
 
 def signal_trials(
@@ -108,7 +111,7 @@ def _trial(
             wrong = _wrong(node)
             if node.name == "recorder" and bag.exists():
                 wrong = wrong or unreadable(bag)
-            yield Ended(node.name, kind, moment, ended_at - sent_at, code, wrong)
+            yield Ended(node.name, kind, moment, ended_at - sent_at, code, wrong, node.last_line)
 
 
 def _wait_until_begun(nodes: list[NodeProcess]) -> None:
