@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 from needle_common.errors import UserError
-from needle_common.process.shared_memory import remove_dead_ports
+from needle_common.process.shared_memory import remove_dead_ports, remove_half_made_ports
 
 # Above 101 the ports reach into the range that Linux gives out to outgoing connections; 0 is where
 # everything runs that was not told otherwise.
@@ -40,6 +40,7 @@ def own_domain() -> Iterator[int]:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as lock:
             if _binds(lock, f"\0needle_ros_domain_{domain}") and _is_silent(domain):
                 remove_dead_ports(ports_of(domain))
+                remove_half_made_ports()
                 try:
                     yield domain
                 finally:

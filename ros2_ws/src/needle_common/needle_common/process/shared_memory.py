@@ -1,18 +1,28 @@
 """Fast DDS's shared memory: kept from other users, and taken away where a process was killed.
 
 A port is a file that every process of a domain opens. Who is killed never closes it: the count of
-its users stays wrong for good, and the next run in that domain inherits the file.
+its users stays wrong for good, and the next run in that domain inherits the file. Who is killed
+while making one leaves a file for which whoever opens it waits for ever, as every node of this
+machine does for that of port 7000.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
+import re
+import sys
+import time
 from collections.abc import Iterable
 from pathlib import Path
 
 SHARED_MEMORY = Path("/dev/shm")
 _PREFIX = "fastrtps_"
+_PORT = re.compile(rf"{_PREFIX}port\d+")
+# Boost's first word of a segment: not begun, under way. What is made is neither.
+_HALF_MADE = (0, 1)
+# Making one takes less than a millisecond; on a busy machine its maker may have to wait [s].
+_MAKING = 1.0
 
 
 def make_private() -> None:
@@ -61,6 +71,42 @@ def remove_dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> Non
         for path in _files(folder, name):
             with contextlib.suppress(OSError):
                 path.unlink()
+
+
+def remove_half_made_ports(folder: Path = SHARED_MEMORY) -> None:
+    """Remove the ports that were half made when their maker ended; what is being made is awaited.
+
+    Parameters
+    ----------
+    folder : Path
+        Where shared memory is mounted.
+    """
+    found = _half_made_ports(folder)
+    if not found:
+        return
+    time.sleep(_MAKING)
+    for path, inode in _half_made_ports(folder).items():
+        if found.get(path) == inode:
+            with contextlib.suppress(OSError):
+                path.unlink()
+
+
+def _half_made_ports(folder: Path) -> dict[Path, int]:
+    """Return the inodes of half-made ports on which nobody listens."""
+    found = {}
+    for path in folder.iterdir():
+        # Another user's, or gone.
+        with contextlib.suppress(OSError):
+            if _PORT.fullmatch(path.name) and _is_half_made(path):
+                found[path] = path.stat().st_ino
+    return found
+
+
+def _is_half_made(port: Path) -> bool:
+    with port.open("rb") as file:
+        state = file.read(4)
+    unwritten = len(state) < 4 or int.from_bytes(state, sys.byteorder) in _HALF_MADE
+    return unwritten and not _is_held(port.parent, port.name)
 
 
 def _files(folder: Path, name: str) -> tuple[Path, Path, Path]:

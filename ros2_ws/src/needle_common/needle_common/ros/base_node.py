@@ -27,7 +27,7 @@ from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import GRACE, EndRequest
 from needle_common.process.reach import keep_to_this_machine
-from needle_common.process.shared_memory import make_private
+from needle_common.process.shared_memory import make_private, remove_half_made_ports
 from needle_common.ros.conversions import RELIABLE, to_diagnostic_status, to_stamp
 from needle_common.ros.discovery import signature
 from needle_common.ros.executor import NodeExecutor
@@ -167,6 +167,7 @@ def run_node(
             for line in foreign_nodes(argv):
                 print(line, file=sys.stderr)
             keep_to_this_machine(shared_memory=shared_memory)
+            remove_half_made_ports()
             # rclpy's own handlers would shut the context down in the middle of what is under way.
             rclpy.init(args=argv, signal_handler_options=SignalHandlerOptions.NO)
         # rclpy raises its own private types for a bad command line

@@ -3,6 +3,8 @@
 import dataclasses
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
 from rclpy.node import Node
@@ -11,6 +13,8 @@ from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERNAL_
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import ENDING_SIGNALS
+from needle_common.process.ros_domain import FIRST_PARTICIPANT, own_domain, ports_of
+from needle_common.process.shared_memory import SHARED_MEMORY
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 
 
@@ -107,3 +111,22 @@ def test_a_parameter_before_ros_args_is_said_to_go_after(
 def test_a_parameter_without_its_option_is_no_remapping(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(Refuses, "rate:=1", "--ros-args", "-p", "other:=1") == EXIT_BAD_INPUT
     assert capsys.readouterr().err.endswith("is set by --ros-args -p rate:=1\n")
+
+
+def test_a_node_begins_where_the_maker_of_a_port_ended_half_way() -> None:
+    code = """
+import sys
+from rclpy.node import Node
+from needle_common.ros.base_node import run_node
+node = lambda: Node("one")
+spin = lambda node, end: 7
+sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin))
+"""
+    with own_domain() as domain:
+        # Of what the rig says to each other; discovery has the one before.
+        port = ports_of(domain)[FIRST_PARTICIPANT + 1]
+        (SHARED_MEMORY / f"fastrtps_port{port}").write_bytes(b"")
+        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, timeout=30.0, check=False)
+    assert done.returncode == 7

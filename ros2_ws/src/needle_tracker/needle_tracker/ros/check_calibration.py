@@ -17,6 +17,7 @@ from sensor_msgs.msg import Image
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.errors import UserError
 from needle_common.process.reach import keep_to_this_machine
+from needle_common.process.shared_memory import remove_half_made_ports
 from needle_common.ros.conversions import IMAGES_BEST_EFFORT, to_nanoseconds
 from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.pair_answers import Frame
@@ -68,6 +69,7 @@ def _live_view(
         raise UserError(f"--live {name} is none of the session's places")
     context = Context()
     keep_to_this_machine()
+    remove_half_made_ports()
     rclpy.init(args=words, context=context, signal_handler_options=SignalHandlerOptions.NO)
     try:
         pairs = _Capture(context, calibration, options).take()
