@@ -94,7 +94,7 @@ def remove_half_made_ports(folder: Path = SHARED_MEMORY) -> None:
 def _half_made_ports(folder: Path) -> dict[Path, int]:
     """Return the inodes of half-made ports on which nobody listens."""
     found = {}
-    for path in folder.iterdir():
+    for path in folder.glob(f"{_PREFIX}port*"):
         # Another user's, or gone.
         with contextlib.suppress(OSError):
             if _PORT.fullmatch(path.name) and _is_half_made(path):
