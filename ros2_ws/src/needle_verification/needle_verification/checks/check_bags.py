@@ -268,13 +268,12 @@ def _signal_finding(key: str, found: list[Ended], load: str) -> Finding:
         for node in sorted({one.node for one in found})
     }
     wrong = [
-        f"{one.node} {one.seconds:.2f} s after {one.kind} at {one.moment:.1f} s: "
-        f"{one.wrong or f'exit code {one.code}, {one.said}'}"
+        f"{one.description}: {one.wrong or f'exit code {one.code}, {one.said}'}"
         for one in found
         if one.wrong or one.code not in _END_CODES
     ]
     late = [
-        f"{one.node} {one.seconds:.2f} s after {one.kind} at {one.moment:.1f} s"
+        one.description
         for one in found
         if one.seconds > LONGEST_END.get(one.node, LONGEST_END_OF_OTHERS)
     ]
@@ -284,7 +283,7 @@ def _signal_finding(key: str, found: list[Ended], load: str) -> Finding:
         f"signals at random moments at 2 x 30 Hz, {load}: {len(found)} ends",
         f"exit code 0 or 130, no traceback, within {LONGEST_END_OF_OTHERS:g} s "
         f"(recorder {LONGEST_END['recorder']:g} s, its bag whole)",
-        f"{len(wrong)} otherwise; slowest: {times} " + "; ".join(wrong[:3] + late[:3]),
+        "; ".join([f"{len(wrong)} otherwise", f"slowest: {times}", *wrong[:3], *late[:3]]),
         not wrong and not late,
     )
 

@@ -59,6 +59,11 @@ class Ended:
     wrong: str
     said: str
 
+    @property
+    def description(self) -> str:
+        """Node, time and signal in words."""
+        return f"{self.node} {self.seconds:.2f} s after {self.kind} at {self.moment:.1f} s"
+
 
 def signal_trials(
     folder: Path, count: int, seed: int, *, burners: int = 0, latest: float = LATEST
