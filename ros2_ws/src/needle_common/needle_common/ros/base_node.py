@@ -11,7 +11,6 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -212,9 +211,7 @@ def _explain(help_text: str, parameters: type) -> int:
     return EXIT_DONE
 
 
-def executor_of(
-    node: Node, on_failure: Callable[[str], None] = lambda _: None
-) -> SingleThreadedExecutor:
+def executor_of(node: Node, on_failure: Callable[[str], None] = lambda _: None) -> NodeExecutor:
     """Return what runs a node's callbacks, so that nothing which it is sent ends it.
 
     Parameters

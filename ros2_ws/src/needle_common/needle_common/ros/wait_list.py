@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Coroutine, Iterable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import Any
 
 from rclpy.context import Context
@@ -62,6 +62,28 @@ class WaitListExecutor(SingleThreadedExecutor):
         """Take note, from whatever thread, that entities of a node came or went."""
         self._is_stale = True
         super().wake()
+
+    def spin_ready(self, timeout_sec: float, looks: int) -> None:
+        """Wait until something is ready; run it, and what is ready then, until nothing is.
+
+        Parameters
+        ----------
+        timeout_sec : float
+            How long to wait [s]; not at all with 0.
+        looks : int
+            How often to look at most, each callback once a look: what comes without end ends here.
+        """
+        ran = True
+        while ran and looks > 0:
+            ran = False
+            with suppress(ShutdownException, TimeoutException):
+                for task, *_ in self._wait_for_ready_callbacks(timeout_sec):
+                    ran = True
+                    task()
+                    # Raises what the callback raised.
+                    task.result()
+            timeout_sec = 0.0
+            looks -= 1
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Run no callback any more."""

@@ -49,7 +49,7 @@ Publishes   sim/drive_positions: where the motors really are, from the home swit
 """
 
 # A look at ROS costs more than serving a frame: not more often than this, where nothing is awaited
-# of it. What comes faster waits in the middleware and takes memory there.
+# of it.
 _WAIT = 0.005
 _PERIOD = 0.02
 _PATIENCE = 0.2
@@ -191,11 +191,12 @@ def main() -> int:
                 now = time.monotonic()
                 if waits or now - looked_at >= _WAIT:
                     looked_at = now
-                    times = -1
-                    while node.new_times != times:
-                        # All that is there counts: a stamp that came late must not be taken twice.
-                        times = node.new_times
-                        executor.spin_once(timeout_sec=_WAIT if waits and times == 0 else 0.0)
+                    # All that waits counts: a stamp that came late must not be taken twice, and
+                    # what is left to the middleware takes memory there. A flood, more than a queue
+                    # holds, must not take the bus's time.
+                    executor.spin_ready(
+                        _WAIT if waits and node.new_times == 0 else 0.0, RELIABLE.depth
+                    )
         return EXIT_DONE
 
     return run_node(
