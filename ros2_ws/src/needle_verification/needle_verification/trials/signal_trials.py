@@ -106,10 +106,11 @@ def _trial(
         time.sleep(moment)
         number = signal.Signals[kind.split(maxsplit=1)[0]]
         sent_at = time.monotonic()
-        _send_to_all_at_once(nodes, number)
+        _send_at_once(nodes, number)
         if kind.endswith("twice"):
             time.sleep(rng.uniform(0.0, _SECOND_WITHIN))
-            _send_to_all_at_once(nodes, number)
+            # All have the first. To stop a node now would begin its time to end (`LateExit`) anew.
+            _send(nodes, number)
         ends = _ends(nodes)
         for node in nodes:
             ended_at, code = ends.get(node.name, (float("inf"), -signal.SIGKILL))
@@ -135,14 +136,19 @@ def _catches(pid: int, number: signal.Signals) -> bool:
     return False
 
 
-def _send_to_all_at_once(nodes: list[NodeProcess], number: signal.Signals) -> None:
+def _send_at_once(nodes: list[NodeProcess], number: signal.Signals) -> None:
     """Send a signal as a terminal does: none sees another's end before it has the signal itself.
 
     They are stopped meanwhile: each that gets it may take the processor from who sends it.
     """
-    for each in (signal.SIGSTOP, number, signal.SIGCONT):
-        for node in nodes:
-            node.signal_group(each)
+    _send(nodes, signal.SIGSTOP)
+    _send(nodes, number)
+    _send(nodes, signal.SIGCONT)
+
+
+def _send(nodes: list[NodeProcess], number: signal.Signals) -> None:
+    for node in nodes:
+        node.signal_group(number)
 
 
 def _ends(nodes: list[NodeProcess]) -> dict[str, tuple[float, int]]:
