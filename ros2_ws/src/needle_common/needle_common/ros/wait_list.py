@@ -73,17 +73,20 @@ class WaitListExecutor(SingleThreadedExecutor):
         looks : int
             How often to look at most, each callback once a look: what comes without end ends here.
         """
-        ran = True
-        while ran and looks > 0:
-            ran = False
-            with suppress(ShutdownException, TimeoutException):
-                for task, *_ in self._wait_for_ready_callbacks(timeout_sec):
-                    ran = True
-                    task()
-                    # Raises what the callback raised.
-                    task.result()
-            timeout_sec = 0.0
-            looks -= 1
+        for look in range(looks):
+            if not self._run_ready(timeout_sec if look == 0 else 0.0):
+                return
+
+    def _run_ready(self, timeout_sec: float) -> bool:
+        """Run what one look finds; return whether it found anything."""
+        found = False
+        with suppress(ShutdownException, TimeoutException):
+            for task, *_ in self._wait_for_ready_callbacks(timeout_sec):
+                found = True
+                task()
+                # Raises what the callback raised.
+                task.result()
+        return found
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Run no callback any more."""

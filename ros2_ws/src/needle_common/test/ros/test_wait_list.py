@@ -219,36 +219,30 @@ def test_a_failure_of_one_of_many_is_raised_and_the_others_have_their_turn(waiti
 
 
 def test_entities_are_gathered_once_however_many_callbacks_run(
-    monkeypatch: pytest.MonkeyPatch,
+    waiting: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    gathered = 0
-    original = wait_list._WaitList.__init__
+    gathered = waits = 0
+    gather, wait = wait_list._WaitList.__init__, wait_list._WaitList.wait
 
     def count(self: Any, executor: WaitListExecutor) -> None:
         nonlocal gathered
         gathered += 1
-        original(self, executor)
+        gather(self, executor)
 
-    with own_context() as context:
-        bench = Bench(context, WaitListExecutor)
-        heard: list[Header] = []
-        bench.hear("topic", heard.append)
-        sender = bench.sender("topic")
-        bench.executor.spin_once(timeout_sec=0.0)
-        monkeypatch.setattr(wait_list._WaitList, "__init__", count)
-        waits = 0
-        wait = wait_list._WaitList.wait
+    def count_waits(self: Any, timeout_ns: int) -> Any:
+        nonlocal waits
+        waits += 1
+        return wait(self, timeout_ns)
 
-        def count_waits(self: Any, timeout_ns: int) -> Any:
-            nonlocal waits
-            waits += 1
-            return wait(self, timeout_ns)
-
-        monkeypatch.setattr(wait_list._WaitList, "wait", count_waits)
-        for number in range(1, 21):
-            sender.publish(Header())
-            while len(heard) < number:
-                bench.executor.spin_once(timeout_sec=LIMIT)
-        bench.close()
+    heard: list[Header] = []
+    waiting.hear("topic", heard.append)
+    sender = waiting.sender("topic")
+    waiting.executor.spin_once(timeout_sec=0.0)
+    monkeypatch.setattr(wait_list._WaitList, "__init__", count)
+    monkeypatch.setattr(wait_list._WaitList, "wait", count_waits)
+    for number in range(1, 21):
+        sender.publish(Header())
+        while len(heard) < number:
+            waiting.executor.spin_once(timeout_sec=LIMIT)
     assert gathered == 0
     assert waits == 20
