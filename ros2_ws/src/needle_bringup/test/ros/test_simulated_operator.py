@@ -51,8 +51,9 @@ class PlayedRig(RigNode):
         send = service.send_response
 
         def send_unless_mute(response: object, header: object) -> None:
-            if name in self.mute:
-                self.mute.remove(name)
+            # An answer is sent directly after the call to `answer`.
+            if self.asked[-1] in self.mute:
+                self.mute.remove(self.asked[-1])
             else:
                 send(response, header)
 
@@ -151,15 +152,14 @@ def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(
     scene: Scene, prepared: bool
 ) -> None:
     rig = scene.rig
+    # The stand-in waits for the answer that does not come while the signal comes.
+    rig.mute = {"device/enable False"}
     if prepared:
         scene.until(lambda: rig.asked == STARTED)
         rig.tell_controller("FAULT", 7, "the device is gone")
     else:
         scene.until(lambda: "device/home" in rig.asked)
         rig.refusal = "the device is gone"
-        scene.until(lambda: rig.asked[-1] == "device/enable True")
-    # No answer comes: the stand-in waits for it while the signal comes.
-    rig.mute = {"device/enable"}
     scene.until(lambda: rig.asked[-1] == "device/enable False")
     scene.operator.send_signal(signal.SIGINT)
     code, said = scene.end()
@@ -170,7 +170,7 @@ def test_a_signal_while_a_failed_run_is_put_away_counts_as_one(
 @pytest.mark.parametrize("mute", STARTED)
 def test_an_answer_that_is_lost_is_asked_for_again(scene: Scene, mute: str) -> None:
     rig = scene.rig
-    rig.mute = {mute.partition(" ")[0]}
+    rig.mute = {mute}
     scene.until(lambda: "plane_controller/start" in rig.asked)
     rig.tell_controller("STEERING", 1)
     scene.until(lambda: rig.holds)
