@@ -8,13 +8,16 @@ from types import SimpleNamespace
 from typing import cast
 
 import pytest
-from _pytest.config import PytestPluginManager
 
 from code_lines import ROOT, code_lines, is_test, modules
-from pytest_lanes import BACKGROUND_LIMIT, LONG_FILES, pytest_collection_modifyitems
+from pytest_lanes import BACKGROUND_LIMIT, LONG_FILES, next_file, pytest_collection_modifyitems
 
 LONGEST_MODULE = 400
 MOST_MODULES = 15
+NODES = "ros2_ws/src/needle_bags/test/ros/test_recorder.py"
+MORE_NODES = "ros2_ws/src/needle_bags/test/ros/test_player.py"
+RECKONS = "ros2_ws/src/needle_tracker/test/image/test_looks.py"
+MORE = "ros2_ws/src/needle_tracker/test/image/test_tip_fit.py"
 # Docstrings begin with a noun or a verb, not with a clause.
 CLAUSES = {"How", "Nobody", "What", "When", "Where", "Who", "Whoever", "Whose", "Why"}
 SOURCE = '''"""A docstring.
@@ -80,13 +83,20 @@ def test_the_test_files_that_are_run_first_are_there() -> None:
     assert [name for name in LONG_FILES if not (ROOT / name).is_file()] == []
 
 
-def test_a_time_limit_begins_when_the_test_has_its_place_in_a_lane() -> None:
-    manager = PytestPluginManager()
-    for plugin in ("pytest_lanes", "pytest_timeout"):
-        manager.import_plugin(plugin)
-    # The last one is called first, and around the others.
-    names = [one.plugin_name for one in manager.hook.pytest_runtest_protocol.get_hookimpls()]
-    assert names.index("pytest_lanes") > names.index("pytest_timeout")
+@pytest.mark.parametrize(
+    ("waiting", "in_front", "next_one"),
+    [
+        ([NODES, RECKONS], True, NODES),
+        ([RECKONS, NODES, MORE_NODES], True, NODES),
+        ([NODES, RECKONS, MORE], False, RECKONS),
+        ([RECKONS, MORE], True, RECKONS),
+        ([NODES, MORE_NODES], False, None),
+    ],
+)
+def test_a_lane_gets_what_it_may_run(
+    waiting: list[str], in_front: bool, next_one: str | None
+) -> None:
+    assert next_file(waiting, in_front=in_front) == next_one
 
 
 def test_who_makes_way_for_others_has_time(request: pytest.FixtureRequest) -> None:

@@ -4,24 +4,26 @@ scripts/test sets NEEDLE_TEST_RUN, unique to the run and inherited by every proc
 starts. pytest-xdist runs the test files in lanes, each a process of its own; nodes of one lane must
 not hear those of another.
 
-Three lanes share two cores. Files that only reckon (`IN_BACKGROUND`) take what the others leave:
-those with nodes and watchdogs wait most of their time, and are late when nobody makes way for them.
-At most two of these run at a time.
+Four lanes share two cores. Files with nodes and watchdogs of their own wait a third of their time,
+and are late when nobody makes way for them: at most two of them run at a time. Files that only
+reckon (`IN_BACKGROUND`) take what those leave.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import gc
 import os
 import re
 import signal
 import time
-from collections.abc import Generator
+from collections.abc import Collection, Generator
 from pathlib import Path
 
 import pytest
+from xdist.remote import Producer
+from xdist.scheduler import LoadFileScheduling
+from xdist.workermanage import WorkerController
 
 from needle_common.process.ros_domain import own_domain
 
@@ -35,26 +37,28 @@ LONG_FILES = (
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
     "ros2_ws/src/needle_bringup/test/graph/test_console.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
+    "ros2_ws/src/needle_verification/test/ros/soak/test_rig_run.py",
+    "ros2_ws/src/needle_verification/test/studies/test_obstacle_study.py",
     "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
-    "ros2_ws/src/needle_analysis/test/ros/test_rerun.py",
-    "ros2_ws/src/needle_analysis/test/ros/test_rerun_hearing.py",
+    "ros2_ws/src/needle_verification/test/checks/test_check_control.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_bags.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_console_hold.py",
 )
 IN_BACKGROUND = re.compile(
-    r"tests/(test_lint|site/test_docs_site)\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
+    r"tests/(test_(lint|reference)|site/\w+)\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
     r".*/needle_sim/test/(camera|needle|path_traced|studies)/.*|"
-    r".*/needle_analysis/test/(report|run|rerun)/.*|"
-    r".*/needle_verification/test/(studies|tracking|training|paper)/.*"
+    r".*/needle_bags/test/(reading|recovery)/.*|"
+    r".*/needle_analysis/test/(report/|run/|rerun/|ros/test_(rerun|hostile)).*|"
+    r".*/needle_verification/test/(studies|tracking|training|paper)/.*|"
+    r".*/needle_verification/test/(checks/test_check_control|ros/soak/test_rig_run)\.py"
 )
 """Test files without processes or watchdogs of their own."""
 BACKGROUND_LIMIT = 900.0
 """A test's time in the background [s]: while both cores are in use it may stand still."""
 _IN_FRONT = 2
+"""How many files may run in front of the others at a time."""
+_BACKGROUND_NICENESS = 10
 _left: list[str] = []
-_place = contextlib.ExitStack()
-_running: list[str] = []
-"""The file that has this lane's place; empty between two."""
 _reserved = contextlib.ExitStack()
 
 
@@ -71,6 +75,45 @@ def pytest_unconfigure() -> None:
     _reserved.close()
 
 
+class LaneScheduling(LoadFileScheduling):
+    """Hands out the files, in their order, each to a lane that may run it at once."""
+
+    def _assign_work_unit(self, node: WorkerController) -> None:
+        lanes_in_front = sum(
+            any(_runs_in_front(file) and not all(done.values()) for file, done in files.items())
+            for lane, files in self.assigned_work.items()
+            if lane is not node
+        )
+        # Only a privileged user may take back what a lane gave away.
+        stays_behind = not all(map(_runs_in_front, self.assigned_work[node]))
+        file = next_file(self.workqueue, in_front=lanes_in_front < _IN_FRONT and not stays_behind)
+        if file is None:
+            # What is left is for the lanes in front.
+            node.shutdown()
+        else:
+            self.workqueue.move_to_end(file, last=False)
+            super()._assign_work_unit(node)
+
+
+def next_file(waiting: Collection[str], *, in_front: bool) -> str | None:
+    """Return the test file that a lane gets next, or None.
+
+    Parameters
+    ----------
+    waiting : collection of str
+        Test files that no lane has yet.
+    in_front : bool
+        Whether the lane may run in front; it is in the background when nothing is left there.
+    """
+    kinds = (True, False) if in_front else (False,)
+    return next((file for kind in kinds for file in waiting if _runs_in_front(file) is kind), None)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LaneScheduling:
+    """Return what hands out the files in place of xdist's own."""
+    return LaneScheduling(config, log)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Generator[None, object, object]:
     """Collect without searches for garbage: what comes up is there to stay."""
@@ -85,46 +128,25 @@ def pytest_collection() -> Generator[None, object, object]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest files first, all else as it was collected; give time to who makes way."""
     for item in items:
-        if IN_BACKGROUND.fullmatch(_file_of(item)):
+        if not _runs_in_front(_file_of(item)):
             item.add_marker(pytest.mark.timeout(BACKGROUND_LIMIT), append=False)
     places = {file: place for place, file in enumerate(LONG_FILES)}
     items.sort(key=lambda item: places.get(_file_of(item), len(places)))
 
 
-# First of all: a test's own time limit begins when it has its place.
-@pytest.hookimpl(wrapper=True, tryfirst=True)
-def pytest_runtest_protocol(
-    item: pytest.Item, nextitem: pytest.Item | None
-) -> Generator[None, object, object]:
-    """Take a file's place, in front or in the background, for as long as it runs."""
-    file = _file_of(item)
-    if in_lane(item.config) and _running != [file]:
-        _take_place(file)
-        _running[:] = [file]
-    result = yield
-    if nextitem is None or _file_of(nextitem) != file:
-        _running.clear()
-        _place.close()
-    return result
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> None:
+    """Make way for the files in front."""
+    if in_lane(item.config) and not _runs_in_front(_file_of(item)):
+        os.setpriority(os.PRIO_PROCESS, 0, _BACKGROUND_NICENESS)
 
 
 def _file_of(item: pytest.Item) -> str:
     return item.nodeid.partition("::")[0]
 
 
-def _take_place(file: str) -> None:
-    policy = os.SCHED_IDLE if IN_BACKGROUND.fullmatch(file) else os.SCHED_OTHER
-    os.sched_setscheduler(0, policy, os.sched_param(0))
-    if policy == os.SCHED_IDLE:
-        return
-    names = [Path(os.environ["TMPDIR"], f"place_{n}") for n in range(_IN_FRONT)]
-    places = [_place.enter_context(name.open("wb")) for name in names]
-    while True:
-        for place in places:
-            with contextlib.suppress(BlockingIOError):
-                fcntl.flock(place, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                return
-        time.sleep(0.05)
+def _runs_in_front(file: str) -> bool:
+    return IN_BACKGROUND.fullmatch(file) is None
 
 
 def in_lane(config: pytest.Config) -> bool:
