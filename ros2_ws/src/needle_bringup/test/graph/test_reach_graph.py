@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -106,10 +107,12 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 def listening(pid: int, domain: int) -> set[str]:
     """Return the addresses at which a process listens on ports of its domain."""
-    files = Path(f"/proc/{pid}/fd").iterdir()
-    own = {
-        match[1] for f in files if (match := re.fullmatch(r"socket:\[(\d+)\]", str(f.readlink())))
-    }
+    own = set()
+    for file in Path(f"/proc/{pid}/fd").iterdir():
+        # It may have been closed meanwhile.
+        with contextlib.suppress(FileNotFoundError):
+            if match := re.fullmatch(r"socket:\[(\d+)\]", str(file.readlink())):
+                own.add(match[1])
     lines = Path(f"/proc/{pid}/net/udp").read_text("ascii").splitlines()[1:]
     found = set()
     for fields in map(str.split, lines):
