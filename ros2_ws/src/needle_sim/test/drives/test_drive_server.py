@@ -22,6 +22,8 @@ from needle_sim.drives.fault_commands import PlugOrder, obey
 
 from .master import INSERTION, ROTATION, settings
 
+LIMIT = 20.0
+
 
 def troubles(bus: EmulatedBus) -> tuple[bool, bool, bool]:
     drives = bus.drives
@@ -74,6 +76,13 @@ def served(tmp_path: Path) -> Iterator[Served]:
     assert list(tmp_path.iterdir()) == []
 
 
+def patient_node(network: canopen.Network, node_id: int) -> Any:
+    """Add a drive whose answers are waited for, whatever else keeps the machine busy."""
+    node = network.add_node(node_id, None)
+    node.sdo.RESPONSE_TIMEOUT = LIMIT
+    return node
+
+
 def test_stock_slcan_and_canopen_reach_both_drives(served: Served, tmp_path: Path) -> None:
     network = canopen.Network()
     network.connect(
@@ -81,7 +90,7 @@ def test_stock_slcan_and_canopen_reach_both_drives(served: Served, tmp_path: Pat
     )
     try:
         for node_id, name in ((INSERTION, "insertion"), (ROTATION, "rotation")):
-            node = network.add_node(node_id, None)
+            node = patient_node(network, node_id)
             assert node.sdo.upload(0x1008, 0) == f"Emulated {name} drive".encode()
         network.nmt.send_command(1)
         for word in (0x06, 0x07, 0x0F):
@@ -109,7 +118,7 @@ def test_unplugged_adapter_is_an_error_and_comes_back(served: Served, tmp_path: 
     network = canopen.Network()
     network.connect(interface="slcan", channel=str(link), bitrate=500_000, sleep_after_open=0)
     try:
-        node = network.add_node(INSERTION, None)
+        node = patient_node(network, INSERTION)
         assert node.sdo.upload(0x1000, 0) == b"\x92\x01\x04\x00"
     finally:
         network.disconnect()
