@@ -60,8 +60,9 @@ _CAMERAS = "stereo_tracker"
 _TIP_CAMERA = "needle_verification.ros.computers.tip_camera"
 # How long what comes back is watched [s].
 _BACK = 2.0
-# After so long without motion the next one is another [s].
-_REST = 0.1
+# After so long without motion the next one is another [s]: a driver that a busy machine holds up
+# for less goes on to the end of its stop after that.
+_REST = REAL_TIME_WATCHDOG
 
 
 class _DriveWitness(HoldWitness):
