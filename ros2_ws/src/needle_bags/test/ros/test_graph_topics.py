@@ -97,10 +97,11 @@ class Graph:
     def _take(self, message: Received) -> None:
         self.numbers.append(int(message.data))
 
-    def replace(self) -> tuple[PlayedSubscription, PlayedSubscription]:
-        """Return a subscription and the one that replaces it."""
+    def replace(self, *heard: int) -> tuple[PlayedSubscription, PlayedSubscription]:
+        """Return a subscription, which has heard some, and the one that replaces it then."""
         self.node.offer(ReliabilityPolicy.RELIABLE)
         self.topics.poll()
+        self.node.subscriptions[0].hear(*heard)
         self.node.offer(ReliabilityPolicy.BEST_EFFORT)
         self.topics.poll()
         before, following = self.node.subscriptions
@@ -119,6 +120,12 @@ def test_what_waits_for_the_one_before_comes_first_and_once(graph: Graph) -> Non
     following.waiting.append(sent(4))
     following.hear(3)
     assert graph.numbers == [0, 1, 2, 3, 4]
+
+
+def test_what_was_sent_before_and_is_sent_again_is_given_once(graph: Graph) -> None:
+    _, following = graph.replace(0, 1)
+    following.hear(0, 1, 2)
+    assert graph.numbers == [0, 1, 2]
 
 
 def test_what_both_get_is_given_once_whoever_is_first(graph: Graph) -> None:
