@@ -6,6 +6,7 @@ The process ends with the one that started it, however that ends: it waits for t
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import json
 import select
@@ -48,8 +49,10 @@ class ParameterDesk:
             start_new_session=True,
         )
         assert self._process.stdin is not None
-        self._process.stdin.write(json.dumps(values, default=list).encode() + b"\n")
-        self._process.stdin.flush()
+        # A signal to all of a terminal meets it, too, until it has a session of its own.
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(values, default=list).encode() + b"\n")
+            self._process.stdin.flush()
 
     def ready(self, wait: float) -> bool:
         """Return whether it answers from now on, or never will; looks for `wait` at most [s]."""
@@ -59,7 +62,8 @@ class ParameterDesk:
     def close(self) -> None:
         """End it; one that is still being loaded has nothing to take leave of."""
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
         try:
             self._process.wait(_LONGEST_END if self.ready(0.0) else 0.0)
         except subprocess.TimeoutExpired:

@@ -102,6 +102,21 @@ def test_what_is_fixed_cannot_be_set_however_long_the_request_is(bench: Bench) -
     assert rate.double_value == 50.0
 
 
+def test_one_that_a_signal_ended_at_its_start_is_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Ended(subprocess.Popen[bytes]):
+        def __init__(self, _: list[str], **how: Any) -> None:
+            super().__init__(["true"], **how)
+            self.wait(LIMIT)
+
+    monkeypatch.setattr(subprocess, "Popen", Ended)
+    with own_context() as context:
+        node = Node("short", context=context, start_parameter_services=False)
+        desk = ParameterDesk(node, "nowhere:Settings")
+        assert desk.ready(LIMIT)
+        desk.close()
+        node.destroy_node()
+
+
 def test_it_ends_with_whoever_started_it() -> None:
     with own_domain() as domain:
         words = [
