@@ -41,6 +41,8 @@ _DEEP = 0.17  # from here on the next trial has a rig of its own [m]
 _KEY = 48
 _JOY_PERIOD = 0.02
 _NEUTRAL, _AGAIN = 0.2, 2.0
+# Farther than the end of a stop or what the drives settle by takes a needle: it moves [m].
+_UNDER_WAY = 0.2e-3
 
 
 class HeldSource(Protocol):
@@ -159,7 +161,7 @@ def hold_anew(hand: HeldSource, witness: HoldWitness) -> None:
         again = time.monotonic() + _AGAIN
         while time.monotonic() < again:
             witness.look(0.005)
-            if witness.insertion > at:
+            if witness.insertion > at + _UNDER_WAY:
                 return
     raise UserError(f"the held needle does not move{witness.state_now()}")
 
