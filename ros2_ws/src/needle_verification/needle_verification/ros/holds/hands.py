@@ -41,7 +41,7 @@ _DEEP = 0.17  # from here on the next trial has a rig of its own [m]
 _KEY = 48
 _JOY_PERIOD = 0.02
 _NEUTRAL, _AGAIN = 0.2, 2.0
-# Farther than the end of a stop or what the drives settle by takes a needle: it moves [m].
+# A needle that goes farther than a late stop or settling drives would take it moves [m].
 _UNDER_WAY = 0.2e-3
 
 
