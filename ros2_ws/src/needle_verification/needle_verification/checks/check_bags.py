@@ -27,7 +27,6 @@ from needle_verification.checking import (
 )
 from needle_verification.checks import check_rerun
 from needle_verification.descendants import ran
-from needle_verification.trials.damage_trials import damage_trials
 from needle_verification.trials.recording_trials import (
     FullRate,
     Killed,
@@ -38,7 +37,6 @@ from needle_verification.trials.signal_trials import Ended, signal_trials
 
 DURATION = 60.0
 MOMENTS = 50
-DAMAGES = 500
 PROCESSOR_SHARE = 0.35
 MEMORY_GROWTH_MB = 5.0
 LAST_SECONDS = 0.5
@@ -116,23 +114,6 @@ def _killed_finding(key: str, what: str, found: list[Killed]) -> Finding:
         + "; ".join(why[:1]),
         not why and age <= LAST_SECONDS and gaps == 0,
     )
-
-
-def damaged(bench: Workbench, count: int = DAMAGES) -> Iterator[Finding]:
-    """Damage bags at random places, recover them, and compare with what was recorded."""
-    found = list(damage_trials(bench.folder / "damage", count, seed=6))
-    faults = [f"{one.what}: {one.faults[0]}" for one in found if one.faults]
-    yield Finding(
-        "damaged",
-        f"{count} bags with wrong bits, zeros, noise, a cut or a missing file, then recover",
-        "readable messages all there, losses told to the message, no bag read for less in silence, "
-        "no file destroyed",
-        f"{len(faults)} not so, {sum(one.lost for one in found)} messages lost and told, "
-        f"{sum(one.was_read for one in found)} bags read in full as they were "
-        + "; ".join(faults[:1]),
-        not faults,
-    )
-    shutil.rmtree(bench.folder / "damage")
 
 
 def disk_full(bench: Workbench) -> Iterator[Finding]:
@@ -315,7 +296,6 @@ def _witness(domain: int, bag: Path) -> subprocess.Popen[bytes]:
 CHECKS: tuple[Check, ...] = (
     full_rate,
     killed,
-    damaged,
     disk_full,
     bag_format,
     *check_rerun.CHECKS,

@@ -1,1 +1,1 @@
-"""Trials whose processes are started, killed and damaged from outside."""
+"""Trials whose processes are started and killed from outside."""

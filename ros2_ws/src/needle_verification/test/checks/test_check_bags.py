@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 
 from needle_verification.checks.check_bags import bag_findings
-from needle_verification.trials.damage_trials import damage_trials
 from needle_verification.trials.recording_trials import record_and_kill, record_full_rate
 
 
@@ -26,8 +25,3 @@ def test_what_a_killed_recorder_leaves_is_recovered(tmp_path: Path, images: bool
         assert killed.unreadable == ""
         assert killed.gaps == 0
         assert killed.messages > 10
-
-
-def test_damaged_bags_keep_what_can_be_read(tmp_path: Path) -> None:
-    for trial in damage_trials(tmp_path, 40, seed=3):
-        assert trial.faults == [], trial.what
