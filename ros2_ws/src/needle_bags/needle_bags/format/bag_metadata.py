@@ -18,13 +18,11 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from needle_common.files.bag_directory import METADATA_FILE
+from needle_common.files.bag_path import METADATA_FILE
 from needle_common.files.bag_topic import BagTopic
 from needle_common.files.file_access import replace_file
 
 METADATA_VERSION: Final = 9
-# Name of the MCAP metadata records that rosbag2 writes.
-METADATA_RECORD: Final = "rosbag2"
 _NO_LIMIT: Final = QosTime(*divmod(2**63 - 1, 10**9))
 # What a publisher offers of which nothing else is known.
 USUAL_QOS: Final = Qos(

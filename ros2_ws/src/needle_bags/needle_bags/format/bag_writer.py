@@ -12,7 +12,6 @@ from typing import IO, Final
 from mcap.writer import CompressionType, Writer
 
 from needle_bags.format.bag_metadata import (
-    METADATA_RECORD,
     DataFile,
     bag_information,
     channel_metadata,
@@ -21,13 +20,13 @@ from needle_bags.format.bag_metadata import (
 )
 from needle_bags.format.mcap_ending import NO_ROOM, McapEnding
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import METADATA_FILE
+from needle_common.files.bag_path import METADATA_FILE
+from needle_common.files.bag_records import DISTRO_KEY, METADATA_KEY, METADATA_RECORD
 from needle_common.files.bag_topic import BagTopic
 
 LIBRARY: Final = "needle_bags"
 COMPRESSIONS: Final = ("none", "zstd")
 CHUNK_SIZE: Final = 2 * 2**20
-DISTRO_KEY: Final = "ROS_DISTRO"
 _SEQUENCE_MASK: Final = 0xFFFFFFFF
 
 
@@ -152,7 +151,7 @@ class BagWriter:
         """
         information = self._information()
         with self._writing():
-            self._mcap.add_metadata(METADATA_RECORD, {"serialized_metadata": to_yaml(information)})
+            self._mcap.add_metadata(METADATA_RECORD, {METADATA_KEY: to_yaml(information)})
             self._end_file()
             write_metadata(self.directory, information)
 

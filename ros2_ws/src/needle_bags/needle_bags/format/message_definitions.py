@@ -9,7 +9,7 @@ from typing import Any
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import parsed_types
+from needle_common.files.bag_types import parsed_types
 from needle_common.files.installed import find_shared
 
 _SEPARATOR = "=" * 80

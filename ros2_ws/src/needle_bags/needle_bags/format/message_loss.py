@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-
 # A gap counts once so many messages have followed it and nothing has come from within it.
 CERTAIN_AFTER = 5
 
@@ -49,25 +47,3 @@ class SequenceGaps:
 
     def _settle(self) -> None:
         self._missing, self._jump = self.missing, None
-
-
-class DamageGaps:
-    """Messages lost in damaged places, told by the numbers of those around them.
-
-    What was missing where nothing is damaged was not lost there; numbers of several publishers on
-    one topic, or none, tell nothing.
-    """
-
-    def __init__(self) -> None:
-        self._last: dict[int, tuple[int, int]] = {}
-        self.missing: Counter[int] = Counter()
-        self.untold: set[int] = set()
-
-    def take(self, channel: int, number: int, place: int) -> None:
-        """Take the number of a message that lies behind so many damaged places."""
-        before, behind = self._last.get(channel, (0, place))
-        self._last[channel] = (number, place)
-        if number <= before:
-            self.untold.add(channel)
-        elif place > behind:
-            self.missing[channel] += number - before - 1

@@ -1,1 +1,1 @@
-"""Bags made whole of what can be read in them."""
+"""Bags made whole: everything before the first damage."""

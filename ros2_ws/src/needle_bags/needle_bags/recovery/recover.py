@@ -12,24 +12,30 @@ from needle_common.commands.options import CommandParser, output_file
 
 _DESCRIPTION = """
 Makes a bag whole again whose recording was cut off (by a crash, kill -9, a power cut or a full
-disk) or whose files were damaged. What can be read is written into new files, and what could not be
-read is named. What was there stays as FILE.damaged until you delete it, so there must be room for a
-copy. A bag that is whole is left as it is.
+disk) or that is damaged. It keeps everything before the first damage, and says how many seconds of
+the recording follow it, if they are known. A bag of several files ends at the damage, too.
+
+The bag's files are those that metadata.yaml names, or else <stem>_<n>.mcap of one stem if they are
+of one recording. `recover` names other files in the folder and leaves them as they are. The
+previous files stay as FILE.damaged until you delete them, so there must be room for a copy. A bag
+that is whole is left as it is. A single .mcap file is made whole by itself.
 """
 _EXAMPLES = """
 examples:
   ros2 run needle_bags recover bags/my_run
   ros2 run needle_bags recover bags/my_run --json recovery.json
+  ros2 run needle_bags recover downloads/monday.mcap
 
-exit codes: 0 the bag is whole now (also if something was lost: it is named); 2 there is no bag, it
-is still being recorded, or the disk refuses the changes; 130 interrupted (run it again)
+exit codes: 0 the bag is whole now (also if something was lost); 2 there is no bag, it
+is still being recorded, it holds two recordings, nothing comes before the damage, or the disk
+refuses the changes; 130 interrupted (run it again)
 """
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = CommandParser("recover", _DESCRIPTION, _EXAMPLES)
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
     parser.add_argument(
         "--json", type=Path, metavar="FILE", help="also write what was done as flat JSON"
     )
@@ -48,15 +54,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _lines(bag: Path, recovery: BagRecovery) -> list[str]:
-    holds = f"{recovery.messages} messages of {recovery.topics} topics"
+    holds = f"{recovery.messages} messages of {len(recovery.bag.topics)} topics"
+    left_out = [f"  left out: {line}" for line in recovery.left_out]
     if recovery.was_whole:
-        return [f"{bag} is whole: {holds}; nothing to do"]
+        return [f"{bag} is whole: {holds}; nothing to do", *left_out]
     lines = [f"recovered {bag}: {holds}"]
-    lines += [f"  lost: {loss}" for loss in recovery.losses.lines()]
-    if not recovery.losses.lines():
-        lines.append("  lost: nothing that had been written")
+    lines.append(f"  lost: {recovery.lost or 'nothing that had been written'}")
+    lines += left_out
     if recovery.kept:
-        lines.append(f"  what was there is kept as {', '.join(recovery.kept)}: delete it when done")
+        lines.append(f"  previous files, to be deleted when done: {', '.join(recovery.kept)}")
     return lines
 
 
@@ -64,12 +70,10 @@ def _flat(recovery: BagRecovery) -> dict[str, JsonValue]:
     return {
         "was_whole": recovery.was_whole,
         "messages": recovery.messages,
-        "topics": recovery.topics,
-        "files": len(recovery.files),
-        "lost_messages": sum(recovery.losses.messages.values()),
-        "lost_messages_exact": recovery.losses.is_exact,
-        "lost_bytes": recovery.bytes_lost,
-        "lost_files": len(recovery.losses.missing),
+        "topics": len(recovery.bag.topics),
+        "lost": recovery.lost,
+        "lost_s": recovery.seconds_lost,
+        "files_left_out": len(recovery.left_out),
     }
 
 

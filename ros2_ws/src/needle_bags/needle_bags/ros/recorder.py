@@ -28,7 +28,8 @@ from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import recover_hint
+from needle_common.files.bag_path import recover_hint
+from needle_common.files.bag_records import RUN_RECORD
 from needle_common.files.bag_topic import BagTopic
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
@@ -127,7 +128,7 @@ class Recorder(WholeNode):
         }
         for key, text in texts.items():
             self.recording.set_custom_data(key, text)
-        self.recording.add_record("needle_run", texts)
+        self.recording.add_record(RUN_RECORD, texts)
         if calibration:
             self.recording.add_file(
                 "calibration.yaml", "application/yaml", calibration.encode(), time.time_ns()

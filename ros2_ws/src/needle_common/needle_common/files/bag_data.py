@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Final
+from urllib.parse import quote
 
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader
 
 from needle_common.files.file_access import open_regular
-from needle_common.files.mcap_file import CHUNK_LIMIT, TIME_LIMIT
+from needle_common.files.mcap_records import CHUNK_LIMIT, TIME_LIMIT
 
 # A data file that is compressed as a whole may be so large when it is not [B].
 FILE_LIMIT: Final = 2**33
@@ -60,6 +63,17 @@ class SqliteData:
         if connections:
             for connection, log_time, data in self._reader.messages(connections, start, end):
                 yield connection.topic, log_time, log_time, bytes(data)
+
+
+def is_sound_database(file: Path) -> bool:
+    """Return whether SQLite finds a data file's messages, and nothing wrong."""
+    try:
+        address = f"file:{quote(str(file))}?immutable=1"
+        with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
+            database.execute("SELECT id FROM messages LIMIT 1")
+            return bool(database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
 
 
 def is_packed(data: bytes) -> bool:

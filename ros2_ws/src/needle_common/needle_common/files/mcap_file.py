@@ -8,62 +8,34 @@ from __future__ import annotations
 
 import heapq
 import os
-import struct
-import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import NonSeekingReader
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    Footer,
-    McapRecord,
-    Message,
-    Schema,
-    Statistics,
-)
+from mcap.records import Chunk, ChunkIndex, Message, Metadata, Statistics
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
 
+from needle_common.errors import UserError
 from needle_common.files.file_access import open_regular
-
-RECORD_HEADER: Final = struct.Struct("<BQ")
-FOOTER_SIZE: Final = RECORD_HEADER.size + 20
-# What bytes that are not what they should be make a parser raise.
-UNREADABLE: Final = (
-    ValueError,
-    struct.error,
-    McapError,
-    LookupError,
-    OverflowError,
-    RuntimeError,
-    zstandard.ZstdError,
+from needle_common.files.mcap_records import (
+    MESSAGE,
+    RECORD_HEADER,
+    SUMMARY_LIMIT,
+    TIME_LIMIT,
+    UNREADABLE,
+    BrokenMcapError,
+    find_index,
+    parse_record,
+    records_of,
 )
-# Largest chunk, and largest sum of chunks that overlap in time, taken into memory [B].
-CHUNK_LIMIT: Final = 2**29
+
+# Largest sum of chunks that overlap in time, taken into memory [B].
 OVERLAP_LIMIT: Final = 2**30
-SUMMARY_LIMIT: Final = 2**27
-# Times [ns] are signed in ROS 2.
-TIME_LIMIT: Final = 2**63
-_MESSAGE: Final = struct.Struct("<HIQQ")
-_DEFINITIONS: Final[dict[int, type[Channel] | type[Schema]]] = {
-    Opcode.CHANNEL: Channel,
-    Opcode.SCHEMA: Schema,
-}
-
-
-class BrokenMcapError(Exception):
-    """A file is not what its index says, or has none; the message says how."""
 
 
 class _Part(NamedTuple):
@@ -75,114 +47,6 @@ class _Part(NamedTuple):
     length: int
     size: int
     chunk: ChunkIndex | None
-
-
-class Index(NamedTuple):
-    """Index at a file's end: its contents, where it begins, whether a checksum vouches for it."""
-
-    records: Summary
-    start: int
-    is_checked: bool
-
-    def counts(self) -> dict[str, int]:
-        """Return messages by topic."""
-        found: Counter[str] = Counter()
-        if self.records.statistics is not None:
-            for number, count in self.records.statistics.channel_message_counts.items():
-                found[self.records.channels[number].topic] += count
-        return dict(found)
-
-
-def read_index(data: bytes, size: int) -> Index:
-    """Return the index that ends a file.
-
-    Parameters
-    ----------
-    data : bytes
-        The last part of the file, `SUMMARY_LIMIT` bytes if it has them.
-    size : int
-        The file's.
-
-    Raises
-    ------
-    BrokenMcapError
-        If there is none, or it is damaged.
-    """
-    if not data.endswith(MCAP0_MAGIC) or len(data) < FOOTER_SIZE + len(MCAP0_MAGIC):
-        raise BrokenMcapError("it has no end: the recording was cut off")
-    end = len(data) - FOOTER_SIZE - len(MCAP0_MAGIC)
-    if RECORD_HEADER.unpack_from(data, end) != (Opcode.FOOTER, 20):
-        raise BrokenMcapError("its footer is damaged")
-    footer = Footer.read(ReadDataStream(BytesIO(data[end + RECORD_HEADER.size :])))
-    if not footer.summary_start:
-        raise BrokenMcapError("it has no index")
-    begin = footer.summary_start - (size - len(data))
-    if begin < 0 or begin > end:
-        raise BrokenMcapError("its index is not where its footer says, or too large")
-    section = data[begin : len(data) - len(MCAP0_MAGIC) - 4]
-    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
-        raise BrokenMcapError("the checksum of its index is wrong")
-    try:
-        records = NonSeekingReader(BytesIO(MCAP0_MAGIC + data[begin:])).get_summary()
-        index = Index(records or Summary(), footer.summary_start, bool(footer.summary_crc))
-        index.counts()
-    except UNREADABLE as error:
-        raise BrokenMcapError("its index is damaged") from error
-    return index
-
-
-def decompressed(data: bytes, compression: str, size: int) -> bytes:
-    """Return what `size` bytes were compressed into `data`.
-
-    Raises
-    ------
-    ValueError, RuntimeError, zstandard.ZstdError
-        If it is damaged, not of that size, or above `CHUNK_LIMIT`.
-    """
-    if size > CHUNK_LIMIT:
-        raise ValueError(f"a chunk holds {size} bytes, {CHUNK_LIMIT} at most are read")
-    if compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
-            plain = stream.read(size + 1)
-    elif compression == "lz4":
-        plain = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
-    elif not compression:
-        plain = data
-    else:
-        raise ValueError(f"a chunk is compressed as {compression[:20]!r}")
-    if len(plain) != size:
-        raise ValueError("a chunk is not of the size that it says")
-    return plain
-
-
-def records_of(chunk: Chunk) -> list[McapRecord]:
-    """Return the records in a chunk, checked against its checksum if it has one.
-
-    Raises
-    ------
-    UNREADABLE
-        If it is damaged.
-    """
-    plain = decompressed(chunk.data, chunk.compression, chunk.uncompressed_size)
-    if chunk.uncompressed_crc not in (0, zlib.crc32(plain)):
-        raise ValueError("its checksum is wrong")
-    records: list[McapRecord] = []
-    view, position = memoryview(plain), 0
-    while position < len(plain):
-        opcode, length = RECORD_HEADER.unpack_from(plain, position)
-        position += RECORD_HEADER.size
-        body = view[position : position + length]
-        position += length
-        if len(body) < length:
-            raise ValueError("its last record is cut off")
-        # mcap's own parser takes eight calls for a message, and messages are nearly all there is.
-        if opcode == Opcode.MESSAGE:
-            channel, sequence, log_time, publish_time = _MESSAGE.unpack_from(body)
-            data = bytes(body[_MESSAGE.size :])
-            records.append(Message(channel, log_time, data, publish_time, sequence))
-        elif opcode in _DEFINITIONS:
-            records.append(_DEFINITIONS[opcode].read(ReadDataStream(BytesIO(body))))
-    return records
 
 
 class McapFile:
@@ -197,6 +61,8 @@ class McapFile:
     ------
     BrokenMcapError
         If it is not whole.
+    UserError
+        If it is compressed in a way that is not read here.
     OSError
         If it cannot be read.
 
@@ -209,11 +75,11 @@ class McapFile:
     """
 
     def __init__(self, path: Path) -> None:
+        self._path = path
         self._stream = open_regular(path)
         try:
             self._size = os.fstat(self._stream.fileno()).st_size
-            self._index = self._open()
-            self.summary = self._index.records
+            self.summary, self._end = self._open()
             self._parts = [
                 _Part(
                     c.message_start_time,
@@ -239,14 +105,54 @@ class McapFile:
         told = self.statistics
         return (told.message_start_time, told.message_end_time) if told.message_count else None
 
-    def counts(self) -> dict[str, int]:
+    def counts(self) -> Counter[str]:
         """Return messages by topic."""
-        return self._index.counts()
+        found: Counter[str] = Counter()
+        for number, count in self.statistics.channel_message_counts.items():
+            found[self.summary.channels[number].topic] += count
+        return found
 
     def definitions(self) -> dict[str, tuple[str, str]]:
         """Return encoding and text of each type's definition."""
         schemas = self.summary.schemas.values()
         return {schema.name: (schema.encoding, schema.data.decode()) for schema in schemas}
+
+    def topics(self) -> list[dict[str, Any]]:
+        """Return what metadata.yaml has of each topic below `topics_with_message_count`."""
+        counts, schemas = self.statistics.channel_message_counts, self.summary.schemas
+        return [
+            {
+                "topic_metadata": {
+                    "name": channel.topic,
+                    "type": schemas[channel.schema_id].name if channel.schema_id else "",
+                    "serialization_format": channel.message_encoding,
+                    "offered_qos_profiles": channel.metadata.get("offered_qos_profiles"),
+                    "type_description_hash": channel.metadata.get("topic_type_hash"),
+                },
+                "message_count": counts.get(channel.id, 0),
+            }
+            for channel in self.summary.channels.values()
+        ]
+
+    def metadata(self) -> list[Metadata]:
+        """Return the metadata records.
+
+        Raises
+        ------
+        BrokenMcapError
+            If one is damaged, or they take more than `SUMMARY_LIMIT`.
+        """
+        indexes = self.summary.metadata_indexes
+        if sum(index.length for index in indexes) > SUMMARY_LIMIT:
+            raise BrokenMcapError("its metadata records are too large")
+        found = []
+        for index in indexes:
+            record = memoryview(self._read(index.offset, index.length))
+            try:
+                found.append(parse_record(Opcode.METADATA, record[RECORD_HEADER.size :]))
+            except UNREADABLE as error:
+                raise BrokenMcapError("a metadata record is damaged") from error
+        return found
 
     def read(
         self, topics: Collection[str], start: int = 0, stop: int = TIME_LIMIT
@@ -291,19 +197,23 @@ class McapFile:
         if is_complete:
             self._compare(seen)
 
-    def _open(self) -> Index:
+    def _open(self) -> tuple[Summary, int]:
         if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise BrokenMcapError("it does not begin as an MCAP file")
-        begin = max(0, self._size - SUMMARY_LIMIT)
-        self._stream.seek(max(begin, self._size - 2**16))
-        try:
-            index = read_index(self._stream.read(), self._size)
-        except BrokenMcapError:  # or longer than that
-            index = read_index(self._read(begin, self._size - begin), self._size)
-        summary, told = index.records, index.records.statistics
+        summary, end = find_index(self._stream)
+        told = summary.statistics
+        for chunk in summary.chunk_indexes:
+            if chunk.compression not in ("", "zstd", "lz4"):
+                raise UserError(
+                    f"{self._path}: its compression {chunk.compression[:20]!r} is not read here"
+                )
         if told is None:
             raise BrokenMcapError("its index does not say how many messages there are")
-        if told.message_count != sum(told.channel_message_counts.values()):
+        counts = told.channel_message_counts
+        if (
+            told.message_count != sum(counts.values())
+            or not counts.keys() <= summary.channels.keys()
+        ):
             raise BrokenMcapError("its index contradicts itself")
         if told.message_count and told.message_end_time >= TIME_LIMIT:
             raise BrokenMcapError("its times lie beyond the year 2262")
@@ -311,7 +221,7 @@ class McapFile:
             if channel.schema_id and channel.schema_id not in summary.schemas:
                 raise BrokenMcapError(f"it does not define the type of {channel.topic}")
         self.statistics: Statistics = told
-        return index
+        return summary, end
 
     def _read(self, offset: int, size: int) -> bytes:
         self._stream.seek(offset)
@@ -361,8 +271,8 @@ class McapFile:
         found: list[_Part] = []
         seen: Counter[int] = Counter()
         position = len(MCAP0_MAGIC)
-        while position < self._index.start:
-            head = self._read(position, RECORD_HEADER.size + _MESSAGE.size)
+        while position < self._end:
+            head = self._read(position, RECORD_HEADER.size + MESSAGE.size)
             if len(head) < RECORD_HEADER.size:
                 break
             opcode, length = RECORD_HEADER.unpack_from(head)
@@ -370,14 +280,14 @@ class McapFile:
             if opcode == Opcode.MESSAGE:
                 if length < len(head):
                     raise BrokenMcapError("a message's length is wrong")
-                channel, _, log_time, publish_time = _MESSAGE.unpack_from(head, RECORD_HEADER.size)
+                channel, _, log_time, publish_time = MESSAGE.unpack_from(head, RECORD_HEADER.size)
                 self._check(log_time, publish_time)
                 found.append(_Part(log_time, position, log_time, length, length, None))
                 seen[channel] += 1
             elif opcode == Opcode.CHUNK:
                 raise BrokenMcapError("its index does not know its chunks")
             position += length
-        if position != self._index.start:
+        if position != self._end:
             raise BrokenMcapError("a record's length is wrong")
         self._compare(seen)
         return found

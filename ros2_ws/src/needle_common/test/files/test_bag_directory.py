@@ -22,7 +22,9 @@ from rosbags.rosbag2 import Writer as BagWriter
 from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory, parsed_types, require_bag
+from needle_common.files.bag_directory import BagDirectory
+from needle_common.files.bag_path import require_bag
+from needle_common.files.bag_types import parsed_types
 
 COUNT = 60
 TOPICS = ("/a", "/b")
@@ -295,14 +297,13 @@ def test_a_message_of_another_type_is_one_line(tmp_path: Path) -> None:
     assert "a message of /a does not fit its definition" in reason(tmp_path / "bag")
 
 
-@pytest.mark.parametrize("name", ["bag_0.mcap", "metadata.yaml"])
-def test_a_file_of_a_bag_names_the_bag(tmp_path: Path, name: str) -> None:
+def test_metadata_alone_name_the_bag(tmp_path: Path) -> None:
     write(tmp_path / "bag")
-    with pytest.raises(UserError, match=f"name the bag's directory, {tmp_path}/bag$"):
-        require_bag(tmp_path / "bag" / name)
+    with pytest.raises(UserError, match=f"or the bag's directory, {tmp_path}/bag$"):
+        require_bag(tmp_path / "bag" / "metadata.yaml")
 
 
 def test_another_file_is_no_bag_and_names_none(tmp_path: Path) -> None:
     (tmp_path / "README.md").write_text("")
-    with pytest.raises(UserError, match=r"README\.md is a file: name the bag's directory$"):
+    with pytest.raises(UserError, match=r"README\.md is a file: name an \.mcap file or the bag's"):
         require_bag(tmp_path / "README.md")

@@ -1,0 +1,144 @@
+"""Bags of numbered messages, one every 10 ms; mcap's and rosbags' readers say what is in them."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import numpy as np
+import yaml
+from mcap.reader import make_reader
+from mcap.records import Message
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
+from rosbags.interfaces import QosDurability
+from rosbags.rosbag2 import Reader
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.format.bag_copy import standard_topic
+from needle_bags.format.bag_metadata import (
+    USUAL_QOS,
+    DataFile,
+    bag_information,
+    channel_metadata,
+    write_metadata,
+)
+from needle_bags.format.bag_writer import BagWriter
+from needle_common.files.bag_topic import BagTopic
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+TYPE = "std_msgs/msg/UInt8MultiArray"
+LATCHED = USUAL_QOS._replace(durability=QosDurability.TRANSIENT_LOCAL)
+TOPICS = [
+    BagTopic(name, TYPE, told.definition, told.type_hash, (LATCHED,))
+    for name in ("/one", "/two", "/three")
+    for told in [standard_topic(name, TYPE)]
+]
+START, STEP = 1_700_000_000 * 10**9, 10_000_000
+RUN = {"commit": "0123abc", "run_info": "seed: 3"}
+
+
+@functools.cache
+def payload(number: int) -> bytes:
+    """A message that tells its number and ends in no zero, as a power cut's zeros do."""
+    content = np.frombuffer(np.random.default_rng(number).bytes(100) + b"\x01", np.uint8)
+    layout = STORE.types["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=number)
+    return bytes(STORE.serialize_cdr(STORE.types[TYPE](layout=layout, data=content), TYPE))
+
+
+def number_of(data: bytes) -> int:
+    return int(STORE.deserialize_cdr(data, TYPE).layout.data_offset)  # type: ignore[attr-defined]
+
+
+def write(
+    path: Path,
+    count: int = 300,
+    *,
+    first: int = 0,
+    run: dict[str, str] | None = None,
+    **how: int | str,
+) -> Path:
+    """Our recorder's bag, of chunks of some 30 messages, with what it leaves in the data."""
+    bag = BagWriter(path, **{"chunk_size": 4096, **how})  # type: ignore[arg-type]
+    topics = [bag.add_topic(topic) for topic in TOPICS]
+    run = RUN if run is None else run
+    if run:
+        bag.add_metadata("needle_run", run)
+    for key, text in run.items():
+        bag.set_custom_data(key, text)
+    for node, gain in (("/one", 1.5), ("/two", 2.5)):
+        text = f"{{{node}: {{ros__parameters: {{gain: {gain}}}}}}}"
+        bag.add_metadata("parameters", {"node": node, "yaml": text})
+    bag.add_metadata("parameter_change", {"stamp_ns": "5", "node": "/one", "value": "2.0"})
+    bag.add_attachment("calibration.yaml", "application/yaml", b"left: {}\n", 1)
+    for number in range(first, first + count):
+        time = START + number * STEP
+        bag.write(topics[number % 3], payload(number), time, time - 1000, number // 3 + 1)
+    bag.close()
+    return path
+
+
+def write_unchunked(path: Path, count: int = 300) -> Path:
+    """A bag as rosbag2's recorder writes it with config/rosbag2_mcap.yaml."""
+    path.mkdir()
+    content = DataFile(f"{path.name}_0.mcap")
+    with (path / content.name).open("wb") as stream:
+        mcap = Writer(stream, use_chunking=False)
+        mcap.start("ros2")
+        schema = mcap.register_schema(TYPE, "ros2msg", TOPICS[0].definition.encode())
+        channels = [
+            mcap.register_channel(t.name, "cdr", schema, channel_metadata(t)) for t in TOPICS
+        ]
+        for number in range(count):
+            time = START + number * STEP
+            mcap.add_message(channels[number % 3], time, payload(number), time)
+            content.add(TOPICS[number % 3].name, time)
+        mcap.finish()  # type: ignore[no-untyped-call]
+    write_metadata(path, bag_information([content], TOPICS, {}, "jazzy"))
+    return path
+
+
+def kill(path: Path, share: float = 0.75) -> Path:
+    """Leave what a killed recorder leaves: no metadata.yaml, no index, half a chunk."""
+    (path / "metadata.yaml").unlink()
+    file = max(path.glob("*.mcap"))
+    data = file.read_bytes()
+    file.write_bytes(data[: int(len(data) * share)])
+    return path
+
+
+def damage(file: Path, share: float = 0.5) -> int:
+    """Change a byte of a message in a file; return the message's number."""
+    data = bytearray(file.read_bytes())
+    found = {data.find(payload(number)): number for number in range(2000)}
+    place = min(at for at in found if at > len(data) * share)
+    data[place + 50] ^= 1
+    file.write_bytes(data)
+    return found[place]
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in path.iterdir() if file.is_file()}
+
+
+def numbers(path: Path) -> list[int]:
+    """The numbers of a whole bag's messages, as all readers see them."""
+    with Reader(path) as reader:
+        found = [bytes(data) for _, _, data in reader.messages()]
+        assert reader.message_count == len(found)
+    files = [path]
+    if path.is_dir():
+        told = yaml.safe_load((path / "metadata.yaml").read_text())
+        names = told["rosbag2_bagfile_information"]["relative_file_paths"]
+        files = [path / name for name in names]
+    indexed: list[bytes] = []
+    streamed: list[bytes] = []
+    for file in files:
+        with file.open("rb") as stream:
+            reader_of_index = make_reader(stream, validate_crcs=True)
+            indexed += [m.data for _, _, m in reader_of_index.iter_messages()]
+            stream.seek(0)
+            records = StreamReader(stream, validate_crcs=True).records
+            streamed += [record.data for record in records if isinstance(record, Message)]
+    assert found == indexed == streamed
+    return [number_of(data) for data in found]

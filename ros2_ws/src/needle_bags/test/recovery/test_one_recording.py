@@ -1,0 +1,195 @@
+"""Folders with files of several recordings: which of them are a bag's."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from needle_analysis.report import report
+from needle_bags.reading.bag_files import read_contents
+from needle_bags.recovery import recover
+from needle_bags.recovery.bag_recovery import recover_bag
+from needle_common.errors import UserError
+from needle_common.files.bag_path import recording_files
+
+from .numbered_bag import RUN, contents, damage, kill, numbers, write
+
+MakeRun = Callable[..., Path]
+REGRESSION = Path(__file__).resolve().parents[5] / "bags/regression/regression_0.mcap"
+
+
+def put(folder: Path, *bags: tuple[Path, str]) -> Path:
+    """Copy the first file of bags into a folder, under other names."""
+    folder.mkdir(exist_ok=True)
+    for bag, name in bags:
+        shutil.copyfile(min(bag.glob("*.mcap")), folder / name)
+    return folder
+
+
+def test_two_recordings_in_one_folder_are_not_merged(
+    tmp_path: Path, make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = put(tmp_path / "dl", (make_run(), "monday.mcap"), (REGRESSION.parent, "tuesday.mcap"))
+    before = contents(folder)
+    for act in (report, recover):
+        assert act.main([str(folder)]) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1
+        assert "two recordings in one folder (monday.mcap, tuesday.mcap)" in said
+        assert "give each a folder of its own, or name one of the files" in said
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize("harm", ["nothing", "metadata", "data"])
+def test_a_stranger_beside_a_bag_is_named_and_left(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], harm: str
+) -> None:
+    """Without metadata.yaml, the bag is the files that are called as its folder."""
+    path = write(tmp_path / "bag", max_file_size=20_000)
+    put(path, (REGRESSION.parent, "a_stranger.mcap"))
+    stranger = (path / "a_stranger.mcap").read_bytes()
+    if harm == "metadata":
+        (path / "metadata.yaml").unlink()
+    elif harm == "data":
+        damage(path / "bag_1.mcap", share=0.4)
+    assert recover.main([str(path)]) == 0
+    said = capsys.readouterr().out
+    assert "left out: a_stranger.mcap: not of this bag (it begins " in said
+    assert "days after the bag, another commit, another run_info)" in said
+    assert (path / "a_stranger.mcap").read_bytes() == stranger
+    kept = numbers(path)
+    assert kept == list(range(len(kept)))
+    assert len(kept) == 300 or (harm == "data" and len(kept) > 200)
+    assert recover_bag(path).was_whole
+
+
+def test_a_stranger_that_is_not_whole_is_named_too(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag")
+    (path / "notes.mcap").write_bytes(b"no MCAP file")
+    (path / "._bag_0.mcap").write_bytes(b"another system's notes of bag_0.mcap")
+    recovery = recover_bag(path)
+    assert recovery.was_whole
+    assert recovery.left_out == ["notes.mcap: not of this bag (not whole)"]
+
+
+def test_a_killed_file_among_others_is_made_whole_alone(tmp_path: Path) -> None:
+    killed = kill(write(tmp_path / "killed"))
+    folder = put(tmp_path / "dl", (killed, "a.mcap"), (REGRESSION.parent, "b.mcap"))
+    before = contents(folder)
+    with pytest.raises(UserError, match=r"recover .*/dl/a\.mcap`$"):
+        read_contents(folder / "a.mcap")
+    recovery = recover_bag(folder / "a.mcap")
+    assert numbers(folder / "a.mcap") == list(range(recovery.messages))
+    told = read_contents(folder / "a.mcap").custom_data
+    assert told["recovered"] == recovery.lost
+    assert told["commit"] == RUN["commit"]
+    after = contents(folder)
+    assert after.pop("a.mcap.damaged") == before.pop("a.mcap")
+    assert after.pop("a.mcap")
+    assert after == before
+    assert recover_bag(folder / "a.mcap").was_whole
+
+
+def test_a_killed_file_beside_a_bag_is_made_whole_alone(tmp_path: Path) -> None:
+    """What metadata.yaml tells is of other files."""
+    folder, killed = write(tmp_path / "bag", 900), kill(write(tmp_path / "killed"))
+    put(folder, (killed, "killed.mcap"))
+    before = contents(folder)
+    recovery = recover_bag(folder / "killed.mcap")
+    assert numbers(folder / "killed.mcap") == list(range(recovery.messages))
+    assert recovery.lost.endswith("(the file ends within a record) on: at least 0.3 s follow")
+    after = contents(folder)
+    assert {after.pop("killed.mcap.damaged")} == {before.pop("killed.mcap")}
+    assert after.pop("killed.mcap")
+    assert after == before
+
+
+def test_a_file_of_a_bag_is_recovered_with_its_bag(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag", max_file_size=20_000)
+    damage(path / "bag_1.mcap")
+    recover_bag(path / "bag_1.mcap")
+    assert recover_bag(path).was_whole
+    assert 0 < len(numbers(path)) < 300
+
+
+OTHER = {"commit": "7654def", "run_info": "seed: 4"}
+
+
+@pytest.mark.parametrize(
+    ("first", "run", "words"),
+    [
+        (400, RUN, "x_1.mcap is the beginning of a recording"),
+        (0, {}, "x_1.mcap begins 3.0 s before x_0.mcap ends"),
+        (100, {}, "x_1.mcap begins 2.0 s before x_0.mcap ends"),
+        (30_000_000, {}, "x_1.mcap begins 3.5 days after x_0.mcap ends"),
+        (10_000, {}, "x_1.mcap begins 97.0 s after x_0.mcap ends"),
+    ],
+)
+@pytest.mark.parametrize("is_killed", [False, True])
+def test_one_stem_of_two_recordings_is_not_merged(
+    tmp_path: Path, first: int, run: dict[str, str], words: str, is_killed: bool
+) -> None:
+    one, two = write(tmp_path / "one"), write(tmp_path / "two", first=first, run=run)
+    if is_killed:
+        kill(two)
+    folder = put(tmp_path / "dl", (one, "x_0.mcap"), (two, "x_1.mcap"))
+    before = contents(folder)
+    with pytest.raises(UserError, match=f"two recordings in one folder: {words}"):
+        recover_bag(folder)
+    assert contents(folder) == before
+
+
+def test_another_run_is_told_by_what_ends_its_file(tmp_path: Path) -> None:
+    """The last file of a recording has no record of its own of the run, but all of the bag's."""
+    one, two = (
+        write(tmp_path / "one"),
+        write(tmp_path / "two", first=300, run=OTHER, max_file_size=30_000),
+    )
+    folder = put(tmp_path / "dl", (one, "x_0.mcap"))
+    shutil.copyfile(max(two.glob("*.mcap")), folder / "x_1.mcap")
+    with pytest.raises(UserError, match=r"x_1\.mcap has another commit, another run_info"):
+        recover_bag(folder)
+
+
+def test_a_damaged_file_is_not_followed_by_another_recording(tmp_path: Path) -> None:
+    one, two = write(tmp_path / "one"), write(tmp_path / "two", first=400)
+    folder = put(tmp_path / "dl", (one, "x_0.mcap"), (two, "x_2.mcap"))
+    damage(folder / "x_0.mcap")
+    with pytest.raises(UserError, match=r"x_2\.mcap is the beginning of a recording"):
+        recover_bag(folder)
+
+
+def test_metadata_that_name_none_of_the_files(tmp_path: Path) -> None:
+    path = write(tmp_path / "bag")
+    (path / "bag_0.mcap").rename(path / "monday.mcap")
+    before = contents(path)
+    with pytest.raises(UserError, match=r"nothing comes before bag_0\.mcap \(it is missing\)"):
+        recover_bag(path)
+    assert contents(path) == before
+
+
+@pytest.mark.parametrize(
+    ("names", "found"),
+    [
+        (
+            ["bag_0.mcap", "bag_10.mcap", "bag_2.mcap"],
+            ["bag_0.mcap", "bag_1.mcap", "bag_2.mcap", "bag_3.mcap", "bag_10.mcap"],
+        ),
+        (["x.mcap", "bag_3.mcap"], ["bag_3.mcap"]),
+        (["x_1.mcap.zstd", "x_1.mcap", "x_2.mcap.zstd"], ["x_1.mcap", "x_2.mcap.zstd"]),
+        (
+            ["x_0.mcap.damaged", "._x_0.mcap", "x_0.db3", "2026-03-01_10-20-30_x.mcap"],
+            ["2026-03-01_10-20-30_x.mcap"],
+        ),
+        ([], []),
+    ],
+)
+def test_files_of_a_recording(tmp_path: Path, names: list[str], found: list[str]) -> None:
+    folder = tmp_path / "bag"
+    folder.mkdir()
+    for name in names:
+        (folder / name).write_bytes(b"")
+    assert [file.name for file in recording_files(folder)] == found
