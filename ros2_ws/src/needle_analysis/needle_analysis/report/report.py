@@ -40,12 +40,16 @@ Writes into the bag's directory (or --output): report.html, one file of 6 MB at 
 the insertion and all figures, which opens in any browser without a network, and prints; and the
 figures as PNG files. With two bags: one page that compares them, compared_with_<A>.html, into the
 second bag's directory (or --output).
+
+A single .mcap file is read alone, whatever else is in its folder; its report goes into the folder
+<file>_report beside it.
 """
 _EXAMPLES = """
 examples:
   ros2 run needle_analysis report bags/2026-03-01_10-20-30_camera_paper
   ros2 run needle_analysis report BAG --json figures.json --output /tmp/report
   ros2 run needle_analysis report bags/paper_run bags/best_run
+  ros2 run needle_analysis report downloads/monday.mcap
 
 exit codes: 0 done; 2 a bag is missing, broken, unfinished, or not of a needle run
 """
@@ -61,7 +65,7 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     summary : dict
         Its figures (`run_summary.summarize`).
     directory : Path, optional
-        Where to; the bag's directory by default.
+        Where to; the bag's directory by default, or `<file>_report` beside a single file.
 
     Returns
     -------
@@ -81,7 +85,7 @@ def write_report(run: Run, summary: dict[str, JsonValue], directory: Path | None
     files = {f"{name}.png": png for name, png in data.items()}
     film = (frames, [*cameras, *plan_views(run, frames)])
     files[PAGE] = build_page(run, summary, data, timings, film).encode()
-    return _write(run.path if directory is None else directory, files)
+    return _write(directory or _folder(run), files)
 
 
 def write_pair_report(
@@ -111,7 +115,13 @@ def write_pair_report(
     data = {name: _png(figure) for name, figure in pair_figures(*runs).items()}
     name = f"compared_with_{runs[0].path.absolute().name}.html"
     page = build_pair_page(runs, summaries, data).encode()
-    return _write(runs[1].path if directory is None else directory, {name: page})
+    return _write(directory or _folder(runs[1]), {name: page})
+
+
+def _folder(run: Run) -> Path:
+    """Return where a run's report goes: its bag's directory, or a folder beside its file."""
+    stem = run.path.name.removesuffix(".zstd").removesuffix(".mcap")
+    return run.path.with_name(f"{stem}_report") if run.path.is_file() else run.path
 
 
 def _write(directory: Path, files: Mapping[str, bytes]) -> Path:
@@ -157,7 +167,7 @@ def figures_of(run: Run, timings: Sequence[StageTiming]) -> dict[str, Figure | N
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     parser = CommandParser("report", _DESCRIPTION, _EXAMPLES)
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
     parser.add_argument(
         "other", type=Path, nargs="?", metavar="OTHER_BAG", help="compare BAG with this one"
     )
@@ -167,9 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--namespace", metavar="NS", help="of the rig to show, where a bag holds several"
     )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="write here and not into the bag's directory"
-    )
+    parser.add_argument("--output", type=Path, metavar="DIR", help="write here instead")
     return run_command(lambda: _report(parser.parse_args(arguments)))
 
 

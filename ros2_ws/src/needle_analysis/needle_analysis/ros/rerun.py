@@ -156,7 +156,7 @@ def _run(words: Sequence[str]) -> int:
 def _parser() -> CommandParser:
     parser = CommandParser("rerun", DESCRIPTION, EPILOG)
     add = parser.add_argument
-    add("bag", type=Path, metavar="BAG", help="the bag's directory")
+    add("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
     add("--preset", metavar="|".join(PRESETS), help="another controller than the recorded one")
     for kind in GROUPS:
         add(

@@ -52,7 +52,7 @@ class PlayerOptions:
     Attributes
     ----------
     bag : Path
-        The bag's directory.
+        The bag's directory, or a file.
     rate : float
         How many times faster than recorded.
     start, end : float
@@ -100,7 +100,7 @@ def parse_options(arguments: Sequence[str]) -> PlayerOptions:
     def add_regex(name: str, text: str) -> None:
         parser.add_argument(name, default="", metavar="REGEX", help=text)
 
-    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory")
+    parser.add_argument("bag", type=Path, metavar="BAG", help="the bag's directory, or a file")
     parser.add_argument("--rate", type=float, default=1.0, metavar="R", help="times as fast")
     parser.add_argument("--start", type=float, default=0.0, metavar="S", help="begin here [s]")
     parser.add_argument("--end", type=float, default=math.inf, metavar="S", help="end here [s]")

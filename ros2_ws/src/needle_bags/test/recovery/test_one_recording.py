@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from needle_analysis.report import report
+from needle_analysis.ros import rerun
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.recovery import recover
 from needle_bags.recovery.bag_recovery import recover_bag
@@ -41,6 +42,23 @@ def test_two_recordings_in_one_folder_are_not_merged(
         assert "two recordings in one folder (monday.mcap, tuesday.mcap)" in said
         assert "give each a folder of its own, or name one of the files" in said
     assert contents(folder) == before
+
+
+def test_one_file_is_read_alone(
+    tmp_path: Path, make_run: MakeRun, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = put(tmp_path / "dl", (make_run(), "mon.day.mcap"), (REGRESSION.parent, "tuesday.mcap"))
+    before = contents(folder)
+    assert report.main([str(folder / "mon.day.mcap")]) == 0
+    assert (folder / "mon.day_report" / "report.html").is_file()
+    assert rerun.main([str(folder / "tuesday.mcap")]) == 0
+    assert "UNCHANGED" in capsys.readouterr().out
+    assert contents(folder) == before
+    alone, bag = read_contents(folder / "tuesday.mcap"), read_contents(REGRESSION.parent)
+    assert alone.topics == bag.topics
+    assert alone.counts == +bag.counts
+    assert alone.custom_data == bag.custom_data
+    assert (alone.start, alone.end, alone.distribution) == (bag.start, bag.end, bag.distribution)
 
 
 @pytest.mark.parametrize("harm", ["nothing", "metadata", "data"])
