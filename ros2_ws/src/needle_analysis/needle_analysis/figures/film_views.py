@@ -10,7 +10,6 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 import numpy.typing as npt
-import yaml
 from matplotlib.figure import Figure
 
 from needle_analysis.figures.figure_style import (
@@ -28,6 +27,7 @@ from needle_analysis.run.run_summary import GOAL, finite_tips, target_offset
 from needle_bags.reading.bag_images import SIDES, images_at
 from needle_bags.reading.bag_reader import Run
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import load_plain
 from needle_tracker.optics.calibration import parse_calibration
 
 Floats = npt.NDArray[np.float64]
@@ -76,8 +76,8 @@ def projections(run: Run) -> dict[str, Projection]:
     from needle_tracker.optics.refraction import stereo_views  # noqa: PLC0415
 
     try:
-        calibration = parse_calibration(yaml.safe_load(run.calibration))
-    except (UserError, yaml.YAMLError):
+        calibration = parse_calibration(load_plain(run.calibration, aliases=True))
+    except (UserError, ValueError):
         return {}
     views = stereo_views(calibration)
     return {side: view.project for side, view in zip(SIDES, views, strict=True)}

@@ -12,9 +12,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import read_yaml
 from needle_controller.model.target_plane import RIG
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 
@@ -35,10 +34,7 @@ def read_obstacles(path: Path) -> Obstacles:
         A file that cannot be read, is no such YAML, is in another frame than `rig`, or holds an
         obstacle that is incomplete, not finite or out of bounds.
     """
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: cannot be read: {error}".replace("\n", " ")) from error
+    document = read_yaml(path)
     if not isinstance(document, dict):
         raise UserError(f"{path}: wants frame, spheres and capsules")
     unknown = sorted(str(key) for key in document if key not in {"frame", *_KINDS})

@@ -83,7 +83,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
         ("0.002, 0.05", ".nan, 0.05", "y of obstacle 1 = nan"),
         ("[0.0, 0.002, 0.05]", "[0.0, 0.05]", "center = .* wants three numbers"),
         ("radius: 0.003", "radius: '3 mm'", "capsules, number 1: radius = '3 mm'"),
-        ("frame: rig", "frame: [", "cannot be read"),
+        ("frame: rig", "frame: [", "not YAML in line 4"),
         ("spheres:", "spheres: 3\nboxes:", "boxes is not one of"),
     ],
 )

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import yaml
 
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import read_yaml
 from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
@@ -103,13 +103,7 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
         If it cannot be read or says something that cannot be, naming file, key and value.
     """
     path = Path(path)
-    try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise UserError(f"cannot read calibration {path}: {error.strerror}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"calibration {path} is no YAML: {reason}") from error
+    document = read_yaml(path)
     try:
         return _stereo_rig(_Entries(document))
     except UserError as error:

@@ -172,7 +172,7 @@ def test_truth_s_angles_give_the_directions_back() -> None:
         (["--depth-mm", "nan"], "--depth-mm = nan mm is not finite"),
         (["--step-mm", "0"], "--step-mm = 0 mm is outside"),
         (["--noise", "60"], "--noise = 60 grey levels is outside [0, 50]"),
-        (["--calibration", "/nowhere.yaml"], "cannot read calibration /nowhere.yaml"),
+        (["--calibration", "/nowhere.yaml"], "/nowhere.yaml: cannot be read: No such file"),
         (["--start-mm", "130"], "--start-mm = 130 mm is outside [0, 120]"),
         (["--renderer", "slow"], "--renderer 'slow' is not one of quick, path_traced"),
         (["--appearance", "random"], "--appearance is for renderer path_traced"),

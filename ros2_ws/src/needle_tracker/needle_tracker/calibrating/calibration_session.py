@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import read_yaml
 from needle_common.settings.bounds import check_bounds
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.optics.calibration import SIDES, parse_windows, yaml_problem
+from needle_tracker.optics.calibration import SIDES, parse_windows
 from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
@@ -103,13 +103,7 @@ def load_session(path: Path) -> Session:
     UserError
         Unreadable, not YAML, an unknown key, or a value missing or out of bounds.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UserError(f"cannot read session {path}: {reason}") from error
-    except yaml.YAMLError as error:
-        raise UserError(f"session {path} is not YAML: {yaml_problem(error)}") from error
+    content = read_yaml(path)
     try:
         return parse_session(content)
     except UserError as error:
@@ -117,7 +111,7 @@ def load_session(path: Path) -> Session:
 
 
 def parse_session(content: Any) -> Session:
-    """Check the content of a session file, as `yaml.safe_load` returns it.
+    """Check the content of a session file.
 
     Parameters
     ----------

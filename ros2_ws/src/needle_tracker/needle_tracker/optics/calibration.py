@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import load_plain
 from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
 
@@ -103,17 +103,13 @@ def read_calibration(path: Path) -> str:
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return what the text of a calibration file says; raises as `load_calibration`."""
     try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise UserError(f"calibration {path} is not YAML: {yaml_problem(error)}") from error
-    try:
-        return parse_calibration(content)
-    except UserError as error:
+        return parse_calibration(load_plain(text, aliases=True))
+    except (UserError, ValueError) as error:
         raise UserError(f"calibration {path}: {error}") from error
 
 
 def parse_calibration(content: Any) -> StereoCalibration:
-    """Check the content of a calibration file, as `yaml.safe_load` returns it.
+    """Check the content of a calibration file.
 
     Parameters
     ----------
@@ -177,13 +173,6 @@ def parse_windows(content: Any) -> tuple[Window, Window]:
     index = _index(content, "phantom", "refractive_index")
     surface = surface_from_above(height, index)
     return surface, surface
-
-
-def yaml_problem(error: yaml.YAMLError) -> str:
-    """Return in one line what a file is no YAML for, and where."""
-    mark = getattr(error, "problem_mark", None)
-    problem = getattr(error, "problem", None) or str(error).splitlines()[0]
-    return problem if mark is None else f"line {mark.line + 1}: {problem}"
 
 
 def _window(content: Any, side: str) -> Window:

@@ -65,7 +65,7 @@ def test_a_wrong_place_is_named(place: dict[str, Any], says: str) -> None:
 
 def test_a_file_that_is_no_session(tmp_path: Any) -> None:
     path = tmp_path / "session.yaml"
-    with pytest.raises(UserError, match="cannot read session"):
+    with pytest.raises(UserError, match="cannot be read: No such file"):
         load_session(path)
     path.write_bytes(b"\xff\xfe\x00")
     with pytest.raises(UserError, match="not a text file"):

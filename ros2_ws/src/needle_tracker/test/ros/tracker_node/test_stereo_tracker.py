@@ -163,7 +163,7 @@ def test_one_camera_alone_is_said(bench: Bench, images: Images) -> None:
     ("name", "value", "said"),
     [
         ("calibration_file", "/nowhere/rig.yaml", "/nowhere/rig.yaml"),
-        ("calibration_file", __file__, "is not YAML"),
+        ("calibration_file", __file__, "not YAML in line"),
         ("calibration_file", "/dev/null", "phantom is missing"),
         ("pair_tolerance", -1.0, "pair_tolerance"),
         ("needle_polarity", "grey", "needle_polarity"),
