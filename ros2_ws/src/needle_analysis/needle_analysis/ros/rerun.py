@@ -8,8 +8,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
 from needle_analysis.rerun.bag_pass import (
     TIP_TOPICS,
     has_images,
@@ -28,8 +26,9 @@ from needle_bags.ros.parameter_snapshots import plain_value
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.commands.options import CommandParser, output_file
 from needle_common.errors import UserError
+from needle_common.files.plain_yaml import load_plain
 from needle_common.ros.parameters import OF_EVERY_NODE
-from needle_common.settings.parameter_files import read_parameters
+from needle_common.settings.parameter_files import Sections, none_for, read_sections, values_for
 from needle_controller.presets.own_parts import GROUPS
 from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
@@ -112,16 +111,18 @@ def _run(words: Sequence[str]) -> int:
     file = output_file("--json", given.json)
     if given.output is not None:
         refuse_existing_bag(given.output)
-    changes = read_parameters(given.params) if given.params is not None else {}
+    sections = read_sections(given.params) if given.params is not None else {}
     if given.preset is not None and given.preset not in PRESETS:
         raise UserError(f"--preset {given.preset!r} is not one of {', '.join(PRESETS)}")
     named = {key: getattr(given, key) for key in ("preset", *GROUPS)}
     asked = {key: name for key, name in named.items() if name is not None}
-    if asked:
-        changes = {**changes, CONTROLLER: {**changes.get(CONTROLLER, {}), **asked}}
     run = read_run(given.bag, given.namespace)
-    tracker_node = _node(run, TRACKER, changes) if has_images(run) else None
-    controller_node = _node(run, CONTROLLER, changes)
+    params = (given.params, sections)
+    tracker_node = _node(run, TRACKER, params, {}) if has_images(run) else None
+    controller_node = _node(run, CONTROLLER, params, asked)
+    reached = controller_node.given.difference(asked) or (tracker_node and tracker_node.given)
+    if given.params is not None and not reached:
+        print(f"warning: {none_for(*params, controller_node.name)}", file=sys.stderr)
     calibration = run.calibration if tracker_node is None else _calibration(run, tracker_node)
     tracker = None if tracker_node is None else _tracker(run, tracker_node, calibration)
     ends = step_ends(run.path, run.namespace)
@@ -176,17 +177,19 @@ def _parser() -> CommandParser:
     return parser
 
 
-def _node(run: Run, name: str, changes: Mapping[str, Mapping[str, Any]]) -> Node:
+def _node(
+    run: Run, name: str, params: tuple[Path | None, Sections], asked: Mapping[str, str]
+) -> Node:
     recorded = run.parameters or _announced(run)
     found = [full for full in recorded if full.rsplit("/", maxsplit=1)[-1] == name]
-    if not found and name not in changes:
+    own = f"{run.namespace}{name}"
+    full_name = found[0] if found and own not in found else own
+    given = {**(values_for(*params, full_name, name) or {}), **asked}
+    if not found and not given:
         raise UserError(
             f"{run.path} has no parameters of {name} (recorded by another recorder?): give them "
             f"with --params"
         )
-    own = f"{run.namespace}{name}"
-    full_name = found[0] if found and own not in found else own
-    given = changes.get(name, {})
     return Node(full_name, {**recorded.get(full_name, {}), **given}, frozenset(given))
 
 
@@ -222,10 +225,9 @@ def _calibration(run: Run, node: Node) -> str:
 
 def _tracker(run: Run, node: Node, text: str) -> TrackerStage:
     try:
-        calibration = parse_calibration(yaml.safe_load(text))
-    except (UserError, yaml.YAMLError) as error:
-        lines = str(error).splitlines()
-        raise UserError(f"{run.path}: the calibration is broken: {lines[0]}") from error
+        calibration = parse_calibration(load_plain(text, aliases=True))
+    except (UserError, ValueError) as error:
+        raise UserError(f"{run.path}: the calibration is broken: {error}") from error
     return TrackerStage(calibration, node.parameters(StereoTrackerParameters))
 
 

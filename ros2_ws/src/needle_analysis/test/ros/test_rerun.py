@@ -235,6 +235,17 @@ def test_bad_parameters_are_one_line(
     assert printed.count("\n") == 1
 
 
+def test_parameters_reach_the_node_or_that_is_said(tmp_path: Path, capsys: Capture) -> None:
+    file = tmp_path / "rig.yaml"
+    file.write_text("/rig1/plane_controller: {ros__parameters: {curvature: 8.0}}")
+    assert rerun(BAG, "--params", file) == 2
+    assert "this node is /plane_controller: write '/plane_controller'" in capsys.readouterr().err
+    file.write_text("device_driver: {ros__parameters: {max_depth: 0.1}}")
+    assert rerun(BAG, "--params", file) == 0
+    warning = f"warning: {file}: no section for /plane_controller: it has device_driver"
+    assert capsys.readouterr().err.splitlines()[0] == warning
+
+
 def test_a_bag_without_parameters_says_what_to_do(
     make_run: Callable[..., Path], capsys: Capture
 ) -> None:

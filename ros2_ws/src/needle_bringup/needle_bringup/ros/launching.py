@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -43,9 +43,8 @@ def describe(
         refuse_misspelt(context.launch_configurations, list(every))
         given = {name: LaunchConfiguration(name).perform(context) for name in every}
         more = words(given)
-        namespace = given.pop("namespace")
         return [
-            _node(name, values, namespace, more.get(name, ()))
+            _node(name, values, given["namespace"], more.get(name, ()))
             for name, values in nodes(given).items()
         ]
 
@@ -59,10 +58,8 @@ def describe(
 
 
 def _node(name: str, values: Mapping[str, Any], namespace: str, words: Sequence[str]) -> Node:
-    # One by one: a parameter file would have to name the node with its namespace, and what is
-    # named otherwise runs on its defaults.
     ros_arguments = []
-    for parameter, value in _flat(values):
+    for parameter, value in values.items():
         ros_arguments += ["-p", f"{parameter}:={json.dumps(value)}"]
     # The recorder writes out what it still holds.
     patience = {"sigterm_timeout": str(RECORDER_GRACE)} if name == "recorder" else {}
@@ -76,11 +73,3 @@ def _node(name: str, values: Mapping[str, Any], namespace: str, words: Sequence[
         on_exit=Shutdown(reason=f"{name} has ended"),
         **patience,
     )
-
-
-def _flat(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for name, value in values.items():
-        if isinstance(value, Mapping):
-            yield from _flat(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from needle_bags.format.bag_writer import refuse_existing_bag
 from needle_bringup.simulation.rig_configuration import (
-    NODES,
     PACKAGES,
     command_line_parameters,
     merge,
@@ -69,7 +68,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     ----------
     arguments : mapping
         Launch argument -> text: level, seed, real_time_factor, controller, simulated_operator, bag,
-        can and params.
+        can, params and namespace.
 
     Returns
     -------
@@ -97,7 +96,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
         del parameters["recorder"]
         for values in parameters.values():
             values.pop("wait_for_recorder", None)
-    return _with_file(parameters, arguments["params"], _OF_SIMULATION)
+    return _with_file(parameters, arguments, _OF_SIMULATION)
 
 
 def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
@@ -106,7 +105,7 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     Parameters
     ----------
     arguments : mapping
-        Launch argument -> text: calibration, drives, bag and params.
+        Launch argument -> text: calibration, drives, bag, params and namespace.
 
     Returns
     -------
@@ -128,11 +127,8 @@ def nodes_beside_rig(arguments: Mapping[str, str]) -> Parameters:
     if bag is not None:
         parameters["recorder"] = {"bag": str(bag), "run_info": json.dumps(dict(arguments))}
     if arguments["drives"]:
-        driver = _read("drives", arguments["drives"])
-        if list(driver) != ["device_driver"]:
-            raise UserError(f"drives:={arguments['drives']}: wants one section, device_driver")
-        parameters.update(driver)
-    return _with_file(parameters, arguments["params"], _OF_RIG)
+        parameters.update(_read("drives", arguments, ["device_driver"]))
+    return _with_file(parameters, arguments, _OF_RIG)
 
 
 def replayed_nodes(arguments: Mapping[str, str]) -> Parameters:
@@ -178,22 +174,24 @@ def replay_words(arguments: Mapping[str, str]) -> dict[str, list[str]]:
     return {"player": player, "live_view": ["--ros-args", *(w for ws in remapped for w in ws)]}
 
 
-def _with_file(parameters: Parameters, file: str, reserved: Mapping[str, str]) -> Parameters:
+def _with_file(
+    parameters: Parameters, arguments: Mapping[str, str], reserved: Mapping[str, str]
+) -> Parameters:
     """Return the parameters with a parameter file on top."""
-    if not file:
+    if not arguments["params"]:
         return parameters
-    given = _read("params", file)
+    given = _read("params", arguments, list(parameters))
     for node, values in given.items():
-        if node not in parameters:
-            raise UserError(f"params:={file}: {node} is not started with these arguments")
         for name in values:
             if name in reserved:
-                raise UserError(f"params:={file}: {node}: {name} is set by {reserved[name]}:=")
+                where = f"params:={arguments['params']}"
+                raise UserError(f"{where}: {node}: {name} is set by {reserved[name]}:=")
     return merge(parameters, given)
 
 
-def _read(argument: str, file: str) -> Parameters:
-    return read_parameters(existing_file(f"{argument}:=", file), NODES)
+def _read(argument: str, arguments: Mapping[str, str], nodes: Sequence[str]) -> Parameters:
+    file = existing_file(f"{argument}:=", arguments[argument])
+    return read_parameters(file, nodes, arguments.get("namespace", ""))
 
 
 def _new_bag(text: str) -> Path | None:

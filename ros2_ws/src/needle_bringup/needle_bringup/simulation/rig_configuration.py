@@ -199,13 +199,10 @@ def refuse_reserved(path: Path, given: Parameters, options: SimulateOptions) -> 
     Raises
     ------
     UserError
-        If the file sets what an option sets, a node that this level does not run, or what the
-        recorder leaves out.
+        If the file sets what an option sets, or what the recorder leaves out.
     """
     reserved = command_line_parameters(options, Path())
     for node, values in given.items():
-        if node not in reserved:
-            raise UserError(f"{path}: {node} does not run at level {options.level}")
         for name in values:
             if name in reserved[node]:
                 option = OPTIONS.get(name)

@@ -17,7 +17,6 @@ from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
-    NODES,
     PACKAGES,
     command_line_parameters,
     merge,
@@ -103,7 +102,7 @@ def simulate(options: SimulateOptions) -> int:
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
     if options.params is not None:
-        given = read_parameters(options.params, NODES)
+        given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
     executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     # A signal is looked at between steps from here on; in the report it raises wherever it comes.

@@ -65,7 +65,7 @@ def test_drives_that_name_another_node_do_not_start_the_driver_on_its_defaults(
     tmp_path: Path,
 ) -> None:
     wrong = file_of(tmp_path, {"drive_emulator": {"ros__parameters": {"channel": "x"}}})
-    with pytest.raises(UserError, match="wants one section, device_driver"):
+    with pytest.raises(UserError, match="'drive_emulator' is not started here, only device_driver"):
         beside_rig(drives=wrong)
     right = file_of(tmp_path, {"device_driver": {"ros__parameters": {"channel": "can7"}}})
     assert beside_rig(drives=right)["device_driver"] == {"channel": "can7"}
@@ -103,11 +103,27 @@ def test_what_an_argument_says_no_file_says(tmp_path: Path) -> None:
     with pytest.raises(UserError, match="level is set by level:="):
         simulated(params=level)
     other = file_of(tmp_path, {"simulated_operator": {"ros__parameters": {"stall_timeout": 1.0}}})
-    with pytest.raises(UserError, match="simulated_operator is not started"):
+    with pytest.raises(UserError, match="'simulated_operator' is not started here, only sim_rig, "):
         simulated(params=other)
     good = file_of(tmp_path, {"plane_controller": {"ros__parameters": {"depth": 0.05}}})
     assert simulated(params=good)["plane_controller"]["depth"] == 0.05
     assert beside_rig(params=good)["plane_controller"] == {"depth": 0.05}
+
+
+def test_a_file_of_two_rigs_has_both_namespaces(tmp_path: Path) -> None:
+    depths = {f"/rig{n}/plane_controller": {"ros__parameters": {"depth": 0.01 * n}} for n in (1, 2)}
+    file = file_of(tmp_path, depths)
+    for start in (beside_rig, simulated):
+        for namespace in ("rig2", "/rig2/"):
+            given = start(params=file, namespace=namespace)["plane_controller"]
+            assert given["depth"] == 0.02
+        with pytest.raises(
+            UserError, match="is for /rig1/plane_controller, this node is /plane_co"
+        ):
+            start(params=file)
+    drives = file_of(tmp_path, {"device_driver": {"ros__parameters": {"channel": "can7"}}})
+    with pytest.raises(UserError, match="this node is /rig1/device_driver: write '/rig1/device_d"):
+        beside_rig(drives=drives, namespace="rig1")
 
 
 def test_a_bag_is_played_for_viewers(tmp_path: Path) -> None:

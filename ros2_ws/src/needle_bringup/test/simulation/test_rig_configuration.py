@@ -72,15 +72,15 @@ def test_later_layers_win_one_parameter_at_a_time() -> None:
 def test_a_written_file_reads_back(tmp_path: Path) -> None:
     parameters = {"sim_rig": {"level": "tip", "curvature": 1e-5, "flag": True}}
     write_parameters(tmp_path / "p.yaml", parameters)
-    assert read_parameters(tmp_path / "p.yaml") == parameters
+    assert read_parameters(tmp_path / "p.yaml", NODES) == parameters
 
 
 @pytest.mark.parametrize(
     ("text", "named"),
     [
         ("controller: {ros__parameters: {x: 1}}", "unknown node 'controller'"),
-        ("plane_controller: {parameters: {x: 1}}", "ros__parameters"),
-        ("plane_controller: {ros__parameters: [1]}", "NAME: VALUE"),
+        ("joy_node: {ros__parameters: {x: 1}}", "'joy_node' is not started here"),
+        ("/rig1/sim_rig: {ros__parameters: {x: 1}}", "this node is /sim_rig"),
         ("[1, 2", "not YAML"),
         ("just text", "not a ROS parameter file"),
         ("", "not a ROS parameter file"),
@@ -90,7 +90,7 @@ def test_a_bad_file_is_named_in_one_line(tmp_path: Path, text: str, named: str) 
     path = tmp_path / "bad.yaml"
     path.write_text(text)
     with pytest.raises(UserError) as caught:
-        read_parameters(path)
+        read_parameters(path, NODES)
     assert named in str(caught.value)
     assert str(path) in str(caught.value)
     assert len(str(caught.value).splitlines()) == 1
@@ -101,8 +101,6 @@ def test_a_file_may_not_contradict_the_command_line() -> None:
     options = SimulateOptions(level="tip", noise_mm=1.0)
     with pytest.raises(UserError, match="--depth-mm"):
         refuse_reserved(path, {"plane_controller": {"depth": 0.1}}, options)
-    with pytest.raises(UserError, match="does not run at level tip"):
-        refuse_reserved(path, {"stereo_tracker": {}}, options)
     with pytest.raises(UserError, match="recorder: topics does not go into the file: simulate wa"):
         refuse_reserved(path, {"recorder": {"topics": ["/needle/tip"]}}, options)
     refuse_reserved(path, {"plane_controller": {"curvature": 8.0}}, options)

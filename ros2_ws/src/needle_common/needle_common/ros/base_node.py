@@ -31,7 +31,7 @@ from needle_common.ros.conversions import RELIABLE, to_diagnostic_status, to_sta
 from needle_common.ros.discovery import signature
 from needle_common.ros.executor import NodeExecutor
 from needle_common.settings.parameter_fields import describe
-from needle_common.settings.parameter_files import foreign_nodes
+from needle_common.settings.parameter_files import given_sections
 
 _LONGEST_TEXT = 200
 _ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level")
@@ -155,6 +155,8 @@ def run_node(
     argv = list(sys.argv if args is None else args)
     with EndRequest(grace, interrupted) as end:
         try:
+            # rclpy reads the files, too, but its errors do not say what is wrong with them.
+            given_sections(argv)
             own = remove_ros_args(argv)[1:]
             if own in (["--help"], ["-h"]):
                 return run_command(lambda: _explain(help_text, parameters))
@@ -163,8 +165,6 @@ def run_node(
             own = own or [argument for argument in before if ":=" in argument]
             if own:
                 raise UserError(f"unknown argument {own[0]!r}; {_hint(own[0])}")
-            for line in foreign_nodes(argv):
-                print(line, file=sys.stderr)
             keep_to_this_machine(shared_memory=shared_memory)
             remove_half_made_ports()
             # rclpy's own handlers would shut the context down in the middle of what is under way.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import sys
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Generic, TypeVar
@@ -18,6 +19,7 @@ from rclpy.parameter import Parameter
 
 from needle_common.errors import UserError
 from needle_common.settings.parameter_fields import ParameterSpec, specs
+from needle_common.settings.parameter_files import check_command_line
 
 P = TypeVar("P")
 
@@ -43,7 +45,8 @@ class NodeParameters(Generic[P]):
     Raises
     ------
     UserError
-        A given parameter that is unknown, of the wrong type, or out of bounds.
+        A given parameter that is unknown, of the wrong type, or out of bounds, or that is meant for
+        the node and does not reach it.
     """
 
     def __init__(
@@ -51,6 +54,8 @@ class NodeParameters(Generic[P]):
     ) -> None:
         self._on_change = on_change
         known = {name: (spec, default) for name, spec, default in specs(parameters)}
+        for line in check_command_line(sys.argv, node.get_fully_qualified_name()):
+            node.get_logger().warning(line)
         _refuse_unknown(node, list(known))
         values: dict[str, Any] = {}
         for name, (spec, default) in known.items():

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser, number, output_file
 from needle_common.errors import UserError
-from needle_common.settings.parameter_files import read_parameters
+from needle_common.settings.parameter_files import none_for, read_sections, values_for
 from needle_tracker.answers.annotation import Image, annotate
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
@@ -150,7 +150,11 @@ def _parameters(given: argparse.Namespace) -> StereoTrackerParameters:
     """Return the node's parameters: its defaults, what --params says, and the needle's width."""
     changes: dict[str, Any] = {}
     if given.params is not None:
-        changes |= read_parameters(Path(given.params)).get(_NODE, {})
+        sections = read_sections(Path(given.params))
+        values = values_for(given.params, sections, f"/{_NODE}", _NODE)
+        if values is None:
+            print(f"warning: {none_for(given.params, sections, f'/{_NODE}')}", file=sys.stderr)
+        changes |= values or {}
         known = {field.name for field in dataclasses.fields(StereoTrackerParameters)}
         if unknown := sorted(set(changes) - known):
             raise UserError(f"--params: {_NODE} has no parameter {', '.join(unknown)}")

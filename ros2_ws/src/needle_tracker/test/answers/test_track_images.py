@@ -116,6 +116,8 @@ def test_parameters_of_the_node_count_here_too(
         ("stereo_tracker: {ros__parameters: {needle_width: 1.0}}", "needle_width"),
         ("stereo_tracker: {ros__parameters: {bevel_length: 1.2}}", "bevel_length"),
         ("stereo_trakcer: {ros__parameters: {needle_width: 0.001}}", "stereo_trakcer"),
+        ("/left/stereo_tracker: {ros__parameters: {}}", "this node is /stereo_tracker: write"),
+        ("stereo_tracker: {ros__parameters: {seed: 1, seed: 2}}", "duplicate key 'seed' in line 1"),
     ],
 )
 def test_parameters_that_are_none_are_refused_in_one_line(
@@ -131,6 +133,17 @@ def test_parameters_that_are_none_are_refused_in_one_line(
     lines = capsys.readouterr().err.strip().splitlines()
     assert len(lines) == 1
     assert said in lines[0]
+
+
+def test_a_file_for_other_nodes_is_one_warning(
+    folder: Path, calibration_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = folder / "rig.yaml"
+    file.write_text("device_driver: {ros__parameters: {max_depth: 0.08}}")
+    code, _ = track(folder, calibration_path, "--params", str(file))
+    assert code == 0
+    warning = f"warning: {file}: no section for /stereo_tracker: it has device_driver"
+    assert capsys.readouterr().err.splitlines()[0] == warning
 
 
 def test_an_end_without_a_long_face_is_surer(folder: Path, calibration_path: Path) -> None:
