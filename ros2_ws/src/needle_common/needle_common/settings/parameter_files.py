@@ -13,18 +13,8 @@ from needle_common.errors import UserError
 from needle_common.files.plain_yaml import read_yaml
 
 NODES = (
-    "recorder",
-    "sim_rig",
-    "drive_emulator",
-    "device_driver",
-    "stereo_camera",
-    "stereo_tracker",
-    "plane_controller",
-    "operator",
-    "simulated_operator",
-    "live_view",
-    "openigtlink",
-    "player",
+    *("recorder", "sim_rig", "drive_emulator", "device_driver", "stereo_camera", "stereo_tracker"),
+    *("plane_controller", "operator", "simulated_operator", "live_view", "openigtlink", "player"),
     "console",
 )
 """Names of the rig's nodes."""

@@ -44,6 +44,8 @@ def test_a_node_that_its_section_does_not_reach_stops(
     file = tmp_path / "rig.yaml"
     file.write_text(f"{node}: {{ros__parameters: {{}}}}")
     words = [*WORDS.get(node, []), "--ros-args", "--params-file", str(file), "-r", remapping]
+    # Without the line, it would stop for this.
+    words += ["-p", "unknown:=1"]
     monkeypatch.setattr(sys, "argv", [f"/lib/{node}", *words])
     with mock.patch.dict(os.environ):
         assert importlib.import_module(MODULES[node]).main() == 2
