@@ -57,6 +57,9 @@ _needle_env() {
     export ROS_PYTHON_CHECK_FIELDS=1
     # No packet leaves this machine, and none comes in, unless asked for.
     export ROS_AUTOMATIC_DISCOVERY_RANGE="${ROS_AUTOMATIC_DISCOVERY_RANGE:-LOCALHOST}"
+    if [ "${RMW_IMPLEMENTATION:-rmw_fastrtps_cpp}" != rmw_fastrtps_cpp ]; then
+        echo "env.sh: RMW_IMPLEMENTATION=$RMW_IMPLEMENTATION ignored: the rig's nodes run on rmw_fastrtps_cpp" >&2
+    fi
     export RMW_IMPLEMENTATION=rmw_fastrtps_cpp
     # Shared memory that holds camera images; who may ask. Every node of ours chooses in the same way.
     case "$ROS_AUTOMATIC_DISCOVERY_RANGE" in

@@ -105,6 +105,18 @@ def test_profiles_of_the_users_own_stay_and_missing_ones_do_not(name: str, set_u
 
 
 @pytest.mark.parametrize("name", SHELLS)
+def test_another_middleware_is_named_and_replaced(name: str, set_up: Path) -> None:
+    source = f". {str(set_up / 'scripts' / 'env.sh')!r}"
+    line = f"set -eu; {source}; {source}; echo $RMW_IMPLEMENTATION"
+    result = shell(name, line, RMW_IMPLEMENTATION="rmw_cyclonedds_cpp")
+    assert result.stdout == "rmw_fastrtps_cpp\n"
+    assert result.stderr == (
+        "env.sh: RMW_IMPLEMENTATION=rmw_cyclonedds_cpp ignored: "
+        "the rig's nodes run on rmw_fastrtps_cpp\n"
+    )
+
+
+@pytest.mark.parametrize("name", SHELLS)
 def test_leaves_no_helpers(name: str, set_up: Path) -> None:
     result = shell(name, f". {str(set_up / 'scripts/env.sh')!r}; set; typeset -f")
     names = [line.partition("=")[0] for line in result.stdout.splitlines()]

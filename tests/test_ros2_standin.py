@@ -132,3 +132,23 @@ def test_help_says_what_it_is(arguments: list[str]) -> None:
     result = ros2(None, *arguments)
     assert result.returncode == 0
     assert "stand-in" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "code", "line"),
+    [
+        ("ROS_DOMAIN_ID", "300", 2, "ros2: ROS_DOMAIN_ID=300 is not a number from 0 to 232"),
+        (
+            *("RMW_IMPLEMENTATION", "rmw_none", 0),
+            "RMW_IMPLEMENTATION=rmw_none ignored: the rig's nodes run on rmw_fastrtps_cpp",
+        ),
+    ],
+)
+def test_the_graph_is_asked_with_what_the_nodes_take(
+    monkeypatch: pytest.MonkeyPatch, variable: str, value: str, code: int, line: str
+) -> None:
+    monkeypatch.setenv(variable, value)
+    command = [sys.executable, "-I", "-S", str(STAND_IN), "node", "list", "--spin-time", "0"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == code
+    assert done.stderr.splitlines()[0] == line

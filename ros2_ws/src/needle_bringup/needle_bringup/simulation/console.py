@@ -22,6 +22,7 @@ from needle_common.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_comman
 from needle_common.errors import UserError
 from needle_common.files.installed import find_executable
 from needle_common.process.end_request import EndRequest
+from needle_common.process.reach import settle_environment
 from needle_common.process.ros_domain import own_domain
 from needle_common.settings.parameter_files import Parameters
 
@@ -59,6 +60,7 @@ def console(options: ConsoleOptions) -> int:
     UserError
         Where something is missing or a port is taken.
     """
+    settle_environment(own_graph=True)
     for port in (options.port, options.port + 1):
         _refuse_taken(port)
     parameters = console_parameters(options)

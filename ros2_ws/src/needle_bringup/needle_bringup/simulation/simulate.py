@@ -37,6 +37,7 @@ from needle_common.commands.executables import loaded
 from needle_common.errors import UserError
 from needle_common.files.installed import find_executable
 from needle_common.process.end_request import EndRequest
+from needle_common.process.reach import settle_environment
 from needle_common.process.ros_domain import own_domain
 from needle_common.settings.parameter_files import Parameters, read_parameters
 
@@ -99,6 +100,7 @@ def simulate(options: SimulateOptions) -> int:
     KeyboardInterrupt
         After an interrupt, when everything has ended.
     """
+    settle_environment(own_graph=True)
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
     if options.params is not None:

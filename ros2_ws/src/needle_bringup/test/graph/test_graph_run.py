@@ -56,6 +56,22 @@ def test_it_steers_records_and_reports(run: Run, level: str) -> None:
     assert rerun.main([str(bag)]) == 0
 
 
+def test_variables_of_another_set_up_are_named_first_and_keep_no_node_away(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    left = {
+        "ROS_DOMAIN_ID": "300",
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF",
+        "ROS_DISCOVERY_SERVER": "127.0.0.1:11811",
+    }
+    for name, value in left.items():
+        monkeypatch.setenv(name, value)
+    finished = run("left", "--level", "tip", *SHORT)
+    assert finished.code == 1, finished.output
+    for line, (name, value) in zip(finished.output.splitlines(), left.items(), strict=False):
+        assert line.startswith(f"{name}={value} ignored: ")
+
+
 def test_one_seed_is_one_run_and_another_another(run: Run) -> None:
     runs = {
         # The run that is looked at above; --seed 1 is the default.

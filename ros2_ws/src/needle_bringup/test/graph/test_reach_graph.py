@@ -131,6 +131,22 @@ def test_a_node_listens_to_this_machine_only_unless_asked_otherwise(
     assert "0.0.0.0" in listening(opened.pid, domain)
 
 
+def test_another_middleware_is_named_and_not_loaded(domain: int) -> None:
+    environment = bare(domain, RMW_IMPLEMENTATION="rmw_cyclonedds_cpp")
+    done = subprocess.run(
+        [find_executable("needle_sim", "drive_emulator"), "--help"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=LIMIT,
+        check=False,
+    )
+    assert done.returncode == 0
+    assert done.stderr == (
+        "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp ignored: the rig's nodes run on rmw_fastrtps_cpp\n"
+    )
+
+
 def segments(process: NodeProcess) -> set[Path]:
     """Return the shared memory that a process has open, but ports, which hold no messages."""
     maps = Path(f"/proc/{process.pid}/maps").read_text("utf-8")

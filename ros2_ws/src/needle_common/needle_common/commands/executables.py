@@ -17,6 +17,7 @@ from types import ModuleType
 from typing import NoReturn
 
 from needle_common.process.end_request import LeaveAtOnce
+from needle_common.process.reach import use_fast_dds
 
 _EXIT_DONE = 0
 _EXIT_INTERRUPTED = 130
@@ -33,6 +34,7 @@ def node(module: str) -> Callable[[], NoReturn]:
 
     def enter() -> NoReturn:
         LeaveAtOnce(_EXIT_DONE)
+        use_fast_dds()
         code: int = loaded(module).main()
         # No way back through the interpreter: what DDS and numerical code left there has its own
         # ideas of an end, and a signal finds no handler any more.
@@ -56,6 +58,7 @@ def command(module: str) -> Callable[[], NoReturn]:
 
     def enter() -> NoReturn:
         LeaveAtOnce(_EXIT_INTERRUPTED)
+        use_fast_dds()
         sys.exit(loaded(module).main())
 
     return enter
