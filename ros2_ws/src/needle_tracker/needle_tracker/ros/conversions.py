@@ -46,28 +46,44 @@ def to_frame(message: Image, side: str, camera: Camera) -> Frame:
     return Frame(grey_image(rows, message.width, message.encoding))
 
 
-def other_resolution(message: CameraInfo, side: str, camera: Camera) -> str:
-    """Return that a camera_info is of images of another size than the calibration's, else empty."""
-    size = (message.width, message.height)
+def image_geometry(message: CameraInfo) -> tuple[int, int, NDArray[np.float64]]:
+    """Return width and height [px] and camera matrix, (3, 3), of a camera_info's images.
+
+    A camera_info gives `width`, `height` and `k` of the full sensor (REP 104). The images show its
+    `roi` (0x0: all of it), reduced by `binning_x` and `binning_y` (0: 1).
+    """
+    roi, bins = message.roi, np.maximum([message.binning_x, message.binning_y], 1)
+    width, height = (roi.width or message.width, roi.height or message.height) // bins
+    matrix = np.array(message.k, dtype=np.float64).reshape(3, 3)
+    matrix[:2, 2] -= roi.x_offset, roi.y_offset
+    matrix[:2] /= bins[:, None]
+    return int(width), int(height), matrix
+
+
+def camera_info_problem(message: CameraInfo, side: str, camera: Camera) -> tuple[str, bool]:
+    """Return how a camera_info contradicts the calibration file, and whether in the images' size.
+
+    The text is empty where it does not.
+    """
+    width, height, matrix = image_geometry(message)
     # Some drivers send zeros where they know nothing.
-    if size in {(0, 0), (camera.width, camera.height)}:
-        return ""
+    if (width, height) in {(0, 0), (camera.width, camera.height)}:
+        difference = float(np.abs(matrix - camera.camera_matrix).max())
+        # An uncalibrated camera driver sends zeros.
+        if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
+            return f"{side} camera_info differs from the calibration by {difference:.1f} px", False
+        return "", False
+    of_sensor, roi = "", message.roi
+    if (width, height) != (message.width, message.height):
+        of_sensor = (
+            f" (sensor {message.width}x{message.height}, roi {roi.width}x{roi.height} at "
+            f"{roi.x_offset},{roi.y_offset}, binning "
+            f"{max(message.binning_x, 1)}x{max(message.binning_y, 1)})"
+        )
     return (
-        f"{side} camera_info is for {message.width}x{message.height}, the calibration for "
+        f"{side} camera_info is for {width}x{height}{of_sensor}, the calibration for "
         f"{camera.width}x{camera.height}"
-    )
-
-
-def camera_info_problem(message: CameraInfo, side: str, camera: Camera) -> str:
-    """Return how a camera_info contradicts the calibration file; empty where it does not."""
-    problem = other_resolution(message, side, camera)
-    if problem:
-        return problem
-    difference = float(np.abs(np.reshape(message.k, (3, 3)) - camera.camera_matrix).max())
-    # An uncalibrated camera driver sends zeros.
-    if np.any(np.asarray(message.k) != 0.0) and difference > 0.5:
-        return f"{side} camera_info differs from the calibration by {difference:.1f} px"
-    return ""
+    ), True
 
 
 def insertion_of(message: JointState) -> float | None:

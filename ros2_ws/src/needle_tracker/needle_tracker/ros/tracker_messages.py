@@ -93,9 +93,9 @@ class TrackerMessages:
         return self.answers.add_image(side, stamp, frame, now)
 
     def _take_info(self, side: str, message: CameraInfo, _: float) -> Iterable[Answer]:
-        camera = self._cameras[side]
-        self.health.camera_info[side] = conversions.camera_info_problem(message, side, camera)
-        self.answers.add_contradiction(side, conversions.other_resolution(message, side, camera))
+        problem, in_size = conversions.camera_info_problem(message, side, self._cameras[side])
+        self.health.camera_info[side] = problem
+        self.answers.add_contradiction(side, problem if in_size else "")
         return ()
 
     def _take_estimate(self, message: PoseWithCovarianceStamped, _: float) -> Iterable[Answer]:

@@ -105,8 +105,8 @@ class Bench:
         message.data = data
         self._images[side].publish(message)
 
-    def camera_info(self, width: int, height: int) -> None:
-        self._infos.publish(CameraInfo(width=width, height=height))
+    def camera_info(self, width: int, height: int, **fields: Any) -> None:
+        self._infos.publish(CameraInfo(width=width, height=height, **fields))
 
     def pair(self, stamp: int, images: Images) -> PoseWithCovarianceStamped:
         """Publish a pair with its joint state, and return the answer."""

@@ -104,6 +104,23 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
     assert found(bench.pair(20, images))
 
 
+def test_a_camera_whose_sensor_is_larger_than_its_images_gives_tips(
+    bench: Bench, images: Images
+) -> None:
+    bench.camera_info(2048, 1536)
+    bench.until(lambda: bench.health["images"][0] == 2)
+    bench.camera_info(2048, 1536, binning_x=2, binning_y=2)
+    bench.until(lambda: not bench.node._health.camera_info["left"])
+    assert found(bench.pair(10, images))
+    bench.camera_info(2048, 1536, binning_x=4, binning_y=2)
+    reason = (
+        "left camera_info is for 512x768 (sensor 2048x1536, roi 0x0 at 0,0, binning 4x2), "
+        "the calibration for 1024x768"
+    )
+    bench.until(lambda: bench.health["images"][1] == reason)
+    assert not found(bench.pair(20, images))
+
+
 def test_a_calibration_for_another_resolution_gives_no_tip(
     context: Context, images: Images, calibration_path: Path, tmp_path: Path
 ) -> None:
