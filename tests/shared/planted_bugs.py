@@ -84,7 +84,7 @@ def _anybody_keeps_a_hold_fresh(patch: pytest.MonkeyPatch) -> None:
 
 
 def _hold_of_a_page_outlives_its_words(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(page_session, "LIFETIME", 2.0)
+    patch.setattr(page_session, "ECHO_AGE_LIMIT", 2.0)
 
 
 def _lost_press_of_a_page_goes_on(patch: pytest.MonkeyPatch) -> None:
@@ -202,7 +202,7 @@ PLANTED = {
         "hold_is_of_now", _hold_of_a_page_outlives_its_words, 2
     ),
     "a page's lost press that goes on": PlantedBug(
-        "hold_is_of_now", _lost_press_of_a_page_goes_on, 215
+        "hold_is_of_now", _lost_press_of_a_page_goes_on, 88
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a cycle that orders twice": PlantedBug("none_beyond_limits", _cycle_that_orders_twice, 1),

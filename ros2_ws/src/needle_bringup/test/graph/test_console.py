@@ -233,7 +233,7 @@ def check_stands_still(rig: Rig, page: Page) -> float:
 def hold_until(rig: Rig, press: Hand, let_go: Hand, wanted: Callable[[float], bool]) -> None:
     """Hold until the insertion [m] is as wanted, and on: only the test lets go.
 
-    A browser that a busy machine keeps waiting for 0.1 s loses the hold; as a person would, the
+    A browser that a busy machine keeps waiting for 0.25 s loses the hold; as a person would, the
     test then lets go and presses anew.
     """
     for _ in range(int(LIMIT)):

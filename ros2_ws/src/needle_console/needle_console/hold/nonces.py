@@ -15,8 +15,8 @@ class Nonces:
         Returns a text that nobody can guess.
     """
 
-    MOST = 10
-    """So many are under way at most: a page that was stopped finds no more when it goes on."""
+    MOST = 13
+    """Most nonces that wait for their echo: 0.26 s of them, so that all younger ones may count."""
 
     def __init__(self, make: Callable[[], str]) -> None:
         self._make = make

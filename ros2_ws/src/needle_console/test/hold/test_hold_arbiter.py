@@ -11,10 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from needle_common.ros.hold_topic import HOLD_LIFETIME
 from needle_console.hold.hold_arbiter import IDLE, MOST_PAGES, SILENCE, HoldArbiter
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
+from needle_console.hold.hold_talk import PERIOD
 from needle_console.hold.nonces import Nonces
-from needle_console.hold.page_session import LIFETIME
+from needle_console.hold.page_session import ECHO_AGE_LIMIT
 from needle_console.hold.refusals import Refusal
 
 
@@ -93,10 +95,10 @@ def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence() -> None:
     page = scene.page()
     scene.press(page)
     for _ in range(100):
-        scene.wait(0.9 * LIFETIME)
+        scene.wait(0.9 * ECHO_AGE_LIMIT)
         assert scene.pressed
         assert scene.say(page, True) is None
-    scene.wait(LIFETIME + 1e-6)
+    scene.wait(ECHO_AGE_LIMIT + 1e-6)
     assert not scene.pressed
     assert scene.arbiter.lapses(scene.now)
     assert not scene.arbiter.lapses(scene.now)
@@ -112,13 +114,13 @@ def test_a_hold_counts_from_its_nonce_however_late_the_message_comes() -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
-    scene.wait(0.05)
+    scene.wait(0.5 * ECHO_AGE_LIMIT)
     late = scene.message(page, True)
-    scene.wait(0.04)
+    scene.wait(0.4 * ECHO_AGE_LIMIT)
     assert scene.arbiter.receive(page, late, scene.now) is None
-    scene.wait(0.055)
+    scene.wait(0.59 * ECHO_AGE_LIMIT)
     assert scene.pressed
-    scene.wait(0.01)
+    scene.wait(0.02 * ECHO_AGE_LIMIT)
     assert not scene.pressed
 
 
@@ -130,7 +132,7 @@ def test_a_burst_after_a_stall_does_not_count() -> None:
     for _ in range(Nonces.MOST - 1):
         scene.wait(0.02)
         held_up.append(scene.message(page, True))
-    scene.wait(LIFETIME)
+    scene.wait(ECHO_AGE_LIMIT)
     assert not scene.pressed
     for data in held_up:
         assert scene.arbiter.receive(page, data, scene.now) is not None
@@ -138,12 +140,38 @@ def test_a_burst_after_a_stall_does_not_count() -> None:
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
 
+def test_a_page_that_stalls_for_almost_the_limit_goes_on() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    held_up = []
+    while scene.now + PERIOD < 100.0 + ECHO_AGE_LIMIT:
+        scene.wait(PERIOD)
+        nonce = scene.arbiter.issue(page, scene.now)
+        assert nonce is not None, "no nonce while an echo may still count"
+        held_up.append(nonce)
+    for nonce in held_up:
+        assert scene.say(page, True, nonce=nonce) is None
+        assert scene.pressed
+    # The last of them counts from when it was sent.
+    scene.wait(ECHO_AGE_LIMIT + 1e-6)
+    assert not scene.pressed
+
+
+def test_the_bound_of_a_page_is_kept_and_its_message_promises_no_more_than_any_other() -> None:
+    # A web page's hold ends within 300 ms, transport and cycle included; what a hold message
+    # promises is another thing.
+    assert ECHO_AGE_LIMIT + PERIOD < 0.3
+    assert Nonces.MOST * PERIOD >= ECHO_AGE_LIMIT
+    assert HOLD_LIFETIME == 0.1
+
+
 def test_a_release_and_press_within_a_stall_do_not_count() -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
     release, press = scene.message(page, False), scene.message(page, True)
-    scene.wait(LIFETIME + 1e-6)
+    scene.wait(ECHO_AGE_LIMIT + 1e-6)
     assert scene.arbiter.receive(page, release, scene.now) is Refusal.STALE
     assert scene.arbiter.receive(page, press, scene.now) is Refusal.STALE
     assert scene.say(page, True) is Refusal.NEW_PRESS
@@ -155,7 +183,7 @@ def test_a_press_that_is_too_old_when_it_comes_does_not_count_later() -> None:
     page = scene.page()
     scene.say(page, False)
     press = scene.message(page, True)
-    scene.wait(LIFETIME + 1e-6)
+    scene.wait(ECHO_AGE_LIMIT + 1e-6)
     assert scene.arbiter.receive(page, press, scene.now) is Refusal.STALE
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
@@ -322,7 +350,7 @@ class Witness(Scene):
         if to_page == page and fields["sequence"] > self._heard.get(page, -1):
             if fields["pressed"]:
                 self._proof[page] = max(self._proof.get(page, -1.0), sent)
-            elif self.now - sent <= LIFETIME:
+            elif self.now - sent <= ECHO_AGE_LIMIT:
                 self._released[page] = self._event
         self._heard[page] = max(self._heard.get(page, -1), fields["sequence"])
         self.arbiter.receive(page, data, self.now)
@@ -335,7 +363,7 @@ class Witness(Scene):
         holder = holders[0] if holders else None
         if holder is not None:
             # Somebody pressed this page's button no longer ago than that, by our own clock.
-            assert self.now - self._proof[holder] <= LIFETIME
+            assert self.now - self._proof[holder] <= ECHO_AGE_LIMIT
             if self._holder is None:
                 # And it was seen released since its last hold was over.
                 assert self._released[holder] >= self._over.get(holder, -1)

@@ -33,8 +33,14 @@ def good(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("change", "passed"),
-    [({}, True), ({"last_motion_ms": 171.0}, False), ({"resumed": True}, False)],
+    ("loss", "change", "passed"),
+    [
+        ("closed", {"last_motion_ms": 319.0}, True),
+        ("closed", {"last_motion_ms": 321.0}, False),
+        ("closed", {"resumed": True}, False),
+        ("asleep", {"last_motion_ms": 169.0}, True),
+        ("asleep", {"last_motion_ms": 171.0}, False),
+    ],
 )
-def test_what_falls_short_is_a_miss(change: dict[str, Any], passed: bool) -> None:
-    assert check_console_hold.judge("closed", [good(), good(**change)]).passed is passed
+def test_what_falls_short_is_a_miss(loss: str, change: dict[str, Any], passed: bool) -> None:
+    assert check_console_hold.judge(loss, [good(), good(**change)]).passed is passed

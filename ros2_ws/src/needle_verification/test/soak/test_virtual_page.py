@@ -21,7 +21,7 @@ from needle_verification.soak.virtual_world import (
 )
 
 ACCESS = Access("127.0.0.1", 8080, "", [])
-LIFETIME = 0.1
+LIFETIME = 0.25
 
 
 class Scene:

@@ -184,6 +184,8 @@ def _watched(rig: VirtualRig, faults: Sequence[Fault]) -> Watch:
         for fault in faults
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
+    # A page may be silent for 0.25 s, a joystick for 0.1 s.
+    late += 0.15 if rig.page is not None else 0.0
     watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
