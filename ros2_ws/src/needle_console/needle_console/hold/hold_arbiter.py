@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from needle_console.hold.hold_state import RELEASED, HoldState
 from needle_console.hold.page_message import GarbageError, read_message
-from needle_console.hold.page_session import PageSession
+from needle_console.hold.page_session import ECHO_AGE_LIMIT, PageSession
 from needle_console.hold.refusals import Refusal
 
 MOST_PAGES = 8
@@ -18,12 +18,14 @@ SILENCE = 5.0
 IDLE = 30.0
 """An owner that has not pressed for so long lets another page have the hold [s]."""
 
+_STALLED = f"no echo from this page for {ECHO_AGE_LIMIT:g} s (browser, network or console stalled)"
+
 
 @dataclasses.dataclass
 class _Page:
     session: PageSession
-    # Why its last press did not count.
-    why: Refusal | None = None
+    # Why its last press did not count, or no longer does; empty: it does, or was let go.
+    why: str = ""
 
 
 class HoldArbiter:
@@ -79,10 +81,15 @@ class HoldArbiter:
             return Refusal.GARBAGE
         free = self._owner in (None, page) or self._owner_is_idle(now)
         refusal = entry.session.receive(message, now, free=free)
-        if entry.session.state(now).pressed:
+        counts = entry.session.state(now).pressed
+        if counts:
             self._owner = page
             self._held_at = now
-        entry.why = refusal if message.pressed else None
+        if counts or not message.pressed:
+            entry.why = ""
+        elif refusal is not None:
+            # Of a press that ended the first reason is told until it is let go.
+            entry.why = entry.why or refusal.value
         return refusal
 
     def issue(self, page: int, now: float) -> str | None:
@@ -97,7 +104,7 @@ class HoldArbiter:
             "heard": entry.session.heard,
             "held": entry.session.state(now).pressed,
             "owner": "nobody" if owner is None else "you" if owner == page else "other",
-            "why": "" if entry.why is None else entry.why.value,
+            "why": entry.why,
         }
 
     def is_silent(self, page: int, now: float) -> bool:
@@ -108,7 +115,7 @@ class HoldArbiter:
         """Return True once when the hold has ended by silence."""
         if self._owner is None or not self._pages[self._owner].session.lapses(now):
             return False
-        self._pages[self._owner].why = Refusal.LOST
+        self._pages[self._owner].why = _STALLED
         return True
 
     def state(self, now: float) -> HoldState:

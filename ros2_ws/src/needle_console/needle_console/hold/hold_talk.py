@@ -76,9 +76,7 @@ class HoldTalk:
         if not self._limits[page].lets_through(now):
             self.refuse(Refusal.RATE)
             return False
-        # A silence that nobody watched is one all the same.
-        if self._arbiter.lapses(now):
-            self.refuse(Refusal.LOST)
+        self._watch_silence(now)
         refusal = self._arbiter.receive(page, data, now)
         if refusal is not None:
             self.refuse(refusal)
@@ -94,6 +92,7 @@ class HoldTalk:
 
     def word_for(self, page: int, now: float) -> str | None:
         """Return what to send a page, every `PERIOD`; None while it is behind with answers."""
+        self._watch_silence(now)
         nonce = self._arbiter.issue(page, now)
         if nonce is None:
             return None
@@ -118,10 +117,14 @@ class HoldTalk:
             self._on_notice(f"hold: {refusal.value}" + (f" ({detail})" if detail else ""))
 
     def _tell(self, now: float) -> None:
-        if self._arbiter.lapses(now):
-            self.refuse(Refusal.LOST, "no fresh word of the page; it takes a new press")
+        self._watch_silence(now)
         self._told = self._arbiter.state(now)
         self._on_state(self._told)
+
+    def _watch_silence(self, now: float) -> None:
+        """End a hold whose page was silent; whatever is done first after a stall notes it."""
+        if self._arbiter.lapses(now):
+            self.refuse(Refusal.LOST, "no fresh word of the page; it takes a new press")
 
     def _tell_change(self, now: float) -> None:
         if self._arbiter.state(now) != self._told:

@@ -60,6 +60,8 @@ class Controls:
         possible = usable_buttons(snapshot)
         device = snapshot.device
         must_let_go = device is not None and device.press_again == self._desk.name
+        why = device.trouble if device is not None and must_let_go else ""
+        self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
         for button, element in self._buttons.items():
             usable = button in possible and not self._other_steers
             if button not in _HOLDS:
@@ -76,6 +78,7 @@ class Controls:
             with hold:
                 ui.label(button.value)
                 if button is Button.INSERT:
+                    self._not_counted = ui.label().classes("not-counted")
                     # hold.js' words, written by page.js.
                     ui.element("div").props('id="hold-words"')
             self._buttons[button] = hold

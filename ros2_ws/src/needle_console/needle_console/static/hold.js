@@ -7,6 +7,9 @@ const RETRY = 1000; // [ms]
 const SILENCE = 500; // Without a word for so long the link is not called open [ms].
 const WRONG_TOKEN = "wrong token";
 const FRAMED = "inside another page";
+const HIDDEN = "the page is hidden";
+const UNFOCUSED = "the window lost the focus";
+const OTHER_POINTER = "a second finger or mouse button";
 const STYLE =
   "[data-hold] { touch-action: none; user-select: none; -webkit-user-select: none;" +
   " -webkit-touch-callout: none; }";
@@ -19,10 +22,10 @@ class Hold {
   #nonce = "";
   #sequence = 0;
   // The press under way: { mode, button, pointer (null: the space bar), sequence (of its first
-  // message) }.
+  // message), counted (whether it was a hold) }.
   #press = null;
-  // Whether a press has ended by itself, and no new one has begun.
-  #lost = false;
+  // Why the last press ended by itself, until a new one begins; empty: it did not.
+  #ended = "";
   #told = { held: false, owner: "nobody", why: "" };
   #heardAt = 0;
   #refusal = "";
@@ -46,9 +49,10 @@ class Hold {
     if (typeof speed === "number" && speed >= 0 && speed <= 1) this.#speed = speed;
   }
 
-  release() {
+  // `why` is given where the hand did not let go itself.
+  release(why = "") {
     if (!this.#press) return;
-    this.#press = null;
+    this.#drop(why);
     this.#send();
     this.#show();
   }
@@ -61,7 +65,7 @@ class Hold {
       owner: told.owner,
       held: told.held && this.#press !== null,
       mode: this.#press ? this.#press.mode : "insert",
-      why: open ? told.why || (this.#lost ? "press again" : "") : this.#refusal,
+      why: open ? this.#ended : this.#refusal,
     };
   }
 
@@ -73,7 +77,7 @@ class Hold {
     socket.onopen = () => socket.send(JSON.stringify({ token: this.#token }));
     socket.onmessage = (event) => this.#hear(JSON.parse(event.data));
     socket.onclose = (event) => {
-      this.#drop();
+      this.#drop("connection to the console lost");
       this.#nonce = "";
       this.#sequence = 0;
       this.#refusal = event.reason;
@@ -87,9 +91,13 @@ class Hold {
     this.#told = told;
     this.#heardAt = performance.now();
     this.#refusal = "";
-    // Once lost, a press is over, whatever the finger does.
-    if (this.#press && told.heard >= this.#press.sequence && !told.held) this.#drop();
-    if (this.#press && !this.#canGoOn()) this.#press = null;
+    if (this.#press && told.heard >= this.#press.sequence) {
+      // Once lost, a press is over, whatever the finger does.
+      if (told.held) this.#press.counted = true;
+      else this.#drop(told.why || "press again");
+    }
+    const gone = this.#press && this.#whyGone();
+    if (gone) this.#drop(gone);
     this.#send();
     this.#show();
   }
@@ -109,24 +117,26 @@ class Hold {
   }
 
   // What should have come as an event, and may not have: a button that is taken away says nothing.
-  #canGoOn() {
+  #whyGone() {
     const { button } = this.#press;
-    const there = button.isConnected && buttonOf(button) === button;
-    return there && document.visibilityState === "visible" && document.hasFocus();
+    if (!button.isConnected || buttonOf(button) !== button) return "its button was switched off";
+    if (document.visibilityState !== "visible") return HIDDEN;
+    return document.hasFocus() ? "" : UNFOCUSED;
   }
 
   #begin(button, pointer) {
-    this.#lost = false;
+    this.#ended = "";
     const sequence = this.#sequence + 1;
-    this.#press = { mode: button.dataset.hold, button, pointer, sequence };
+    this.#press = { mode: button.dataset.hold, button, pointer, sequence, counted: false };
     this.#send();
     this.#show();
   }
 
-  #drop() {
+  // End the press; `why` is empty where the hand let go.
+  #drop(why) {
     if (!this.#press) return;
+    this.#ended = why && `${this.#press.counted ? "hold ended" : "no hold"}: ${why}`;
     this.#press = null;
-    this.#lost = true;
   }
 
   // ---- the hand --------------------------------------------------------------------------------
@@ -136,22 +146,23 @@ class Hold {
     style.textContent = STYLE;
     document.head.append(style);
     const on = (target, type, handler) => target.addEventListener(type, handler, true);
-    const release = () => this.release();
+    const hide = () => this.release(HIDDEN);
     on(window, "pointerdown", (event) => this.#pointerDown(event));
     on(window, "pointermove", (event) => this.#pointerMoved(event));
     for (const type of ["pointerup", "pointercancel", "lostpointercapture"]) {
       on(window, type, (event) => {
-        if (this.#press && event.pointerId === this.#press.pointer) this.release();
+        if (!this.#press || event.pointerId !== this.#press.pointer) return;
+        this.release(type === "pointerup" ? "" : "the browser took the pointer away");
       });
     }
     on(window, "keydown", (event) => this.#keyDown(event));
     on(window, "keyup", (event) => this.#keyUp(event));
     on(window, "blur", (event) => {
-      if (event.target === window) this.release();
+      if (event.target === window) this.release(UNFOCUSED);
     });
-    on(window, "pagehide", release);
-    on(document, "visibilitychange", release);
-    on(document, "freeze", release);
+    on(window, "pagehide", hide);
+    on(document, "visibilitychange", hide);
+    on(document, "freeze", hide);
     // A long touch is a hold, no request for a menu. And Chromium keeps messages of sockets back for
     // 100 ms after a touch that it may still have to scroll by: the hold would be lost each time.
     for (const type of ["touchstart", "contextmenu", "dragstart"]) {
@@ -165,7 +176,7 @@ class Hold {
   #pointerDown(event) {
     // A second finger, wherever it is, ends the hold.
     if (this.#press) {
-      this.release();
+      this.release(OTHER_POINTER);
       return;
     }
     const button = buttonOf(event.target);
@@ -177,7 +188,7 @@ class Hold {
   #pointerMoved(event) {
     // A second button of a mouse comes as a movement.
     if (this.#press && event.pointerId === this.#press.pointer && event.buttons !== 1) {
-      this.release();
+      this.release(event.buttons ? OTHER_POINTER : "");
     }
   }
 
@@ -187,7 +198,7 @@ class Hold {
       const same = space && this.#press.pointer === null;
       if (same) event.preventDefault();
       // Any other key ends the hold.
-      if (!same || !event.repeat) this.release();
+      if (!same || !event.repeat) this.release("another key was pressed");
       return;
     }
     const button = space && !event.ctrlKey && !event.altKey && !event.metaKey && focused();
@@ -209,12 +220,11 @@ class Hold {
     const shown = JSON.stringify(status);
     if (shown === this.#shown) return;
     this.#shown = shown;
-    const again = status.why === "press again" || status.why === "hold lost";
     let state = "ready";
     if (status.link !== "open") state = "offline";
     else if (status.owner === "other") state = "other";
     else if (status.held) state = "held";
-    else if (again) state = "again";
+    else if (this.#ended) state = "again";
     document.documentElement.dataset.holdState = state;
     window.dispatchEvent(new CustomEvent("hold:status", { detail: status }));
   }

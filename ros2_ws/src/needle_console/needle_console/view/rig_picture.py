@@ -63,7 +63,11 @@ class RigPicture:
 
     def see_device(self, values: Mapping[str, str]) -> None:
         """Take the key-values of `device/status`."""
-        self._tell(device=device_state(values))
+        state, before = device_state(values), self._told.device
+        if before is not None and before.trouble and "(hold_new_press)" in state.trouble:
+            # Only says that the press goes on; the status before said why it no longer counts.
+            state = dataclasses.replace(state, trouble=before.trouble)
+        self._tell(device=state)
 
     def see_controller(self, values: Mapping[str, str]) -> None:
         """Take the key-values of `needle/controller_status`; a new start begins a new course."""

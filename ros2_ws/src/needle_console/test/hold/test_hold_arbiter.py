@@ -158,6 +158,23 @@ def test_a_page_that_stalls_for_almost_the_limit_goes_on() -> None:
     assert not scene.pressed
 
 
+def test_the_page_is_told_why_its_press_ended_until_it_is_let_go() -> None:
+    scene = Scene()
+    page = scene.page()
+    scene.press(page)
+    scene.wait(ECHO_AGE_LIMIT + 1e-6)
+    assert scene.arbiter.lapses(scene.now)
+    stalled = "no echo from this page for 0.25 s (browser, network or console stalled)"
+    assert scene.arbiter.tell(page, scene.now)["why"] == stalled
+    # What the finger that is still there meets now is not why.
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert scene.arbiter.tell(page, scene.now)["why"] == stalled
+    scene.say(page, False)
+    assert scene.arbiter.tell(page, scene.now)["why"] == ""
+    scene.say(page, True)
+    assert scene.arbiter.tell(page, scene.now)["why"] == ""
+
+
 def test_the_bound_of_a_page_is_kept_and_its_message_promises_no_more_than_any_other() -> None:
     # A web page's hold ends within 300 ms, transport and cycle included; what a hold message
     # promises is another thing.

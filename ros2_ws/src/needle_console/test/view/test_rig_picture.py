@@ -61,6 +61,35 @@ def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
+def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
+    picture = RigPicture()
+    silent = "no hold message for 0.105 s, limit 0.1 s"
+    goes_on = "hold of 'console' does not count (hold_new_press)"
+    values = {"state": "HOLDING", "reason": goes_on, "press_again": "console"}
+    for told in (
+        {"state": "MOVING", "hold_owner": "console"},
+        {"state": "HOLDING", "reason": silent},
+        values,
+        {**values, "speed_scale": "0"},
+    ):
+        picture.see_device(told)
+    device = picture.states().device
+    assert device is not None
+    assert (device.press_again, device.trouble) == ("console", silent)
+    # Where the console stood still itself, it heard no more than that.
+    picture = RigPicture()
+    for told in ({"state": "MOVING", "hold_owner": "console"}, values):
+        picture.see_device(told)
+    device = picture.states().device
+    assert device is not None
+    assert device.trouble == goes_on
+    stamps = "hold of 'console' does not count (hold_stamp_increases); device/reset ends this"
+    picture.see_device({**values, "reason": stamps})
+    device = picture.states().device
+    assert device is not None
+    assert device.trouble == stamps
+
+
 def test_a_controller_that_is_gone_steers_no_longer() -> None:
     picture = seen(0.01)
     picture.lose_controller()

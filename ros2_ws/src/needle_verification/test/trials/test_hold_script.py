@@ -140,6 +140,38 @@ def test_a_button_that_goes_ends_its_hold(scene: Scene) -> None:
     scene.ends(scene.hold_pointer, lambda: scene.tab.release_pointer(*BUTTON))
 
 
+def test_the_page_says_why_a_hold_ended_by_itself(scene: Scene) -> None:
+    tab = scene.tab
+
+    def why() -> str:
+        return str(tab.run("needleHold.status.why"))
+
+    def stand_still() -> None:
+        tab.run("const end = performance.now() + 500; while (performance.now() < end);")
+
+    scene.ends(scene.hold_pointer, lambda: tab.release_pointer(*BUTTON))
+    assert why() == ""
+    scene.ends(scene.hold_pointer, lambda: tab.press_other_button(*BUTTON))
+    assert why() == "hold ended: a second finger or mouse button"
+    scene.ends(scene.hold_space, lambda: tab.press_key("Escape"))
+    assert why() == "hold ended: another key was pressed"
+    scene.ends(scene.hold_touch, tab.cancel_touch)
+    assert why() == "hold ended: the browser took the pointer away"
+    scene.ends(scene.hold_pointer, lambda: tab.run("window.frames[0].focus()"))
+    assert why() == "hold ended: the window lost the focus"
+    tab.run("window.focus()")
+    scene.hold_pointer()
+    stand_still()
+    stalled = "hold ended: no echo from this page for 0.25 s (browser, network or console stalled)"
+    scene.until(lambda: why() == stalled, "it says why")
+    assert tab.run(_STATE) == "again"
+    # It goes with the next press.
+    scene.hold_pointer()
+    assert why() == ""
+    tab.release_pointer(*BUTTON)
+    scene.until_released()
+
+
 def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
     tab = scene.tab
     tab.release_space()
