@@ -29,3 +29,11 @@ class NoTip(str, enum.Enum):
     UNCONFIRMED = "not confirmed yet"
     STANDS = "not moved yet"
     HIDDEN = "the end is hidden in both images"
+
+
+def progress(reason: str) -> int:
+    """Return how far a detector got with a pair before it gave this reason: more is farther."""
+    order = ["no needle", "no clear tip", *NoTip]
+    ranks = [rank for rank, known in enumerate(order) if reason.startswith(known)]
+    # All that is not listed is said of a shaft whose end has passed the gates.
+    return ranks[0] if ranks else order.index(NoTip.TOO_FAR)

@@ -17,7 +17,7 @@ from needle_tracker.image.looks import CLEAR_WIDTHS, MapLook
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, StagedEnd
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import NoTip
+from needle_tracker.tracking.refusals import NoTip, progress
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
@@ -100,6 +100,7 @@ class TipTracker:
         self._maps_count = self._have_agreed = False
         self._against = 0
         self._put_off: _Pair | None = None
+        self._said = "no needle"
         self._pairs = self._in_vain = 0
         self._since_compared = _BOTH_EVERY
 
@@ -127,7 +128,9 @@ class TipTracker:
         self._pairs += 1
         self._since_compared += 1
         if not (self._maps_count or self._maps_are_due(lines)):
-            return lines
+            # What maps said last still holds while they rest.
+            told = lines.tip is None and progress(self._said) > progress(lines.reason)
+            return dataclasses.replace(lines, reason=self._said) if told else lines
         pair = _Pair(left, right, insertion, lines, mirrored)
         if self._lines_count_anyhow(lines):
             self._put_off = pair
@@ -152,6 +155,7 @@ class TipTracker:
         if maps.tip is not None:
             tip = self._claims.widened(maps.tip, OF_MAP)
             maps = dataclasses.replace(maps, tip=self._staged.placed(tip, maps.shaft, insertion))
+        self._said = "no needle" if maps.tip is not None else maps.reason
         stands = maps.reason == NoTip.STANDS
         shown = maps.tip is not None or (maps.state is TrackState.CONFIRMING and not stands)
         self._in_vain = 0 if shown else self._in_vain + 1
@@ -160,7 +164,8 @@ class TipTracker:
         if lines.tip is None or maps.tip is None or (maps.reason and not pair.mirrored):
             self._against = 0
             self._maps_count = self._maps_count or instead
-            return maps if instead else lines
+            farther = lines.tip is None and progress(maps.reason) > progress(lines.reason)
+            return maps if instead or farther else lines
         self._since_compared = 0
         self._hear(agree=not pair.mirrored and _agree(lines.tip, maps.tip))
         return maps if self._maps_count else lines

@@ -16,6 +16,7 @@ from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.refusals import NoTip, progress
 from needle_tracker.tracking.tip_tracker import TipTracker
 from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
@@ -104,15 +105,15 @@ class Told:
     def __init__(self) -> None:
         self.tip: SpatialTip | None = None
         self.reason = ""
+        self.why = "no needle"
         self.state = TrackState.SEARCHING
         self.ends: tuple[ImageTip | None, ImageTip | None] = (None, None)
         self.asked = 0
 
     def process(self, _: Image, __: Image, ___: float | None) -> Measurement:
         self.asked += 1
-        return Measurement(
-            self.tip, self.state, self.reason if self.tip else "no needle", self.ends
-        )
+        reason = self.reason if self.tip else self.why
+        return Measurement(self.tip, self.state, reason, self.ends)
 
     def skip(self, reason: str) -> Measurement:
         return Measurement(None, TrackState.SEARCHING, reason)
@@ -350,6 +351,45 @@ def test_maps_that_show_something_are_drawn_until_it_is_confirmed(
     for _ in range(6):
         assert answer(tracker) is None
     assert maps.asked >= before + 4
+
+
+def test_the_reason_is_that_of_whichever_got_farther(
+    told: tuple[TipTracker, Told, Told],
+) -> None:
+    tracker, lines, maps = told
+
+    def reason() -> str:
+        return tracker.process(NOTHING, NOTHING, None).reason
+
+    lines.why, maps.why = "no needle in the left image", NoTip.UNCONFIRMED
+    assert reason() == "not confirmed yet"
+    lines.why = NoTip.STANDS
+    assert reason() == "not moved yet"
+    # While maps rest, what they said last is said of what lines do not see.
+    lines.why, maps.why = "no clear tip in the left image", NoTip.STANDS
+    for _ in range(20):
+        assert reason() == "not moved yet"
+    assert maps.asked < 20
+    maps.why = "no needle in the right image"
+    for _ in range(3):
+        reason()
+    assert reason() == "no clear tip in the left image"
+
+
+def test_reasons_are_in_the_order_in_which_a_pair_meets_them() -> None:
+    met = [
+        "no needle in the right image",
+        "no clear tip in the left image",
+        NoTip.NO_COMMON_POINT,
+        NoTip.DISAGREE_ALONG,
+        NoTip.SHORT_OF_INSERTION,
+        "the shaft's length is not the insertion",
+        NoTip.UNCLEAR,
+        NoTip.UNCONFIRMED,
+        NoTip.STANDS,
+    ]
+    ranks = [progress(str(reason)) for reason in met]
+    assert ranks == sorted(set(ranks))
 
 
 def test_a_new_insertion_begins_with_lines(
