@@ -41,9 +41,13 @@ The output is a CSV file, one line for each pair:
   x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
   sigma_*_m       its standard deviations
   pitch_rad yaw_rad   of the shaft at its visible end: asin(d_x) and atan2(-d_y, d_z)
-The tip is measured in the images alone; the insertion says where to look and what cannot be.
+--insertion changes tips: below 4.5 mm (entry_zone) there is none, and beyond none whose distance
+or shaft is off by more than 2 mm (insertion_margin). A followed tip is merged with where the last
+one and the insertion have it, and an end that needle maps show is moved along the shaft towards
+where the insertion has it: an insertion that is 1 mm off moves that by 0.5 to 0.8 mm.
+Without --insertion tips come from the images alone. The first two pairs that show a needle have
+none: three have to agree, and the end has to move. One at rest is not told from an old track.
 --params takes the parameters of the node stereo_tracker, of which those for topics change nothing.
-Without --insertion the first two pairs that show a needle have no tip: three have to agree.
 
 examples:
   ros2 run needle_tracker track_images --calibration rig.yaml --left left --right right \\
