@@ -25,8 +25,8 @@ class StereoTrackerParameters:
     reference_folder: str = fixed_parameter(
         "",
         "-",
-        "Folder with left/ and right/: images of the phantom without needle; empty: taken "
-        "from the pairs before each insertion.",
+        "Folder with left/ and right/: images of the phantom without needle, from just before the "
+        "recording; empty: taken from the pairs before each insertion.",
     )
     reliable_images: bool = fixed_parameter(
         True, "-", "Take images reliably, for simulation; false: best effort, for hardware."

@@ -104,6 +104,8 @@ class MapLook:
     ----------
     background : Background or None
         What stands behind the needle, where that is known.
+    earlier : MapLook or None
+        What looks before the background of this recording; None: this does.
     """
 
     def __init__(self, needle_width_px: float, bevel_length_px: float) -> None:
@@ -112,6 +114,7 @@ class MapLook:
         self._map_before = NeedleMap(needle_width_px)
         self._bevel_length_px = bevel_length_px
         self.background: Background | None = None
+        self.earlier: MapLook | None = None
 
     def _draw(self, image: Image, box: Box, tiles: Mask | None = None) -> Image:
         """Return the map; before lines that were there before the needle, of what is new."""
@@ -250,6 +253,8 @@ class MapLook:
             clear = clear and off < 3.0 * math.hypot(expected.sigma_along, along)
         elif not clear:
             return None
+        end = (point, direction, width)
+        empty = self.background is not None and self.background.is_empty
         return ImageTip(
             point=point,
             direction=direction,
@@ -262,8 +267,8 @@ class MapLook:
             clear=clear,
             bright=True,
             allowance=_ALLOWANCE * width,
-            come=self._has_come(image, point, direction, width),
-            all_new=self.background is not None and self.background.is_empty,
+            come=(self.earlier or self)._has_come(image, *end),
+            all_new=empty and self._has_come(image, *end),
         )
 
 

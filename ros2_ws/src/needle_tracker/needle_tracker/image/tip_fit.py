@@ -54,9 +54,9 @@ class ImageTip:
         How many times worse than a line's it may be known and count as much. A line's end is where
         it is seen to end, and finely; a map's covers what a ground face hides.
     come : bool
-        Whether it is seen where there was nothing of it in an earlier image.
+        Whether it is seen where there was nothing of it in an earlier image of the recording.
     all_new : bool
-        Whether that image is one without any needle.
+        Whether it is seen where there was nothing of it in an image without any needle.
     """
 
     point: Array

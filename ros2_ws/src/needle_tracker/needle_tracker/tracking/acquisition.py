@@ -312,7 +312,8 @@ class Acquisition:
             possible=self._usual.allows(found),
             near=near,
             guided=guided,
-            come=come or (not track.has_begun and all(tip.all_new for tip in found)),
+            come=(come and has_come(found))
+            or (not track.has_begun and has_come(found, since_empty=True)),
         )
 
     def _is_borne_out(

@@ -59,9 +59,18 @@ def is_sound(found: Found, across_px: float, along_px: float) -> bool:
     return all(shows_end(tip, across_px, along_px) for tip in (left, right))
 
 
-def has_come(found: Found) -> bool:
-    """Return whether both views show an end where nothing was before: it needs no further sight."""
-    each = all(tip is not None and tip.come for tip in found)
+def has_come(found: Found, *, since_empty: bool = False) -> bool:
+    """Return whether both views show an end where nothing was before: it needs no further sight.
+
+    Parameters
+    ----------
+    found : pair of (ImageTip or None)
+        What the left and the right image show.
+    since_empty : bool
+        Whether before means in the empty phantom. That may be of another day: tracks that other
+        insertions left since are as new as the needle.
+    """
+    each = all(tip is not None and (tip.all_new if since_empty else tip.come) for tip in found)
     return each and is_sound(found, CLEAR_PX, CLEAR_ALONG_PX)
 
 
@@ -227,15 +236,15 @@ def sights_to_confirm(
     guided : bool
         Whether one view's end was found from what the other shows and the needle's way.
     come : bool
-        Whether an end that has come needs no further sight: nothing else says how far the needle
-        goes, or the phantom was seen without it and it has not been found yet.
+        Whether it has come and needs no further sight: nothing else says how far the needle goes,
+        or the phantom was seen without it and it has not been found yet.
 
     Returns
     -------
     int or None
         0 where one will do, None where it is not seen well enough for any number.
     """
-    if (near and alike and is_sound(found, _NEAR_PX, _NEAR_ALONG_PX)) or (come and has_come(found)):
+    if come or (near and alike and is_sound(found, _NEAR_PX, _NEAR_ALONG_PX)):
         return 0
     more = 0 if alike else _MORE_UNLIKE
     if is_sound(found, SOUND_PX, SOUND_ALONG_PX):

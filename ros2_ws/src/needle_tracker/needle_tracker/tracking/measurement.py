@@ -72,7 +72,7 @@ def judged(
     if tip is None:
         return Measurement(None, track.state, NoTip.NO_COMMON_POINT, found)
     refused = track.judge(tip, insertion)
-    if refused is None and insertion is None and track.stands(tip) and not has_come(found):
+    if refused is None and track.stands(tip, insertion) and not has_come(found):
         refused = NoTip.STANDS
     if refused is None:
         return Measurement(tip, track.state, "", found)

@@ -66,13 +66,14 @@ class TipTracker:
         gates = settings.gates
         self._staged = StagedEnd(0.5 * gates.reach.hole_tolerance, gates.insertion_margin)
         face_widths = settings.bevel_length / settings.needle_width
-        left, right = self._looks = (
-            MapLook(widths[0], face_widths * widths[0]),
-            MapLook(widths[1], face_widths * widths[1]),
-        )
-        self._backgrounds = Backgrounds(
-            self._lines.views, settings.hole_clearance, settings.needle_width, settings.reference
-        )
+        left, right, *earlier = (MapLook(each, face_widths * each) for each in (*widths, *widths))
+        self._looks, self._earlier = (left, right), earlier
+        known = (self._lines.views, settings.hole_clearance, settings.needle_width)
+        self._backgrounds = Backgrounds(*known, settings.reference)
+        self._recording = Backgrounds(*known, None)
+        if settings.reference is not None:
+            # It may be of another day, and tells nothing of what has come in this recording.
+            left.earlier, right.earlier = self._earlier
         # A tip that is known badly is better than none: maps know what they do not see.
         wider = dataclasses.replace(
             gates,
@@ -116,6 +117,8 @@ class TipTracker:
         lines = self._lines.process(left, right, insertion)
         behind = self._backgrounds.see((left, right), insertion)
         self._looks[0].background, self._looks[1].background = behind
+        earlier = self._recording.see((left, right), insertion)
+        self._earlier[0].background, self._earlier[1].background = earlier
         if insertion is not None and insertion < self.settings.entry_zone:
             # A new insertion: all that is known of the last one is over.
             self._maps.process(left, right, insertion)

@@ -29,6 +29,9 @@ _NEAR_ENTRY = 10e-3  # up to here the entry says where it is [m]
 _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
 _BESIDE = 2.0e-3
+# An end that has gone less than a quarter of so much insertion [m] stays: twice, for a glint may
+# move a needle's end by its face, of up to 2 mm.
+_SHOULD_HAVE_GONE, _STAYS, _OFTEN = 3e-3, 0.25, 2
 _CONFIRM_KNOWN = 2
 _CONFIRM_MISSES = 2  # so many pairs may lie between
 _EXPECTED, _NO_SURPRISE = 4.0, 9.0  # squared, over its covariance
@@ -63,6 +66,14 @@ class Track:
 
     def reset(self) -> None:
         """Forget everything."""
+        # Pairs of a recording in which an end may be believed that only the empty phantom lacks.
+        self._unproven = self._settings.confirm_pairs
+        # Where ends were seen, each with its insertion [m].
+        self._ends: dict[int, tuple[float, Array]] = {}
+        self.drop()
+
+    def drop(self) -> None:
+        """Forget the needle, not where ends were seen in this recording."""
         self.state = TrackState.SEARCHING
         self.anchor: Anchor | None = None
         self._misses = 0
@@ -148,6 +159,7 @@ class Track:
         certain: bool = True,
         seen: bool = True,
         come: bool = False,
+        new: bool = False,
     ) -> SpatialTip | None:
         """Take a tip that passed `judge`.
 
@@ -165,6 +177,9 @@ class Track:
             Whether both views show the end.
         come : bool
             Whether they show it where nothing was before: one such tip is enough, too.
+        new : bool
+            Whether they show it where nothing was in the empty phantom. Without the insertion it is
+            believed for `confirm_pairs` pairs; then it must have moved: it may be an old track.
 
         Returns
         -------
@@ -173,7 +188,7 @@ class Track:
             merged with its prediction, so that a view that something spoils counts less; in clear
             images it is so much better than its prediction that this hardly moves it.
         """
-        predicted = self.predict(insertion)
+        predicted, seen_at = self.predict(insertion), tip.position
         if self.state is not TrackState.TRACKING:
             agreeing = self._seen_again(tip, insertion, self._next_rival if anew else None)
             wanted = 1 if come else self._settings.confirm_pairs
@@ -184,10 +199,14 @@ class Track:
             self.state = TrackState.TRACKING if confirmed else TrackState.CONFIRMING
             self._agreeing = agreeing
         self._misses = self._hidden = 0
-        if self.state is TrackState.TRACKING:
+        believed = self.state is TrackState.TRACKING
+        if believed:
             self._rival = self._next_rival = None
+            self._unproven = 0
         else:
             self.pass_on()
+            believed = new and insertion is None and self._unproven > 0
+            self._unproven -= believed
         if anew and (predicted is None or not self._is_on_way(tip, predicted)):
             self._sights, self._is_sure, self._passed = 0, False, []
         self._sights += seen
@@ -200,7 +219,8 @@ class Track:
         if insertion is not None:
             self._passed = [p for p in self._passed if p[0] < insertion - _PITCH]
             self._passed.append((insertion, motion.position))
-        return tip if self.state is TrackState.TRACKING else None
+            self._ends[round(insertion / _PITCH)] = insertion, seen_at
+        return tip if believed else None
 
     def _seen_again(self, tip: SpatialTip, insertion: float | None, rival: Sights | None) -> Sights:
         """Return the sights that agree, with one more."""
@@ -217,11 +237,16 @@ class Track:
         seen = Anchor(TipMotion.start(tip), insertion)
         return Sights(None if stands else seen.motion, seen)
 
-    def stands(self, tip: SpatialTip) -> bool:
+    def stands(self, tip: SpatialTip, insertion: float | None = None) -> bool:
         """Return whether a tip is that of a thing that was seen often enough and has not moved.
 
-        Without the insertion nothing tells it from an old track, a scratch or a screw.
+        With the insertion that is an end that did not go with the needle. Without, nothing tells an
+        old track, a scratch or a screw from a needle at rest.
         """
+        if insertion is not None:
+            ways = [(abs(insertion - at), tip.position - end) for at, end in self._ends.values()]
+            long = [(way, off) for way, off in ways if way >= _SHOULD_HAVE_GONE]
+            return sum(float(np.linalg.norm(off)) < _STAYS * way for way, off in long) >= _OFTEN
         agreeing = self._agreeing
         if self.state is not TrackState.CONFIRMING or agreeing is None:
             return False
@@ -364,11 +389,11 @@ class Track:
                 self.state = TrackState.LOST
         elif self.state is not TrackState.LOST and not self._may_confirm_yet():
             rival = self._rival
-            self.reset()
+            self.drop()
             self._rival = rival
         patience = _PATIENCE if self.is_established else 1
         if self.state is TrackState.LOST and self._misses >= patience * settings.forget_after:
-            self.reset()
+            self.drop()
 
     def _may_confirm_yet(self) -> bool:
         """Return whether a first tip may still be confirmed, though pairs without one came."""

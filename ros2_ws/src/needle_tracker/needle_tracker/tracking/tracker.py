@@ -191,8 +191,10 @@ class StereoTracker:
         alone = self._update_from_single_view(images, insertion)
         if measured.reason in (NoTip.HIDDEN, NoTip.UNCERTAIN):
             self.track.hide()
-        elif measured.reason == NoTip.STANDS:
+        elif measured.reason == NoTip.STANDS and insertion is None:
             self.track.pass_on()
+        elif measured.reason == NoTip.STANDS:
+            self.track.drop()
         else:
             self.track.miss()
         if self.track.anchor is None:
@@ -242,8 +244,9 @@ class StereoTracker:
         sound = is_sound(measured.image_tips, SOUND_PX, SOUND_ALONG_PX)
         seen = is_sound(measured.image_tips, CLEAR_PX, CLEAR_ALONG_PX)
         come = has_come(measured.image_tips)
+        new = has_come(measured.image_tips, since_empty=True)
         believed = self.track.accept(
-            tip, insertion, anew=anew, certain=beyond_doubt, seen=seen, come=come
+            tip, insertion, anew=anew, certain=beyond_doubt, seen=seen, come=come, new=new
         )
         self._believed = believed or self._believed
         left_tip, right_tip = measured.image_tips

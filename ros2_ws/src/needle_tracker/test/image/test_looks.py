@@ -91,6 +91,21 @@ def test_a_needle_has_come_whatever_else_is_new_beyond_it() -> None:
     assert found.come
 
 
+def test_an_old_track_has_not_come_though_the_empty_phantom_lacks_it() -> None:
+    look = MapLook(WIDTH_PX, 0.0)
+    entry = np.array([0.0, 121.0])
+    look.background = Background(drawn(0, 1, paper=True), entry, None)
+    look.earlier = MapLook(WIDTH_PX, 0.0)
+    look.earlier.background = Background(drawn(200, 2, paper=True), entry, 3.0 * WIDTH_PX)
+    for end, come in ((200, False), (240, True)):
+        expected = Expected(np.array([float(end), 121.0]), np.array([1.0, 0.0]), 90.0, 6, 0.0, 0.0)
+        image = drawn(end, 3, paper=True)
+        found = look.fit(image, expected, True, DetectionSettings(needle_width_px=WIDTH_PX))
+        assert found is not None
+        assert found.all_new
+        assert found.come is come
+
+
 def shown(
     monkeypatch: pytest.MonkeyPatch, lines: list[tuple[np.ndarray, float]]
 ) -> tuple[MapLook, np.ndarray]:

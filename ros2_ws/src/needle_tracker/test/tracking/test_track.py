@@ -191,6 +191,55 @@ def test_what_has_come_is_confirmed_by_one_sight_without_the_insertion(gates: Ga
     assert track.state is TrackState.TRACKING
 
 
+def test_what_the_empty_phantom_lacks_is_believed_for_some_pairs_and_then_has_to_move(
+    gates: GateSettings,
+) -> None:
+    track = Track(gates)
+    for _ in range(gates.confirm_pairs):
+        assert not track.stands(tip())
+        assert track.accept(tip(), None, new=True) is not None
+        assert track.is_open(None)
+    assert track.stands(tip())
+    # Not anew after a gap, nor elsewhere.
+    track.miss()
+    assert track.accept(tip(), None, new=True) is None
+    assert track.accept(tip(x=5e-3), None, new=True) is None
+    assert track.accept(tip(x=5e-3, z=0.051), None, new=True) is None
+    assert track.accept(tip(x=5e-3, z=0.052), None, new=True) is not None
+    assert track.state is TrackState.TRACKING
+    track.reset()
+    assert track.accept(tip(), None, new=True) is not None
+
+
+@pytest.mark.parametrize("step", [0.2e-3, 0.5e-3, 1e-3, -1e-3])
+def test_an_end_that_stays_while_the_needle_goes_is_none(gates: GateSettings, step: float) -> None:
+    track = Track(gates)
+    insertions = [0.05 + step * i for i in range(round(6e-3 / abs(step)))]
+    stood = []
+    for insertion in insertions:
+        stood.append(track.stands(tip(), insertion))
+        assert not track.stands(tip(z=insertion), insertion)
+        track.accept(tip(), insertion)
+    assert stood == sorted(stood)
+    gone = abs(insertions[stood.index(True)] - insertions[0])
+    assert 3e-3 <= gone <= 4e-3 + 1e-9
+    # It is remembered when the track is dropped, and not beyond this recording.
+    track.drop()
+    assert track.stands(tip(), insertions[-1])
+    track.reset()
+    assert not track.stands(tip(), insertions[-1])
+
+
+def test_a_needle_whose_end_seems_to_move_by_its_face_does_not_stay(gates: GateSettings) -> None:
+    track = Track(gates)
+    for i in range(20):
+        # In every other pair a glint hides the face, of 2 mm.
+        insertion = 0.05 + 1e-3 * i
+        seen = tip(z=insertion - 2e-3 * (i % 2))
+        assert not track.stands(seen, insertion)
+        track.accept(seen, insertion)
+
+
 @pytest.mark.parametrize(("missed", "confirmed"), [(2, True), (3, False)])
 def test_what_is_seen_twice_within_a_few_pairs_is_confirmed(
     gates: GateSettings, missed: int, confirmed: bool
