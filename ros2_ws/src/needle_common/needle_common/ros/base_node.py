@@ -11,6 +11,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
+from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
@@ -196,7 +197,9 @@ def _run(
             # Others end on the same signal: what was missed from them is no bad input.
             code = EXIT_DONE
     except Exception as error:  # noqa: BLE001
-        code = internal_error(error)
+        # No node: its name, namespace or surroundings are not what ROS takes.
+        is_refused = node is None and isinstance(error, rclpy_implementation.RCLError)
+        code = _refuse(error) if is_refused else internal_error(error)
     finally:
         end.leave(code)
         if node is not None:

@@ -96,6 +96,14 @@ def test_help_is_given_without_a_context(word: str, capsys: pytest.CaptureFixtur
     assert capsys.readouterr().out.startswith("HELP\n")
 
 
+@pytest.mark.filterwarnings("ignore:Failed to fini rosout publisher:RuntimeWarning")
+def test_a_namespace_that_ros_does_not_take_is_bad_input(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(Signalled, "--ros-args", "-r", "__ns:=/rig1/") == EXIT_BAD_INPUT
+    assert capsys.readouterr().err.startswith("error: error creating node: invalid node namespace")
+
+
 def test_an_unknown_argument_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(Refuses, "--fast") == EXIT_BAD_INPUT
     assert "'--fast'" in capsys.readouterr().err
