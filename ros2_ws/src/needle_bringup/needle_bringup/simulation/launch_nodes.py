@@ -182,10 +182,9 @@ def _with_file(
         return parameters
     given = _read("params", arguments, list(parameters))
     for node, values in given.items():
-        for name in values:
-            if name in reserved:
-                where = f"params:={arguments['params']}"
-                raise UserError(f"{where}: {node}: {name} is set by {reserved[name]}:=")
+        for name in reserved.keys() & values.keys():
+            where = f"params:={arguments['params']}: {node}"
+            raise UserError(f"{where}: {name} is set by {reserved[name]}:=")
     return merge(parameters, given)
 
 
