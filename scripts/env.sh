@@ -70,6 +70,9 @@ _needle_env() {
         */needle_fastdds.xml | */needle_fastdds_network.xml) unset FASTRTPS_DEFAULT_PROFILES_FILE ;;
     esac
     if [ ! -f "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ]; then
+        if [ -n "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ]; then
+            echo "env.sh: FASTRTPS_DEFAULT_PROFILES_FILE=$FASTRTPS_DEFAULT_PROFILES_FILE ignored: no such file" >&2
+        fi
         export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_common/needle_common/process/$profiles"
     fi
 }

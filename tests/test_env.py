@@ -100,8 +100,12 @@ def test_profiles_of_the_users_own_stay_and_missing_ones_do_not(name: str, set_u
     own.touch()
     env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE=str(own))
     assert env["FASTRTPS_DEFAULT_PROFILES_FILE"] == str(own)
-    env = sourced(name, set_up, FASTRTPS_DEFAULT_PROFILES_FILE="/not/there.xml")
-    assert env["FASTRTPS_DEFAULT_PROFILES_FILE"].endswith("/needle_fastdds.xml")
+    line = f". {str(set_up / 'scripts' / 'env.sh')!r}; echo $FASTRTPS_DEFAULT_PROFILES_FILE"
+    result = shell(name, line, FASTRTPS_DEFAULT_PROFILES_FILE="/not/there.xml")
+    assert result.stdout.endswith("/needle_fastdds.xml\n")
+    assert result.stderr == (
+        "env.sh: FASTRTPS_DEFAULT_PROFILES_FILE=/not/there.xml ignored: no such file\n"
+    )
 
 
 @pytest.mark.parametrize("name", SHELLS)
