@@ -30,7 +30,6 @@ from needle_common.ros.discovery import (
 )
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.partner_clocks import PartnerClocks
 from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
 from needle_controller.presets.steering_settings import SteeringSettings
@@ -108,8 +107,6 @@ class PlaneControllerNode(WholeNode):
         self._partners = AnsweringNodes(self)
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
-        # A tip is laid beside the joints by stamps that two computers may have given.
-        self._clocks = PartnerClocks(self, self._diagnostics, ("needle/tip", "joint_states"))
         self._watched = WatchedTime()
         self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
         self._life = LifeSigns(

@@ -20,7 +20,6 @@ from needle_common.ros.conversions import IMAGES, LATCHED, RELIABLE
 from needle_common.ros.discovery import AnsweringNodes, unpublished, unrecorded
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.partner_clocks import PartnerClocks
 from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.annotation import annotate
@@ -87,9 +86,6 @@ class StereoTrackerNode(WholeNode):
         sources = {row.topic: self._hear(row) for row in self._messages.inputs.values()}
         self._sources = [heard for topic, heard in sources.items() if topic != "target_plane"]
         self._partners = AnsweringNodes(self)
-        # Images are laid beside the joints by their stamps.
-        stamped = (*map(image_topic, SIDES), "joint_states")
-        self._clocks = PartnerClocks(self, self._diagnostics, stamped)
         self._hears_images = False
         if not parameters.wait_for_recorder:
             self._hear_images()

@@ -23,14 +23,13 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG
 from needle_common.commands.options import CommandParser
 from needle_common.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
-from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
-from needle_common.ros.partner_clocks import PART
+from needle_common.ros.conversions import LATCHED, values_of
 from needle_verification.ros.holds.hands import (
     LATEST,
     OPERATOR,
@@ -55,7 +54,6 @@ from needle_verification.trials.trial_runner import Outcomes, Trial, run_trials,
 KINDS = ("cut",)
 DELAY, LOSS = 0.005, 0.01
 SHORTEST, LONGEST = 0.1, 5.0
-_DRIVER = "/device_driver"
 _CAMERAS = "stereo_tracker"
 _TIP_CAMERA = "needle_verification.ros.computers.tip_camera"
 # How long what comes back is watched [s].
@@ -73,30 +71,10 @@ class _DriveWitness(HoldWitness):
         # Whose hold counted, one after the other.
         self.holders: list[str] = []
         super().__init__("sim/drive_positions")
-        # What the controller says of the clocks of others.
-        self.clocks: dict[str, str] = {}
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)
-        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_health, RELIABLE)
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.holders.append(values_of(message)["hold_owner"])
-
-    def _on_health(self, message: DiagnosticArray) -> None:
-        for status in message.status:
-            if status.name == f"plane_controller: {PART}":
-                self.clocks = values_of(status)
-
-    def clock_of(self, node: str) -> tuple[float, float]:
-        """Return how far a node's clock is ahead of the controller's, and within what [s].
-
-        Raises
-        ------
-        UserError
-            If the controller does not say.
-        """
-        ahead, within = f"{node} ahead_s", f"{node} within_s"
-        self.until(lambda: bool(self.clocks.get(ahead)), f"the clock of {node}")
-        return float(self.clocks[ahead]), float(self.clocks[within])
 
     def end_of_motion(self, begin: float) -> tuple[float, float]:
         """Return when the needle came to rest after a time [s], and how far it went later [m]."""
@@ -187,7 +165,6 @@ def _rig(folder: Path, domain: int, persons: Computer, ahead: float) -> Iterator
         seen = {"light": str(light_file), "clock_ahead": ahead}
         graph.start_module(_CAMERAS, _TIP_CAMERA, seen)
         witness.prepare(READY)
-        witness.clock_of(_DRIVER)
         yield _Rig(witness, graph, foot)
 
 
@@ -199,7 +176,6 @@ def _cut(rig: _Rig, cable: Cable, rng: random.Random, longest: float) -> dict[st
     if witness.way(time.time() - RECENT, math.inf) == 0.0:
         # A busy machine lets a path run out, or a hold.
         hold_anew(rig.foot, witness)
-    ahead, within = witness.clock_of(_DRIVER)
     del witness.holders[:]
     cut = time.time()
     cable.cut()
@@ -208,8 +184,6 @@ def _cut(rig: _Rig, cable: Cable, rng: random.Random, longest: float) -> dict[st
     witness.pause(_BACK)
     end, resumed = witness.end_of_motion(cut)
     outcome = {
-        "clock_ahead_s": ahead,
-        "clock_within_s": within,
         "length_s": length,
         "moving": witness.way(cut - RECENT, cut) > 0.0,
         # A hold that went on counting was not lost.
