@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
@@ -26,7 +27,9 @@ def listen(
 ) -> Subscription[Any]:
     """Subscribe to messages that are short by their nature.
 
-    They come as bytes, and become messages only where they are no longer than `LONGEST`.
+    They come as bytes, and become messages only where they are no longer than `LONGEST`. Each is
+    decoded on its own: one that is too long or cannot be decoded is refused by its topic, and those
+    before and after it are taken.
 
     Parameters
     ----------
@@ -43,18 +46,20 @@ def listen(
     refuse : callable
         Takes the topic, the kind of trouble, and what is wrong.
     at_once : int
-        How many messages a call has at most.
+        How many messages are taken off the queue for a call, refused ones among them.
     """
 
     def on_bytes(first: bytes) -> None:
+        taken = itertools.chain((first,), iter(lambda: _next(subscription, kind), None))
         messages = []
-        data: bytes | None = first
-        while data is not None:
-            if len(data) <= LONGEST:
-                messages.append(deserialize_message(data, kind))
-            else:
+        for data in itertools.islice(taken, at_once):
+            if len(data) > LONGEST:
                 refuse(topic, "too long", f"{len(data)} bytes, at most {LONGEST}")
-            data = _next(subscription, kind) if len(messages) < at_once else None
+                continue
+            try:
+                messages.append(deserialize_message(data, kind))
+            except Exception as error:  # noqa: BLE001 - whatever the middleware raises
+                refuse(topic, "undecodable", f"{len(data)} bytes: {type(error).__name__}: {error}")
         if messages:
             callback(messages)
 

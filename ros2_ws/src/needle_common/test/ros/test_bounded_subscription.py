@@ -78,6 +78,32 @@ def test_a_word_among_a_flood_of_others_is_heard_in_one_call(bench: Bench) -> No
     assert len(bench.calls) < 500
 
 
+@pytest.mark.parametrize("at_once", [1, 3, 1000])
+def test_an_undecodable_message_is_refused_by_its_topic_and_the_others_are_heard(
+    bench: Bench, at_once: int
+) -> None:
+    publisher = bench.listen(Bool, "stop", ESTOPS_HEARD, at_once)
+    # No encapsulation header, half of one, a header without its value.
+    for undecodable in (b"", b"\x00\x01\x00", b"\x00\x01\x00\x00"):
+        publisher.publish(Bool(data=True))
+        publisher.publish(undecodable)
+        publisher.publish(Bool(data=False))
+    bench.until(lambda: sum(map(len, bench.calls)) == 6, "all that can be decoded")
+    bench.until(lambda: len(bench.refused) == 3, "the refusals")
+    assert [m.data for call in bench.calls for m in call] == [True, False] * 3
+    assert {refused[:2] for refused in bench.refused} == {("stop", "undecodable")}
+    assert bench.refused[1][2].startswith("3 bytes: ")
+
+
+def test_a_flood_of_undecodable_messages_does_not_hold_a_call_up(bench: Bench) -> None:
+    publisher = bench.listen(Bool, "stop", ESTOPS_HEARD, 5)
+    for _ in range(20):
+        publisher.publish(b"\x00\x01\x00")
+    bench.executor.spin_once(timeout_sec=LIMIT)
+    assert 1 <= len(bench.refused) <= 5
+    bench.until(lambda: len(bench.refused) == 20, "the others")
+
+
 def test_a_call_has_no_more_than_it_may(bench: Bench) -> None:
     publisher = bench.listen(Bool, "few", ESTOPS_HEARD, 3)
     for _ in range(10):
