@@ -85,12 +85,12 @@ class PathAhead:
         """Return the path for a needle that is at an insertion [m], as `SendPath` has it."""
         start, knot = self.start, self._knot
         end = max(min(insertion + self._settings.horizon, self.end), knot.insertion)
-        places = [(start.insertion, start.rotation), (knot.insertion, knot.rotation)]
+        # A needle that went back begins where it is: a path never begins ahead of the needle.
+        begin = min(start.insertion, insertion)
+        places = [(begin, start.rotation), (knot.insertion, knot.rotation)]
         if end > knot.insertion:
             places.append((end, knot.rotation))
-        return tuple(
-            (at, rotation, (at - start.insertion) / self._speed) for at, rotation in places
-        )
+        return tuple((at, rotation, (at - begin) / self._speed) for at, rotation in places)
 
 
 class ContinuousSteering(Steering):

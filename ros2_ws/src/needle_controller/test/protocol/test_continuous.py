@@ -82,6 +82,17 @@ def test_a_tip_within_a_step_length_only_renews_the_path() -> None:
     assert rig.steering.step == 1
 
 
+def test_the_path_of_a_needle_that_went_back_begins_where_the_needle_is() -> None:
+    rig = ContinuousRig()
+    first = path_in(rig.see())
+    rig.insertion = -0.2 * MM
+    again = path_in(rig.see())
+    assert again.points[0] == (-0.2 * MM, 0.0, 0.0)
+    assert [point[:2] for point in again.points[1:2]] == [first.points[1][:2]]
+    speed = first.points[1][0] / first.points[1][2]
+    assert again.points[1][2] == pytest.approx((first.points[1][0] + 0.2 * MM) / speed)
+
+
 @pytest.mark.parametrize("tips_per_step", [2, 6, 20])
 def test_what_is_believed_and_turned_does_not_depend_on_how_many_tips_there_are(
     tips_per_step: int,

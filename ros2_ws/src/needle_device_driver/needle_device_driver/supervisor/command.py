@@ -131,6 +131,13 @@ def check_command(
     if not context.homed:
         return Refusal(Rule.HOMED_FIRST, "the axes are not homed")
     way = _way(command, context)
+    begin = way[0].start[0]
+    if begin > context.insertion + limits.insertion_tolerance * _ROUNDING:
+        return Refusal(
+            Rule.COMMAND_FORM,
+            f"the path begins at {begin * 1e3:.6g} mm, ahead of the needle at "
+            f"{context.insertion * 1e3:.6g} mm",
+        )
     left = way[-1].leg.insertion - context.insertion
     if command.is_path and abs(left) <= limits.insertion_tolerance:
         return ()

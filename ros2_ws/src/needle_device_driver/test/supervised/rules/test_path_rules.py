@@ -217,6 +217,24 @@ def test_forward_only_each_point_is_ahead_of_the_one_before(bench: Bench) -> Non
     assert "the point before" in refused(bench, Rule.FORWARD_ONLY)
 
 
+@pytest.mark.parametrize("ahead", [0.0011, 0.1, 0.5, 1.0])
+def test_command_form_a_path_that_begins_ahead_of_the_needle_is_refused(
+    bench: Bench, ahead: float
+) -> None:
+    bench.ready()
+    path(bench, (ahead, 0.0), (1.1, 0.1), (1.5, 0.1))
+    assert f"begins at {ahead:.6g} mm, ahead of the" in refused(bench, Rule.COMMAND_FORM)
+
+
+def test_command_form_no_path_that_begins_ahead_takes_the_place_of_another(bench: Bench) -> None:
+    bench.ready()
+    path(bench, (0.0, 0.0), (1.0, 0.3), (2.0, 0.3))
+    bench.cycle(4, holding=True)
+    path(bench, (0.5, 0.1), (1.0, 0.3), (2.2, 0.3))
+    bench.cycle(20, holding=True)
+    assert (bench.last_rule, bench.positions) == (Rule.COMMAND_FORM, (0.002, 0.3))
+
+
 def test_command_form_a_path_has_at_most_32_points(bench: Bench) -> None:
     bench.ready()
     path(bench, *((0.01 * k, 0.0) for k in range(33)))
