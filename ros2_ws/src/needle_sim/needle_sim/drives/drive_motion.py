@@ -51,9 +51,14 @@ class DriveMotion:
         What moves.
     limit_action : LimitAction
         For a target beyond the software limits; they act once the drive is homed.
+    speed_unit : float
+        Counts/s in one unit of the drive's speeds, counts/s^2 in one of its ramps.
     """
 
-    def __init__(self, objects: ObjectDictionary, motor: Motor, limit_action: LimitAction) -> None:
+    def __init__(
+        self, objects: ObjectDictionary, motor: Motor, limit_action: LimitAction, speed_unit: float
+    ) -> None:
+        self._speed_unit = speed_unit
         self._objects = objects
         self._motor = motor
         self._limit_action = limit_action
@@ -177,9 +182,9 @@ class DriveMotion:
         elif self._mode == CYCLIC_SYNCHRONOUS_POSITION and not self._halted:
             demand.interpolate(period)
         elif self._mode == PROFILE_POSITION and self._target is not None and not self._halted:
-            value = self._objects.value
-            speed = min(value(0x6081), value(0x607F))
-            if demand.approach(self._target, speed, value(0x6083), value(0x6084), period):
+            speed = min(self._speed(0x6081), self._speed(0x607F))
+            ramps = self._speed(0x6083), self._speed(0x6084)
+            if demand.approach(self._target, speed, *ramps, period):
                 self._target, self._next_target = self._next_target, None
         elif self._homing is not None and not self._halted:
             self._home(self._homing, period)
@@ -188,7 +193,7 @@ class DriveMotion:
 
     def brake(self, ramp: int, period: float) -> None:
         """Slow the demand down along the ramp in object `ramp`."""
-        self._demand.brake(float(self._objects.value(ramp)), period)
+        self._demand.brake(self._speed(ramp), period)
 
     def follow(self, period: float) -> bool:
         """Move the motor for `period` [s]; returns whether it is too far off for too long."""
@@ -208,7 +213,7 @@ class DriveMotion:
         put(POSITION, 0, position)
         put(0x6062, 0, demanded)
         put(0x60F4, 0, demanded - position)
-        put(0x606C, 0, round(motor.velocity))
+        put(0x606C, 0, round(motor.velocity / self._speed_unit))
         put(0x6077, 0, 1000 if motor.stalled and demanded != position else 0)
         inputs = _NEGATIVE_SWITCH | _HOME_SWITCH if motor.at_negative_switch else 0
         put(0x60FD, 0, inputs | (_POSITIVE_SWITCH if motor.at_positive_switch else 0))
@@ -228,6 +233,10 @@ class DriveMotion:
         return self._limited * _LIMITED | reached * _REACHED | bit_12 * _BIT_12 | bit_13 * _BIT_13
 
     # ---- inside -------------------------------------------------------------------------------
+
+    def _speed(self, index: int, subindex: int = 0) -> float:
+        """Return an object that holds a speed [counts/s] or a ramp [counts/s^2]."""
+        return self._objects.value(index, subindex) * self._speed_unit
 
     @property
     def _halted(self) -> bool:
@@ -259,9 +268,9 @@ class DriveMotion:
         self._homing = Homing(
             value(0x6098),
             self._motor,
-            speed=value(0x6099, 1),
-            edge_speed=value(0x6099, 2),
-            acceleration=value(0x609A),
+            speed=self._speed(0x6099, 1),
+            edge_speed=self._speed(0x6099, 2),
+            acceleration=self._speed(0x609A),
         )
 
     def _home(self, homing: Homing, period: float) -> None:

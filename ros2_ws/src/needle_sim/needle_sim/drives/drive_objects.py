@@ -26,7 +26,7 @@ _VERSION = b"1.0"
 
 
 def drive_dictionary(
-    name: str, device_type: int, number: int, *, counts_per_unit: float
+    name: str, device_type: int, number: int, *, counts_per_unit: float, rpm: float | None
 ) -> ObjectDictionary:
     """Return the dictionary of one drive.
 
@@ -40,6 +40,8 @@ def drive_dictionary(
         Its serial number.
     counts_per_unit : float
         Sets speeds and ramps after power-up to something slow.
+    rpm : float or None
+        One rpm of the motor [counts/s], for a drive that takes speeds in it; None: counts/s.
     """
     objects = ObjectDictionary()
     add = objects.add
@@ -62,13 +64,12 @@ def drive_dictionary(
         read_write(index, 0, Kind.I16, option)
     both(MODE, 0, Kind.I8)
     in_pdo(0x6061, 0, Kind.I8)
-    in_pdo(0x6062, 0, Kind.I32)
-    in_pdo(POSITION, 0, Kind.I32)
+    for index in (0x6062, POSITION, 0x606C, 0x60F4):
+        in_pdo(index, 0, Kind.I32)
     read_write(0x6065, 0, Kind.U32, slow)
     read_write(0x6066, 0, Kind.U16, 0)
     read_write(0x6067, 0, Kind.U32, 10)
     read_write(0x6068, 0, Kind.U16, 0)
-    in_pdo(0x606C, 0, Kind.I32)
     both(0x6072, 0, Kind.U16, 1000)
     in_pdo(0x6077, 0, Kind.I16)
     both(TARGET_POSITION, 0, Kind.I32)
@@ -78,17 +79,23 @@ def drive_dictionary(
     read_write(0x607D, 2, Kind.I32, _INT32_MAX)
     both(0x607F, 0, Kind.U32, 0xFFFFFFFF)
     both(0x6081, 0, Kind.U32, slow)
-    for index in (0x6083, 0x6084, 0x6085):
+    for index in (0x6083, 0x6084, 0x6085, 0x609A):
         both(index, 0, Kind.U32, 10 * slow)
     both(0x6098, 0, Kind.I8, 0)
     add(0x6099, 0, Kind.U8, 2)
     both(0x6099, 1, Kind.U32, slow)
     both(0x6099, 2, Kind.U32, max(slow // 10, 1))
-    both(0x609A, 0, Kind.U32, 10 * slow)
+    # The codes of CiA 303-2: prefix, numerator, denominator.
+    units = [0x00B5_0000, 0x00B5_0300, 0x00B5_5700]
+    if rpm is not None:
+        units[1:] = 0x00B4_4700, 0x00C0_0300
+        for k, value in enumerate((2, round(60.0 * rpm), 1)):
+            add(0x608F, k, Kind.U8 if k == 0 else Kind.U32, value)
+    for k, code in enumerate(units):
+        add(0x60A8 + k, 0, Kind.U32, code)
     add(0x60C2, 0, Kind.U8, 2)
     read_write(0x60C2, 1, Kind.U8, 20)
     read_write(0x60C2, 2, Kind.I8, -3)
-    in_pdo(0x60F4, 0, Kind.I32)
     in_pdo(0x60FD, 0, Kind.U32)
     add(0x6502, 0, Kind.U32, SUPPORTED_MODES)
     return objects

@@ -58,6 +58,8 @@ class EmulatedDriveSettings:
         For a target beyond the software limits.
     boot_time : float
         From power-up to the boot-up message [s].
+    rpm : float or None
+        One rpm of the motor [counts/s], for a drive that takes speeds in rpm and ramps in rpm/s.
     """
 
     name: str
@@ -66,6 +68,7 @@ class EmulatedDriveSettings:
     motor: MotorSettings
     limit_action: LimitAction
     boot_time: float
+    rpm: float | None = None
 
 
 class EmulatedDrive:
@@ -85,8 +88,10 @@ class EmulatedDrive:
             settings.device_type,
             settings.node_id,
             counts_per_unit=settings.motor.counts_per_unit,
+            rpm=settings.rpm,
         )
-        self._motion = DriveMotion(objects, self.motor, settings.limit_action)
+        speed_unit = settings.rpm or 1.0
+        self._motion = DriveMotion(objects, self.motor, settings.limit_action, speed_unit)
         self.device = CanopenDevice(
             settings.node_id,
             objects,

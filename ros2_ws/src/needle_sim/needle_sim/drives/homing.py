@@ -31,7 +31,7 @@ class Homing:
     motor : Motor
         Whose switches are looked at.
     speed : float
-        Towards the switch [counts/s].
+        Towards the switch [counts/s]; no faster than the motor can.
     edge_speed : float
         Off the switch, whose edge is the home position [counts/s].
     acceleration : float
@@ -42,7 +42,7 @@ class Homing:
         self, method: int, motor: Motor, *, speed: float, edge_speed: float, acceleration: float
     ) -> None:
         self._motor = motor
-        self._speed = speed
+        self._speed = min(speed, motor.max_speed)
         self._edge_speed = edge_speed
         self._acceleration = acceleration
         self._direction = 1.0 if method == POSITIVE_SWITCH else -1.0

@@ -49,6 +49,7 @@ class Motor:
 
     def __init__(self, settings: MotorSettings) -> None:
         self._settings = settings
+        self.max_speed = settings.max_speed
         self.position = settings.start
         self.velocity = 0.0
         self.stalled = False
@@ -78,7 +79,7 @@ class Motor:
         lag = self._settings.lag
         if lag > 0.0 and abs(way) > self._CLOSE:
             way *= -math.expm1(-period / lag)
-        most = self._settings.max_speed * period
+        most = self.max_speed * period
         way = min(max(way, -most), most)
         self.position = demand if way == demand - before else before + way
         if self._has_switches:

@@ -15,6 +15,8 @@ from needle_sim.drives.motor import MotorSettings
 
 # Encoder of the rotation axis: 16 bits a turn, no gear.
 COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
+# Of the insertion axis' screw: its way at a turn of the motor [m].
+_LEAD = 0.001
 _LAST_NODE = 127
 
 
@@ -36,6 +38,9 @@ class DriveEmulatorParameters:
         "-",
         "What a drive does with a target beyond 0x607D once it is homed.",
         choices=tuple(action.value for action in LimitAction),
+    )
+    rpm: bool = fixed_parameter(
+        False, "-", "Both drives take speeds in rpm and ramps in rpm/s, and say so (0x60A9)."
     )
     boot_time: float = fixed_parameter(0.5, "s", "From power-up to the boot-up message.", 0.0, 60.0)
     insertion_node_id: int = fixed_parameter(1, "-", "Of the stepper drive.", 1, _LAST_NODE)
@@ -87,18 +92,21 @@ class DriveEmulatorParameters:
         """The insertion axis: a stepper on a screw, with a limit switch at either end."""
         scale = self.insertion_counts_per_unit
         ends = {"start": self.insertion_start * scale, "travel": self.insertion_travel * scale}
-        return self._drive("insertion", STEPPER, **ends)
+        return self._drive("insertion", STEPPER, _LEAD, **ends)
 
     @property
     def rotation(self) -> EmulatedDriveSettings:
         """The rotation axis: a servo that turns without end."""
-        return self._drive("rotation", SERVO)
+        return self._drive("rotation", SERVO, 2.0 * math.pi)
 
-    def _drive(self, axis: str, device_type: int, **ends: float) -> EmulatedDriveSettings:
+    def _drive(
+        self, axis: str, device_type: int, turn: float, **ends: float
+    ) -> EmulatedDriveSettings:
         scale, node_id, max_speed, lag = (
             getattr(self, f"{axis}_{name}")
             for name in ("counts_per_unit", "node_id", "max_speed", "lag")
         )
         motor = MotorSettings(scale, max_speed * scale, lag, **ends)
         action = LimitAction(self.limit_action)
-        return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time)
+        rpm = scale * turn / 60.0 if self.rpm else None
+        return EmulatedDriveSettings(axis, node_id, device_type, motor, action, self.boot_time, rpm)
