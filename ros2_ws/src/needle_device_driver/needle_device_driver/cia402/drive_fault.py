@@ -5,8 +5,8 @@ from __future__ import annotations
 from needle_device_driver.cia402.cia402 import FAULTS, FOLLOWING_ERROR
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
-from needle_device_driver.cia402.emergency import HEARTBEAT_LOST, describe_error
 from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
+from needle_device_driver.link.emergency import HEARTBEAT_LOST, describe_error
 from needle_device_driver.rules import Rule
 
 Fault = tuple[Rule, str]

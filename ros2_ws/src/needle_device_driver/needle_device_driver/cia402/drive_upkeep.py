@@ -5,7 +5,6 @@ from __future__ import annotations
 from needle_device_driver.cia402.cia402 import FAULTS, DriveCommand, Mode, drive_state
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
-from needle_device_driver.cia402.emergency import describe_error
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.can_link import CanLink
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
