@@ -70,7 +70,8 @@ class Cia402Axis(Axis):
         self, name: str, settings: DriveSettings, link: CanLink, *, period: float, watchdog: float
     ) -> None:
         self.name = name
-        self._settings = settings
+        # As given, and with the units that the drive tells.
+        self._given = self._settings = settings
         self.actuated = settings.actuated
         self._link = link
         self._period = period
@@ -348,8 +349,8 @@ class Cia402Axis(Axis):
             self._homed = False
             self._origin += 1
         self.monitor.begin_set_up()
-        self.missing_optional_objects = set_up(
-            self._link, self.monitor, self._settings, period=self._period, homed=self._homed
+        self._settings, self.missing_optional_objects = set_up(
+            self._link, self.monitor, self._given, period=self._period, homed=self._homed
         )
         self._limits_due = False
         await_start(self._link, self.monitor, self._settings, self._period)
@@ -372,9 +373,9 @@ class Cia402Axis(Axis):
         )
         self._machine.begin_anew(self.monitor.feedback)
         self._velocity = 0.0
-        if self._machine.state in FAULTS and access.has(od.ERROR_CODE):
+        if self._machine.state in FAULTS:
             # A fault from before has sent its message to nobody.
-            self.monitor.emergency = access.read(od.ERROR_CODE) or None
+            self.monitor.emergency = access.ask(od.ERROR_CODE) or None
 
     def _switch_off_now(self) -> bool:
         """Run cycles of its own until the drive is off: nobody else will. Return whether it is."""

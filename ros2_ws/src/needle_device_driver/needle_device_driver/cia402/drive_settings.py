@@ -12,6 +12,7 @@ from needle_device_driver.link import objects as od
 
 # Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.
 HERE = (35, 37)
+INDEX_PULSE = (*range(1, 15), 33, 34)
 SWITCHES = tuple(range(1, 15)) + tuple(range(17, 31))
 HOMING_METHODS = (*SWITCHES, 33, 34, *HERE)
 _Positive = Annotated[float, Bounds(ABOVE_0, math.inf, "SI")]
@@ -43,6 +44,14 @@ class DriveSettings:
         Software limits in the drive, from home.
     tolerance : float
         An axis that moves less in a cycle stands still.
+    unit : str
+        Of the axis: m or rad.
+    travel : float
+        How far from its home the axis may be; homing searches so far and a fifth more.
+    counts_per_turn : float
+        Position counts in a turn of the drive's shaft; 0: as it says, or not known.
+    speed_unit, ramp_unit : float
+        Counts/s in one of the drive's units of speed, counts/s^2 in one of its ramps.
     actuated : bool
         False: a hand moves it, the drive only says where it is.
     """
@@ -60,6 +69,11 @@ class DriveSettings:
     lower: float
     upper: float
     tolerance: _Positive
+    unit: str = "m"
+    travel: float = math.inf
+    counts_per_turn: float = 0.0
+    speed_unit: float = 1.0
+    ramp_unit: float = 1.0
     actuated: bool = True
 
     def __post_init__(self) -> None:
@@ -89,9 +103,16 @@ class DriveSettings:
         """Return the position of a count [m or rad]."""
         return self.direction * counts / self.counts_per_unit
 
-    def magnitude(self, value: float) -> int:
-        """Return a distance, speed or ramp in counts, at least 1: 0 often means "no limit"."""
-        return max(1, round(value * self.counts_per_unit))
+    def magnitude(self, value: float, unit: float = 1.0) -> int:
+        """Return a distance, speed or ramp in counts, or in units of so many counts.
+
+        It is at least 1: 0 often means "no limit".
+        """
+        return max(1, round(value * self.counts_per_unit / unit))
+
+    def told(self, value: float) -> str:
+        """Return a position as messages have it."""
+        return f"{value * 1e3:.4g} mm" if self.unit == "m" else f"{value:.4g} rad"
 
     @property
     def stop_time(self) -> float:

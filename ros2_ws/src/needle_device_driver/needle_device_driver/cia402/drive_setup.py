@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import enum
-
 from needle_device_driver.cia402.cia402 import (
     POWERED,
     SUPPORTS_CYCLIC_POSITION,
@@ -14,6 +12,7 @@ from needle_device_driver.cia402.cia402 import (
 )
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
+from needle_device_driver.cia402.drive_units import read_units
 from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.can_link import CanLink
@@ -25,30 +24,20 @@ PRODUCER_HEARTBEAT_MS = 30
 _SLOWEST_HEARTBEAT_MS = 200
 # In seconds.
 _SWITCH_OFF_WAIT = 1.0
+_MODE_WAIT = 0.5
 
 _LEFT_OUT = "has no {}: check on the rig what it does there (docs/hardware.md)"
 _KEPT = "keeps its own {} (refused {}): check on the rig what it does there (docs/hardware.md)"
-_NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
+NO_INPUTS = "has no digital inputs to map: a retraction ends at 0 only, not at the switch"
 _NO_FOLLOWING_ERROR = (
     "has no following error to map: an axis that is stopped while it is blocked is pulled on by up "
     "to the following error window when it comes free"
 )
 
 
-class _Need(enum.Enum):
-    """Weight of an entry that a drive need not have; one that it has is set."""
-
-    # A drive that refuses keeps its own.
-    WISH = enum.auto()
-    # A rule depends on these: what the drive made of them is read back. Rounded is not clipped.
-    ROUNDED = enum.auto()
-    ROUNDED_DOWN = enum.auto()
-    EXACT = enum.auto()
-
-
 def set_up(
     link: CanLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
-) -> tuple[str, ...]:
+) -> tuple[DriveSettings, tuple[str, ...]]:
     """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
 
     Parameters
@@ -66,6 +55,8 @@ def set_up(
 
     Returns
     -------
+    DriveSettings
+        As given, with the units of the drive.
     tuple of str
         What the drive lacks that it could be without.
 
@@ -85,13 +76,14 @@ def set_up(
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
     # Not while this set-up keeps the loop from its heartbeat.
     access.write(od.CONSUMER_HEARTBEAT, 0)
-    missing: list[str] = []
+    settings, assumed = read_units(access, settings)
+    missing = [assumed] if assumed else []
     if settings.actuated:
         missing += _set_up_motion(link, access, settings, period)
         write_limits(access, settings, homed=homed)
         map_pdo(access, node, od.COMMAND)
         map_pdo(access, node, od.SET_POINT)
-    missing += _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, _NO_INPUTS)
+    missing += _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, NO_INPUTS)
     if settings.actuated:
         missing += _map_full(access, node, od.POSITION, od.POSITION_ALONE, _NO_FOLLOWING_ERROR)
     else:
@@ -100,7 +92,7 @@ def set_up(
     access.offer(od.CYCLE_PERIOD, round(period * 1e6))
     _write_heartbeat(access)
     link.send(od.NMT, bytes([od.NMT_START, node]))
-    return tuple(missing)
+    return settings, tuple(missing)
 
 
 def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> None:
@@ -120,10 +112,12 @@ def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) 
 
 
 def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> None:
-    """Set the speeds of a homing; `speed` in unit/s."""
-    access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed))
+    """Set the speeds of a homing; `speed` in unit/s, at least one of the drive's own units."""
+    if speed * settings.counts_per_unit < settings.speed_unit:
+        raise DriveError(f"homing at {speed:g}/s is less than one of the drive's units of speed")
+    access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
     # Slow on the edge that counts.
-    access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0))
+    access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0, settings.speed_unit))
 
 
 def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
@@ -134,39 +128,41 @@ def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
 def _set_up_motion(
     link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
 ) -> list[str]:
-    listed = _lists_modes(access, settings.node_id)
     _switch_off(link, access, settings)
-    if not listed:
-        # It refuses to be in a mode that it lacks.
-        for mode in (Mode.HOMING, Mode.CYCLIC_SYNCHRONOUS_POSITION):
-            access.write(od.MODE_OF_OPERATION, mode)
+    _check_modes(link, access, settings.node_id)
     # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
     access.write_checked(od.QUICK_STOP_OPTION, 6)
     # The node keeps its state: whether it exchanges process data tells a reboot.
     access.offer(od.ERROR_BEHAVIOUR, 1)
     _write_homing_method(access, settings.homing_method)
-    magnitude = settings.magnitude
-    wanted = [
+    window = settings.magnitude(settings.following_error)
+    speed = settings.magnitude(settings.speed, settings.speed_unit)
+    ramp = settings.magnitude(settings.acceleration, settings.ramp_unit)
+    stop_ramp = settings.magnitude(settings.quick_stop_deceleration, settings.ramp_unit)
+    # Entries that a drive need not have. Of those that a rule depends on: the least and the most
+    # that the drive may make of them, for rounded is not clipped.
+    wanted: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
         # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
-        (od.SHUTDOWN_OPTION, 1, _Need.WISH),
-        (od.DISABLE_OPTION, 1, _Need.WISH),
-        (od.FAULT_REACTION_OPTION, 2, _Need.EXACT),
-        (od.ABORT_CONNECTION_OPTION, 1, _Need.EXACT),
-        (od.FOLLOWING_WINDOW, magnitude(settings.following_error), _Need.ROUNDED_DOWN),
-        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3), _Need.WISH),
-        (od.HOME_OFFSET, 0, _Need.EXACT),
-        (od.MAX_PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
-        (od.PROFILE_VELOCITY, magnitude(settings.speed), _Need.WISH),
-        (od.PROFILE_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
-        (od.PROFILE_DECELERATION, magnitude(settings.acceleration), _Need.WISH),
-        (od.HOMING_ACCELERATION, magnitude(settings.acceleration), _Need.WISH),
-        (od.QUICK_STOP_DECELERATION, magnitude(settings.quick_stop_deceleration), _Need.ROUNDED),
-        (od.INTERPOLATION_PERIOD, round(period * 1e3), _Need.EXACT),
-        (od.INTERPOLATION_EXPONENT, -3, _Need.EXACT),
+        (od.SHUTDOWN_OPTION, 1, None),
+        (od.DISABLE_OPTION, 1, None),
+        (od.FAULT_REACTION_OPTION, 2, (2, 2)),
+        (od.ABORT_CONNECTION_OPTION, 1, (1, 1)),
+        (od.FOLLOWING_WINDOW, window, (window // 2 + 1, window)),
+        (od.FOLLOWING_TIMEOUT, round(settings.following_error_time * 1e3), None),
+        (od.HOME_OFFSET, 0, (0, 0)),
+        (od.MAX_PROFILE_VELOCITY, speed, None),
+        (od.PROFILE_VELOCITY, speed, None),
+        (od.PROFILE_ACCELERATION, ramp, None),
+        (od.PROFILE_DECELERATION, ramp, None),
+        (od.HOMING_ACCELERATION, ramp, None),
+        (od.QUICK_STOP_DECELERATION, stop_ramp, (stop_ramp // 2 + 1, 2 * stop_ramp)),
+        (od.INTERPOLATION_PERIOD, round(period * 1e3), (round(period * 1e3),) * 2),
+        (od.INTERPOLATION_EXPONENT, -3, (-3, -3)),
     ]
     if settings.max_torque > 0.0:
-        wanted.append((od.MAX_TORQUE, round(settings.max_torque * 1e3), _Need.ROUNDED))
-    missing = (_set(access, entry, value, need) for entry, value, need in wanted)
+        torque = round(settings.max_torque * 1e3)
+        wanted.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
+    missing = (_set(access, entry, value, taken) for entry, value, taken in wanted)
     return [text for text in missing if text]
 
 
@@ -180,38 +176,44 @@ def _write_heartbeat(access: ObjectAccess) -> None:
             raise
 
 
-def _lists_modes(access: ObjectAccess, node: int) -> bool:
-    """Return whether a drive says which modes it has; raises where a needed one is not there."""
-    try:
-        modes = access.read(od.SUPPORTED_MODES)
-    except DriveRefusalError as error:
-        if error.object_is_missing:
-            return False
-        raise
-    for bit, name in (
-        (SUPPORTS_CYCLIC_POSITION, "cyclic synchronous position"),
-        (SUPPORTS_HOMING, "homing"),
-    ):
-        if not modes & bit:
-            raise DriveError(f"node {node} has no {name} mode (0x6502 = 0x{modes:08X})")
-    return True
+def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> None:
+    """Refuse a drive that lacks a mode; it is off.
+
+    A drive that lists no modes (0x6502) is told each. So is one that does not list cyclic
+    synchronous position: some have it all the same.
+    """
+    listed = access.ask(od.SUPPORTED_MODES)
+    if listed is not None and not listed & SUPPORTS_HOMING:
+        raise DriveError(f"node {node} has no homing mode (0x6502 = 0x{listed:08X})")
+    if listed is None:
+        _try_mode(link, access, node, Mode.HOMING)
+    if listed is None or not listed & SUPPORTS_CYCLIC_POSITION:
+        _try_mode(link, access, node, Mode.CYCLIC_SYNCHRONOUS_POSITION)
 
 
-def _set(access: ObjectAccess, entry: od.Entry, value: int, need: _Need) -> str:
-    """Write an entry as far as it is needed; return what the drive lacks."""
+def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> None:
+    """Refuse a drive that refuses to be in a mode, or does not say that it is."""
+    access.write(od.MODE_OF_OPERATION, mode)
+    until = link.clock() + _MODE_WAIT
+    while (shown := access.read(od.MODE_DISPLAY)) != mode:
+        if link.clock() > until:
+            raise DriveError(
+                f"node {node} has no {mode.name.lower().replace('_', ' ')} mode "
+                f"(0x6060 = {mode}, 0x6061 = {shown})"
+            )
+
+
+def _set(access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, int] | None) -> str:
+    """Write an entry; return what the drive lacks. One that no rule needs it may refuse."""
     try:
-        if need is _Need.EXACT:
-            access.write_checked(entry, value)
-        elif need is _Need.ROUNDED:
-            access.write_checked(entry, value, at_least=value // 2 + 1, at_most=2 * value)
-        elif need is _Need.ROUNDED_DOWN:
-            access.write_checked(entry, value, at_least=value // 2 + 1)
-        else:
+        if taken is None:
             access.write(entry, value)
+        else:
+            access.write_checked(entry, value, taken=taken)
     except DriveRefusalError as error:
         if error.object_is_missing:
             return _LEFT_OUT.format(entry)
-        if need is not _Need.WISH:
+        if taken is not None:
             raise
         return _KEPT.format(entry, value)
     return ""
@@ -245,11 +247,11 @@ def _map_full(
 ) -> list[str]:
     """Map a PDO with its last entry where the drive can; return what it lacks."""
     try:
-        if access.has(full.entries[-1]):
+        if access.ask(full.entries[-1]) is not None:
             map_pdo(access, node, full)
             return []
     except DriveRefusalError:
-        # Either the entry cannot be read or mapped, or the next attempt tells what else it is.
+        # Either the entry cannot be mapped, or the next attempt tells what else it is.
         pass
     map_pdo(access, node, without)
     return [missing]

@@ -7,6 +7,7 @@ from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.emergency import describe_error
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 
 # In seconds.
@@ -100,7 +101,7 @@ def reset_fault(link: CanLink, settings: DriveSettings) -> None:
     until = link.clock() + _FAULT_RESET_WAIT
     while drive_state(access.read(od.STATUSWORD)) in FAULTS:
         if link.clock() > until:
-            has_code = access.has(od.ERROR_CODE)
-            why = f": {describe_error(access.read(od.ERROR_CODE))}" if has_code else ""
+            code = access.ask(od.ERROR_CODE)
+            why = "" if code is None else f": {describe_error(code)}"
             raise DriveError(f"the drive does not leave its fault{why}")
     order(DriveCommand.DISABLE_VOLTAGE)

@@ -75,6 +75,16 @@ class ObjectAccess:
         except (canopen.SdoAbortedError, canopen.SdoCommunicationError, ValueError) as error:
             raise self._error("read", entry, error) from error
 
+    def ask(self, entry: Entry) -> int | None:
+        """Return an entry's value; None where the drive does not have or tell it.
+
+        Raises as `read`, but for a refusal.
+        """
+        try:
+            return self.read(entry)
+        except DriveRefusalError:
+            return None
+
     def write(self, entry: Entry, value: int, *, variable: bool = False) -> None:
         """Write an entry; raises as `read`.
 
@@ -97,8 +107,7 @@ class ObjectAccess:
         entry: Entry,
         value: int,
         *,
-        at_least: int | None = None,
-        at_most: int | None = None,
+        taken: tuple[int, int] | None = None,
         variable: bool = False,
     ) -> None:
         """Write an entry that a safety rule depends on, and read it back; raises as `read`.
@@ -109,8 +118,8 @@ class ObjectAccess:
             Where.
         value : int
             What it shall be.
-        at_least, at_most : int, optional
-            What a drive that rounds may make of it; otherwise nothing else.
+        taken : tuple of int, optional
+            The least and the most that a drive which rounds may make of it; otherwise nothing else.
         variable : bool
             As `write` has it.
 
@@ -121,8 +130,7 @@ class ObjectAccess:
         """
         self.write(entry, value, variable=variable)
         got = self.read(entry)
-        lower = value if at_least is None else at_least
-        upper = value if at_most is None else at_most
+        lower, upper = taken or (value, value)
         if not lower <= got <= upper:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
@@ -130,16 +138,6 @@ class ObjectAccess:
         """Write an entry that is good to have; a drive that refuses goes without."""
         with contextlib.suppress(DriveRefusalError):
             self.write(entry, value)
-
-    def has(self, entry: Entry) -> bool:
-        """Return whether the drive has an entry; raises as `read`."""
-        try:
-            self.read(entry)
-        except DriveRefusalError as error:
-            if error.object_is_missing:
-                return False
-            raise
-        return True
 
     def _upload(self, entry: Entry) -> bytes:
         self._link.beat()

@@ -160,6 +160,9 @@ def _axis(
         "counts_per_unit": fixed_parameter(
             counts_per_unit, f"counts/{unit}", "Position counts of the drive.", 1.0, 1e12
         ),
+        "counts_per_turn": fixed_parameter(
+            0.0, "counts", "In a turn, of a drive in rpm; 0: as it says (0x608F).", 0.0, 1e9
+        ),
         "reverse": fixed_parameter(False, "-", "Whether the drive counts the other way."),
         "acceleration": fixed_parameter(acceleration, ramp, "Ramp of homing.", 1e-4, 1e4),
         "quick_stop_deceleration": fixed_parameter(quick_stop, ramp, "Ramp of a stop.", 1e-4, 1e4),

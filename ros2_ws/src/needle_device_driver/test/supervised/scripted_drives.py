@@ -29,6 +29,10 @@ class ScriptedDrive:
             (0x1000, 0): (402).to_bytes(4, "little"),
             (0x6502, 0): (0x000000A1).to_bytes(4, "little"),
             (0x603F, 0): b"\x00\x00",
+            # Counts, counts/s, counts/s^2.
+            (0x60A8, 0): bytes.fromhex("0000b500"),
+            (0x60A9, 0): bytes.fromhex("0003b500"),
+            (0x60AA, 0): bytes.fromhex("0057b500"),
         }
         for number in range(4):
             # As they come: two are on, the first told at each change; remote frames are not had.
@@ -50,6 +54,8 @@ class ScriptedDrive:
         self.held_back: list[tuple[int, list[tuple[int, bytes]]]] = []
         self.state = "disabled"
         self.mode = 0
+        # What it takes by SDO.
+        self.modes = {6, 8}
         self.inputs = 0
         self.status_size = 7
         self.place_size = 8
@@ -200,6 +206,8 @@ class ScriptedDrive:
             self.objects[index, sub] = self.stores(index, data[4 : 4 + size])
             if index == 0x6040 and not (self.ignores_sdo_orders and self.nmt == 0x05):
                 self.command(int.from_bytes(data[4:6], "little"))
+            if index == 0x6060 and data[4] in self.modes:
+                self.mode = data[4]
             self.say(0x580, b"\x60" + head + bytes(4))
 
 

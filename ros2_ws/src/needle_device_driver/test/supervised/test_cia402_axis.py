@@ -159,6 +159,7 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
     drive_bench: DriveBench, change: dict[tuple[int, int], bytes], text: str
 ) -> None:
     drive_bench.rotation.objects |= change
+    drive_bench.rotation.modes = {6}
     reply = drive_bench.supervisor.configure(drive_bench.clock())
     assert not reply.success
     assert text in reply.message

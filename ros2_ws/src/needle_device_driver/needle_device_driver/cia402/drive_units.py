@@ -1,0 +1,102 @@
+"""Units in which a drive takes its speeds and ramps (CiA 402-3, codes of CiA 303-2)."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
+from needle_device_driver.link import objects as od
+from needle_device_driver.link.object_access import DriveError, ObjectAccess
+
+# Numerators and denominators; what has no dimension is counted.
+_NUMERATORS = {0x00: "counts", 0x01: "m", 0x10: "rad", 0x41: "deg", 0xB4: "turns", 0xB5: "counts"}
+_DENOMINATORS = {0x00: "", 0x03: "/s", 0x47: "/min", 0x57: "/s^2"}
+_TURNED = {(0xB4, 0x47): "rpm", (0xC0, 0x03): "rpm/s"}
+# Of each object what it is about, and the units that are taken.
+_TAKEN = {
+    od.POSITION_UNIT: ("positions", "counts"),
+    od.SPEED_UNIT: ("speeds", "counts/s", "rpm"),
+    od.RAMP_UNIT: ("ramps", "counts/s^2", "rpm/s"),
+}
+
+
+def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSettings, str]:
+    """Return the settings of a drive with the units that it tells in 0x60A9 and 0x60AA.
+
+    Parameters
+    ----------
+    access : ObjectAccess
+        The drive.
+    settings : DriveSettings
+        Its settings so far; a `counts_per_turn` of theirs goes before 0x608F and 0x6091.
+
+    Returns
+    -------
+    DriveSettings
+        With units of counts/s or rpm, with any prefix; counts/s where the drive does not tell.
+    str
+        What the drive does not tell, and what is assumed in its place; empty: nothing.
+
+    Raises
+    ------
+    DriveError
+        If positions are not in counts, a unit is none of these, or speeds in rpm cannot be counted.
+    LinkError
+        If the link is lost.
+    """
+    _counts_in(access, settings, od.POSITION_UNIT)
+    if not settings.actuated:
+        return settings, ""
+    speed = _counts_in(access, settings, od.SPEED_UNIT)
+    ramp = _counts_in(access, settings, od.RAMP_UNIT)
+    if speed is None and (factor := _ratio(access, od.SPEED_FACTOR)) not in (None, 1.0):
+        raise DriveError(f"the drive scales speeds by {factor:g} (0x6096), wanted counts/s")
+    ramps = "counts/s^2" if speed is None else "the unit of its speeds per second"
+    untold = ["counts/s (0x60A9)"] * (speed is None) + [f"{ramps} (0x60AA)"] * (ramp is None)
+    assumed = (
+        f"does not tell its units; assumed: {', '.join(untold)}; "
+        "home it without a needle first (docs/hardware.md)"
+    )
+    speed = speed or 1.0
+    # A homing to an index pulse is bounded by a turn, too.
+    turn = _counts_per_turn(access, settings) if settings.homing_method in INDEX_PULSE else 0.0
+    settings = dataclasses.replace(
+        settings, counts_per_turn=turn, speed_unit=speed, ramp_unit=ramp or speed
+    )
+    return settings, assumed if untold else ""
+
+
+def _counts_in(access: ObjectAccess, settings: DriveSettings, entry: od.Entry) -> float | None:
+    """Return the counts, per second or its square, in one unit; None: the drive does not tell."""
+    code = access.ask(entry)
+    if not code:
+        return None
+    # The upper byte is a power of ten, with a sign.
+    power, above, below = (code >> 24 ^ 0x80) - 0x80, code >> 16 & 0xFF, code >> 8 & 0xFF
+    unit = _TURNED.get((above, below)) or (
+        _NUMERATORS.get(above, f"unit 0x{above:02X}")
+        + _DENOMINATORS.get(below, f" per unit 0x{below:02X}")
+    )
+    what, *wanted = _TAKEN[entry]
+    turns = unit in _TURNED.values()
+    turn = _counts_per_turn(access, settings) if turns else 60.0
+    if not turn:
+        wanted = wanted[:1]
+    if unit not in wanted or (power and entry is od.POSITION_UNIT):
+        told = (f"10^{power} " if power else "") + f"{unit} (0x{entry.index:04X} = 0x{code:08X})"
+        way_out = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
+        taken = " or ".join(wanted)
+        raise DriveError(f"the drive counts {what} in {told}, wanted {taken}{way_out}")
+    return 10.0**power * turn / 60.0
+
+
+def _counts_per_turn(access: ObjectAccess, settings: DriveSettings) -> float:
+    """Return the counts in a turn of the drive's shaft; 0: not known."""
+    return settings.counts_per_turn or (
+        (_ratio(access, od.ENCODER_RESOLUTION) or 0.0) * (_ratio(access, od.GEAR_RATIO) or 1.0)
+    )
+
+
+def _ratio(access: ObjectAccess, entries: tuple[od.Entry, od.Entry]) -> float | None:
+    above, below = map(access.ask, entries)
+    return above / below if above and below else None
