@@ -40,6 +40,7 @@ class Rule(enum.Enum):
     ONE_FAULT_STOPS_BOTH = "one_fault_stops_both"
     INNER_LIMIT_SWITCH = "inner_limit_switch"
     REPLY_AGE = "reply_age"
+    AXIS_SPEED = "axis_speed"
     SETTLING_TIME = "settling_time"
     LINK_LOSS = "link_loss"
     ONE_MASTER = "one_master"

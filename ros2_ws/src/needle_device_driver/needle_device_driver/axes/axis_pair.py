@@ -39,7 +39,21 @@ class PairSnapshot:
     @property
     def let_go(self) -> str:
         """Names of the axes that are switched off while stopped; empty: none."""
-        return " and ".join(name for name, at in self._by_name.items() if at.let_go)
+        return " and ".join(name for name, at in self.by_name.items() if at.let_go)
+
+    def unstopped(self, oldest: float) -> str:
+        """Return which axes were stopped and switched off and are not, or do not say so.
+
+        Parameters
+        ----------
+        oldest : float
+            Steady time from which on a reply says so [s].
+        """
+        return "; ".join(
+            f"{name} axis {at.unstopped or 'silent'}"
+            for name, at in self.by_name.items()
+            if at.unstopped or at.time < oldest
+        )
 
     def age(self, now: float) -> float:
         """Return the age of the older reply [s]."""
@@ -49,7 +63,7 @@ class PairSnapshot:
     def fault(self) -> str:
         """The faults of both axes; empty: none."""
         return "; ".join(
-            f"{name} axis: {at.fault}" for name, at in self._by_name.items() if at.fault
+            f"{name} axis: {at.fault}" for name, at in self.by_name.items() if at.fault
         )
 
     @property
@@ -59,7 +73,8 @@ class PairSnapshot:
         return axis.fault_rule
 
     @property
-    def _by_name(self) -> dict[str, AxisSnapshot]:
+    def by_name(self) -> dict[str, AxisSnapshot]:
+        """Insertion and rotation, by name."""
         return {"insertion": self.insertion, "rotation": self.rotation}
 
 

@@ -6,6 +6,7 @@ import contextlib
 from collections.abc import Iterator
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
     POWERED,
@@ -17,8 +18,8 @@ from needle_device_driver.cia402.cia402 import (
 from needle_device_driver.cia402.drive_fault import Fault, drive_fault
 from needle_device_driver.cia402.drive_machine import LONGEST_REST, DriveMachine
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
-from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
-from needle_device_driver.cia402.drive_setup import set_up, write_homing, write_limits
+from needle_device_driver.cia402.drive_settings import DriveSettings
+from needle_device_driver.cia402.drive_setup import NO_INPUTS, set_up, write_homing, write_limits
 from needle_device_driver.cia402.drive_upkeep import (
     arm_watchdog,
     await_operational,
@@ -80,6 +81,7 @@ class Cia402Axis(Axis):
         self.missing_optional_objects: tuple[str, ...] = ()
         rest, stop_time = settings.magnitude(settings.tolerance), settings.stop_time
         self._machine = DriveMachine(rest, period, stop_time, self.monitor.feedback)
+        self._speed = SpeedWatch(settings, period)
         self._homing: HomingRun | None = None
         self._configured = False
         self._opening = 0
@@ -137,10 +139,8 @@ class Cia402Axis(Axis):
             write_limits(self._access, self._settings, homed=False)
             write_homing(self._access, self._settings, speed)
         self._machine.mode = Mode.HOMING
-        self._homing = HomingRun(
-            here=self._settings.homing_method in HERE,
-            tolerance_counts=self._settings.magnitude(self._settings.tolerance),
-        )
+        switches = NO_INPUTS not in self.missing_optional_objects
+        self._homing = HomingRun(self._settings, speed, switches=switches)
 
     def start_move(self, target: float, speed: float) -> None:
         """Set the set-point of the next cycle; `speed` follows from the cycle's length."""
@@ -166,6 +166,7 @@ class Cia402Axis(Axis):
                 Rule.LOOK_AHEAD,
             )
         self._machine.target = counts
+        self._speed.command(step / settings.counts_per_unit / self._period)
 
     def stop(self) -> None:
         """Order a quick stop now, without waiting for the next cycle."""
@@ -278,7 +279,10 @@ class Cia402Axis(Axis):
             return
         self._machine.update(at)
         if self._homing is not None:
-            self._homing.update(at)
+            self._speed.command(self._homing.speed)
+        plausible = self._speed.judge(before, at, powered=self._machine.state in POWERED)
+        if self._homing is not None:
+            self._homing.update(at, at.position - before.position if plausible else 0)
             if self._homing.step is HomingStep.DONE:
                 # The drive's own limits count from home: now that it has one, and once it is off.
                 self._limits_due = True
@@ -324,7 +328,8 @@ class Cia402Axis(Axis):
             return Rule.LINK_LOSS, self._link.lost
         if self._link.other_master:
             return Rule.ONE_MASTER, self._link.other_master
-        return drive_fault(self.monitor, self._machine, self._homing, actuated=self.actuated)
+        watched = self.monitor, self._machine, self._speed, self._homing
+        return drive_fault(*watched, actuated=self.actuated)
 
     def _refuse_fault(self) -> None:
         if not self._configured:
@@ -372,6 +377,7 @@ class Cia402Axis(Axis):
             access.read(od.POSITION_ACTUAL),
         )
         self._machine.begin_anew(self.monitor.feedback)
+        self._speed.forget()
         self._velocity = 0.0
         if self._machine.state in FAULTS:
             # A fault from before has sent its message to nobody.

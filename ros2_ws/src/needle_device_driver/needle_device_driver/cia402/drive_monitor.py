@@ -43,6 +43,10 @@ class Feedback:
     following_error : int
         How far the axis is short of where its drive wants it [counts]; 0 of a drive that does not
         tell.
+    syncs : int
+        Counts the SYNCs that were sent until it came.
+    time : float
+        When it came, steady clock [s].
     """
 
     number: int
@@ -51,6 +55,8 @@ class Feedback:
     inputs: int
     position: int
     following_error: int
+    syncs: int = 0
+    time: float = 0.0
 
 
 class DriveMonitor:
@@ -79,7 +85,8 @@ class DriveMonitor:
         self._statusword = self._mode = self._inputs = self._position = 0
         self._following_error = 0
         self._answers: set[int] = set()
-        self._syncs = 0
+        self._syncs = self._all_syncs = 0
+        self._taken = 0, 0.0
         self._received = dict.fromkeys(_ANSWER, 0)
         self._fresh_time = -math.inf
         self._heartbeat_time = -math.inf
@@ -108,6 +115,7 @@ class DriveMonitor:
                 self._inputs,
                 self._position,
                 self._following_error,
+                *self._taken,
             )
 
     @property
@@ -152,6 +160,7 @@ class DriveMonitor:
             if self._syncs >= _FORGIVEN_AFTER and not self._is_behind():
                 self._count_anew()
             self._syncs += 1
+            self._all_syncs += 1
 
     def begin_set_up(self) -> None:
         """Forget what was; the node is set up from the start."""
@@ -184,6 +193,7 @@ class DriveMonitor:
             self._number += 1
             self._outdated = True
             self._fresh_time = self._link.clock()
+            self._taken = self._all_syncs, self._fresh_time
 
     def await_operational(self, before: int, timeout: float) -> bool:
         """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
@@ -216,6 +226,7 @@ class DriveMonitor:
             self._number += not self._outdated
             self._outdated = False
             self._fresh_time = time
+            self._taken = self._all_syncs, time
 
     def _take(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
         """Take a frame; one that is not as its kind must be is counted by the link."""

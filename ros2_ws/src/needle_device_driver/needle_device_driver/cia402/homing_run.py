@@ -13,10 +13,16 @@ from needle_device_driver.cia402.cia402 import (
     drive_state,
 )
 from needle_device_driver.cia402.drive_monitor import Feedback
+from needle_device_driver.cia402.drive_settings import HERE, INDEX_PULSE, DriveSettings
+from needle_device_driver.link import objects as od
 
 # A homing where the axis stands ends within a cycle; so many later its end is believed although
 # the drive never took the end of the one before back.
 _INSTANT = 5
+# Of its travel an axis looks for its home over so much.
+_SEARCH = 1.2
+# Methods that end at a limit switch: where it lies, and its bit of the digital inputs.
+_TOWARDS = {17: (-1, od.NEGATIVE_LIMIT_SWITCH), 18: (1, od.POSITIVE_LIMIT_SWITCH)}
 
 
 class HomingStep(enum.Enum):
@@ -33,21 +39,37 @@ class HomingRun:
 
     Parameters
     ----------
-    here : bool
-        Whether the drive takes where it stands as home, without moving.
-    tolerance_counts : int
-        How far from 0 it may then say that it is.
+    settings : DriveSettings
+        The drive: its method, and how far the axis may go.
+    speed : float
+        Towards the switch [m/s or rad/s].
+    switches : bool
+        Whether the drive tells its limit switches.
+
+    Attributes
+    ----------
+    step : HomingStep
+        How far it is.
+    trouble : str
+        Why it must not go on; empty: it may.
     """
 
-    def __init__(self, *, here: bool, tolerance_counts: int) -> None:
-        self._here = here
-        self._tolerance_counts = tolerance_counts
+    def __init__(self, settings: DriveSettings, speed: float, *, switches: bool) -> None:
+        self._settings = settings
+        self.speed = speed
+        method = settings.homing_method
+        # An index pulse comes within a turn beyond the switch.
+        turn = (method in INDEX_PULSE) * settings.counts_per_turn
+        self._longest = _SEARCH * settings.travel + turn / settings.counts_per_unit
+        self._towards, self._switch = _TOWARDS.get(method * switches, (0, 0))
+        self._way = 0
         self._cycles = 0
+        self.trouble = ""
         self._stale = False
         self.step = HomingStep.PREPARING
 
-    def update(self, at: Feedback) -> None:
-        """Take what the drive says now."""
+    def update(self, at: Feedback, way: int) -> None:
+        """Take what the drive says now, and its way since the last answer [counts]."""
         attained = bool(at.statusword & HOMING_ATTAINED)
         ended = attained and bool(at.statusword & TARGET_REACHED)
         if self.step is HomingStep.PREPARING:
@@ -63,13 +85,34 @@ class HomingRun:
         self._cycles += 1
         if at.statusword & HOMING_ERROR:
             self.step = HomingStep.FAILED
+            self.trouble = "reports that homing failed"
             return
+        self._watch_way(at, way)
         # Some drives keep the first bit for good; the second goes with each homing's begin.
         self._stale = self._stale and ended
         if self._stale:
-            near = abs(at.position) <= self._tolerance_counts
-            done = self._here and near and self._cycles >= _INSTANT
+            near = abs(at.position) <= self._settings.magnitude(self._settings.tolerance)
+            here = self._settings.homing_method in HERE
+            done = here and near and self._cycles >= _INSTANT
         else:
             done = ended
         if done:
             self.step = HomingStep.DONE
+
+    def _watch_way(self, at: Feedback, way: int) -> None:
+        """Bound the way from the begin, in the direction of the method until its switch is hit."""
+        settings = self._settings
+        self._way += way
+        if at.inputs & self._switch:
+            self._towards = 0
+        gone = abs(self._way) / settings.counts_per_unit
+        if gone > self._longest:
+            self.trouble = (
+                f"went {settings.told(gone)} without finding its home, at most "
+                f"{settings.told(self._longest)}"
+            )
+        elif self._way * self._towards < 0 and gone > settings.following_error:
+            self.trouble = (
+                f"went {settings.told(gone)} away from the limit switch of homing method "
+                f"{settings.homing_method}: direction of the motor, of the switches?"
+            )

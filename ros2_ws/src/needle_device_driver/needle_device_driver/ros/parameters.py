@@ -132,14 +132,11 @@ class _RigParameters:
         margin = _LIMIT_MARGIN * values["following_error"]
         if axis == "insertion":
             values["actuated"] = self.insertion_drive == "motor"
-            values |= {"speed": limits.max_speed, "lower": -margin}
-            values["upper"] = limits.max_depth + margin
+            values |= {"speed": limits.max_speed, "travel": limits.max_depth, "lower": -margin}
         else:
-            values |= {"speed": limits.max_rotation_rate}
-            values |= {
-                "lower": -limits.max_rotation - margin,
-                "upper": limits.max_rotation + margin,
-            }
+            values |= {"speed": limits.max_rotation_rate, "travel": limits.max_rotation}
+            values |= {"unit": "rad", "lower": -limits.max_rotation - margin}
+        values["upper"] = values["travel"] + margin
         return DriveSettings(**values)
 
 

@@ -14,6 +14,8 @@ from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, 
 from needle_device_driver.supervisor.retraction_bound import RetractionBound
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
 
+# Of the time on a switch so much counts: its edge is looked for at a quarter of the speed.
+_OFF_SWITCH = 0.25
 _WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
@@ -63,7 +65,7 @@ class DeviceCore:
         self._on_stop = on_stop
         self._retraction_bound = RetractionBound(limits.max_depth)
         self._run: MotionRun | None = None
-        self._homing_time = 0.0
+        self._homing_times = [0.0, 0.0]
         self._seen_powered = False
         self._pushed_too_fast = False
         self._let_go = ""
@@ -250,7 +252,7 @@ class DeviceCore:
         except AxisError as refusal:
             self.fail(str(refusal), refusal.rule)
             return str(refusal)
-        self._homing_time = 0.0
+        self._homing_times = [0.0, 0.0]
         self.activity = Activity.HOMING
         self.go(Trigger.HOMING_START, "homing")
         return ""
@@ -301,10 +303,13 @@ class DeviceCore:
 
     def drive_homing(self, period: float) -> None:
         """Let `period` [s] of a homing go by."""
-        self._homing_time += period
-        longest = self._limits.max_homing_time
-        if self._homing_time > longest:
-            self.fail(f"no home switch within {longest:.0f} s", Rule.HOMING_TIME)
+        assert self.snapshot is not None
+        longest = self._limits.longest_homings
+        for k, (name, at) in enumerate(self.snapshot.by_name.items()):
+            self._homing_times[k] += period * at.moving * (_OFF_SWITCH if at.at_home_switch else 1)
+            if self._homing_times[k] > longest[k]:
+                text = f"no home switch of the {name} axis in {longest[k]:.0f} s"
+                self.fail(text, Rule.HOMING_TIME)
 
     def drive(self, period: float, speed_scale: float, now: float) -> None:
         """Order the set-points of the next `period` [s] of what is under way."""

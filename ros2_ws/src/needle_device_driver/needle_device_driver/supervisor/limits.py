@@ -134,10 +134,11 @@ class SafetyLimits:
         return self.max_turns * 2.0 * math.pi
 
     @property
-    def max_homing_time(self) -> float:
-        """Homing over the whole travel of both axes, and half as much again [s]."""
-        return 1.5 * max(
-            self.max_depth / self.homing_speed, self.max_rotation / self.homing_rotation_rate
+    def longest_homings(self) -> tuple[float, float]:
+        """Homing of each axis over its whole travel, and half as much again [s]."""
+        return (
+            1.5 * self.max_depth / self.homing_speed,
+            1.5 * self.max_rotation / self.homing_rotation_rate,
         )
 
 

@@ -178,11 +178,37 @@ def test_homing_needle_out_only_when_disabled_and_can_be_stopped(bench: Bench) -
     assert not bench.supervisor.home(bench.now).success
 
 
-def test_homing_time_is_bounded(make_bench: type[Bench]) -> None:
-    bench = make_bench(max_depth=0.002, max_turns=0.1)
-    bench.insertion.position = 0.001
-    bench.insertion.stuck = True
+@pytest.mark.parametrize(
+    ("which", "longest"), [("insertion", 1.5 * 0.002 / 0.002), ("rotation", 1.5 * 0.6283 / 1.0)]
+)
+def test_homing_time_is_bounded_by_each_axis_own_travel(
+    make_bench: type[Bench], which: str, longest: float
+) -> None:
+    # The other axis has a long way, and may take its time.
+    bench = make_bench(
+        max_depth=0.002 if which == "insertion" else 0.2,
+        max_turns=0.1 if which == "rotation" else 10.0,
+    )
+    axis = getattr(bench, which)
+    axis.position = 0.001
+    axis.stuck = True
     bench.home()
-    bench.cycle(100)
+    start = bench.now
+    while in_state(bench, State.MOVING):
+        assert bench.now - start < 10.0
+        bench.cycle(1)
+    assert bench.now - start == pytest.approx(longest, abs=2.1 * bench.period)
     assert in_state(bench, State.FAULT)
     assert bench.last_rule is Rule.HOMING_TIME
+    assert f"no home switch of the {which} axis in" in bench.status.fault
+
+
+def test_homing_time_on_the_switch_counts_a_quarter(make_bench: type[Bench]) -> None:
+    bench = make_bench(max_depth=0.002, max_turns=0.1)
+    bench.insertion.position, bench.insertion.switch = 0.001, True
+    bench.insertion.stuck = True
+    bench.home()
+    bench.cycle(290)
+    assert in_state(bench, State.MOVING)
+    bench.cycle(20)
+    assert in_state(bench, State.FAULT)
