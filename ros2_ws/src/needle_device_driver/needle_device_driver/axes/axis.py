@@ -61,6 +61,8 @@ class AxisSnapshot:
     let_go : bool
         Whether a stopped axis is switched off until the next order to move, since it was blocked
         short of where its controller wants it.
+    unstopped : str
+        State of an axis that should have stopped and switched off long ago; empty: it has.
     origin : int
         Changes whenever `position` begins to count from elsewhere.
     """
@@ -79,6 +81,7 @@ class AxisSnapshot:
     ready: bool = True
     answered: bool = True
     let_go: bool = False
+    unstopped: str = ""
     origin: int = 0
 
 

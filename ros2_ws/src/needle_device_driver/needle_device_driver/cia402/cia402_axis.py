@@ -83,12 +83,8 @@ class Cia402Axis(Axis):
         self._machine = DriveMachine(rest, period, stop_time, self.monitor.feedback)
         self._speed = SpeedWatch(settings, period)
         self._homing: HomingRun | None = None
-        self._configured = False
-        self._opening = 0
-        self._homed = False
-        self._limits_due = False
-        self._origin = 0
-        self._zero = 0
+        self._configured = self._homed = self._limits_due = False
+        self._opening = self._origin = self._zero = 0
         self._velocity = 0.0
 
     def probe(self) -> None:
@@ -184,10 +180,8 @@ class Cia402Axis(Axis):
         with self._as_axis_error():
             self._link.open()
             self._link.other_master = ""
-            survived = (
-                await_operational(self._link, self.monitor, self._period)
-                and not self.monitor.rebooted
-            )
+            operational = await_operational(self._link, self.monitor, self._period)
+            survived = operational and not self.monitor.rebooted
             if not survived or self._opening != self._link.openings:
                 self._set_up(survived=survived)
             self.monitor.emergency = None
@@ -198,10 +192,8 @@ class Cia402Axis(Axis):
         """Return the newest reply."""
         machine = self._machine
         fault = self._fault
-        position, told = (
-            self._settings.position(counts - self._zero)
-            for counts in (machine.at.position, machine.target)
-        )
+        position = self._settings.position(machine.at.position - self._zero)
+        told = self._settings.position(machine.target - self._zero)
         return AxisSnapshot(
             time=self.monitor.fresh_time,
             position=position,
@@ -217,6 +209,7 @@ class Cia402Axis(Axis):
             ready=not self.actuated or machine.ready,
             answered=self.monitor.answered(),
             let_go=machine.let_go,
+            unstopped=machine.unstopped,
             origin=self._origin,
         )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 from needle_device_driver.cia402.cia402 import (
     FAULTS,
@@ -20,11 +21,13 @@ from needle_device_driver.cia402.drive_monitor import Feedback
 
 # In cycles: how long an axis must stand still to be at rest; when it is switched off although it
 # does not; how much longer than its ramp a quick stop may last, and how long it is then looked at;
-# when a change of state has failed; when a quick stop is left by way of switching off.
+# how much longer a drive may take to begin it; when a change of state has failed; when a quick stop
+# is left by way of switching off.
 _REST = 3
 LONGEST_REST = 50
 _STOP_MARGIN = 2
 _WINDOW = 5
+_SLOWEST_BEGIN = 25
 _LONGEST_SWITCHING = 100
 _LONGEST_REENABLE = 10
 
@@ -55,7 +58,8 @@ class DriveMachine:
         self._stopping = False
         self._still = 0
         self._in_stop = 0
-        self._stopped_at = at.position
+        self._rested = True
+        self._track: deque[int] = deque(maxlen=_WINDOW + 1)
         self._runs_on = False
         self._sent_mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
@@ -91,6 +95,16 @@ class DriveMachine:
         return self._goal is Goal.STOPPED and self._via_off
 
     @property
+    def unstopped(self) -> str:
+        """State of a drive that should have stopped and switched off long ago; empty: it has."""
+        powered = self.state in (*POWERED, DriveState.FAULT_REACTION_ACTIVE)
+        late = self._cycles > self._longest_stop + _WINDOW
+        # Once it has come to rest without power, a hand moves it.
+        moving = late and self._goes_on and (powered or not self._rested)
+        told = ["powered"] * (powered and self._cycles > LONGEST_REST) + ["moving"] * moving
+        return f"still {' and '.join(told)}" if told and self._goal is Goal.OFF else ""
+
+    @property
     def switching(self) -> bool:
         """Tell whether the drive is on its way to the goal."""
         if self._goal is Goal.ON:
@@ -106,6 +120,7 @@ class DriveMachine:
             self._via_off = self.let_go and goal is Goal.ON
             self._goal = goal
             self._cycles = 0
+            self._rested = False
 
     def stop(self) -> None:
         """Want a stop; until the drive has said that it took it, nothing else is ordered."""
@@ -136,6 +151,8 @@ class DriveMachine:
     def update(self, at: Feedback) -> None:
         """Take what the drive says now; `trouble` has what is wrong with it."""
         still = abs(at.position - self.at.position) <= self._rest_counts
+        self._rested = self._rested or self._still >= _REST
+        self._track.append(at.position)
         self._still = self._still + 1 if still else 0
         self.at = at
         state = self.state
@@ -152,23 +169,28 @@ class DriveMachine:
         self._watch_stop(state)
         self._watch_switching(state)
 
+    @property
+    def _goes_on(self) -> bool:
+        """Tell whether the axis leaves its place; jitter around it does not count."""
+        track = self._track
+        return len(track) > _WINDOW and abs(track[-1] - track[0]) > _WINDOW * self._rest_counts
+
     def _watch_stop(self, state: DriveState) -> None:
-        """See to it that a drive does in a quick stop what it says, or switch it off."""
-        if self._goal is not Goal.STOPPED or state is not DriveState.QUICK_STOP_ACTIVE:
+        """Switch off a drive that runs on after the order to stop, whatever it says."""
+        if self._goal is Goal.ON or state not in POWERED:
             self._in_stop = 0
             return
         self._in_stop += 1
-        over = self._in_stop - self._longest_stop
-        if over < 0 or over % _WINDOW:
-            return
-        # What trembles beside one place goes nowhere.
-        way = abs(self.at.position - self._stopped_at)
-        self._stopped_at = self.at.position
-        if over and way > _WINDOW * self._rest_counts:
+        longest = self._longest_stop + _WINDOW
+        if state is not DriveState.QUICK_STOP_ACTIVE:
+            longest += _SLOWEST_BEGIN
+        if self._in_stop >= longest and self._goes_on:
             self._runs_on = True
+            way = abs(self._track[-1] - self._track[0])
+            what = "in its quick stop" if state is DriveState.QUICK_STOP_ACTIVE else "when stopped"
             self._complain(
-                f"runs on in its quick stop ({way} counts in {_WINDOW * self._period:g} s) and is "
-                "switched off: its ramp 0x6085, the ramp's unit"
+                f"runs on {what} ({way} counts in {_WINDOW * self._period:g} s) and is switched "
+                "off: its ramp 0x6085, the ramp's unit"
             )
 
     def _watch_switching(self, state: DriveState) -> None:
@@ -193,6 +215,7 @@ class DriveMachine:
             # It was blocked, and its drive would pull it on when it comes free.
             self._via_off = True
         if self.switching and state not in FAULTS and self._cycles > _LONGEST_SWITCHING:
+            self._runs_on = self._runs_on or self._goal is not Goal.ON
             self._complain(
                 f"is not {self._goal.value} after {_LONGEST_SWITCHING * self._period:g} s: "
                 f"{state.name}, mode {self.at.mode}"

@@ -33,12 +33,10 @@ class DeviceCore:
     on_stop : callable
         Called whenever a fault or emergency stop ends everything.
 
-    Only its own methods change what follows.
-
     Attributes
     ----------
     state, activity : State, Activity
-        What the device may do, and what moves.
+        What the device may do, and what moves; only its own methods change this and what follows.
     configured : bool
         Whether the axes are set up.
     fault, reason : str
@@ -68,7 +66,7 @@ class DeviceCore:
         self._homing_times = [0.0, 0.0]
         self._seen_powered = False
         self._pushed_too_fast = False
-        self._let_go = ""
+        self._let_go = self._unstopped = ""
         self._events: list[Event] = []
         self.state = State.UNCONFIGURED
         self.activity = Activity.NONE
@@ -93,6 +91,11 @@ class DeviceCore:
             return 0.0
         insertion = self.snapshot.insertion
         return insertion.position - self._retraction_bound.target(insertion)
+
+    @property
+    def fault_now(self) -> str:
+        """Reason of FAULT or ESTOPPED, and which axis did not stop for it."""
+        return f"{self.fault}; {self._unstopped}" if self._unstopped else self.fault
 
     @property
     def rotation_owed(self) -> float:
@@ -188,7 +191,7 @@ class DeviceCore:
             if problem is not None:
                 return problem[1]
             trigger, reason = Trigger.RESET, "reset; enable to go on"
-        self.fault = ""
+        self.fault = self._unstopped = ""
         self.go(trigger, reason)
         return ""
 
@@ -360,6 +363,11 @@ class DeviceCore:
         """Read the axes and stop both for what is wrong with one."""
         at = self.poll(now)
         if self.state not in _WATCHED:
+            # A fault may be the silence itself.
+            oldest = now - self._limits.reply_age_limit if self.state is State.ESTOPPED else 0.0
+            told, self._unstopped = self._unstopped, at.unstopped(oldest)
+            if self._unstopped not in ("", told):
+                self._events.append(Notice(self._unstopped, Rule.QUICK_STOP, fault=True))
             return
         on = self.state is not State.DISABLED
         problem = axes_problem(

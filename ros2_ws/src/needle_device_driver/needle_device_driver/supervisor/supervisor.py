@@ -122,7 +122,7 @@ class MotionSupervisor:
             speed_scale=self._hold.speed_scale,
             insertion=None if joints is None else joints.insertion.position,
             rotation=None if joints is None else joints.rotation.position,
-            fault=self._core.fault,
+            fault=self._core.fault_now,
             reason=self._core.reason,
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
