@@ -26,6 +26,7 @@ from needle_bags.ros.parameter_snapshots import plain_value
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
 from needle_common.commands.options import CommandParser, output_file
 from needle_common.errors import UserError
+from needle_common.files.calibration_text import read_calibration
 from needle_common.files.plain_yaml import load_plain
 from needle_common.ros.parameters import OF_EVERY_NODE
 from needle_common.settings.parameter_files import Sections, none_for, read_sections, values_for
@@ -210,11 +211,7 @@ def _announced(run: Run) -> dict[str, dict[str, Any]]:
 def _calibration(run: Run, node: Node) -> str:
     """Return the text of the calibration: that of --params, or the recorded one."""
     if FILE in node.given:
-        path = Path(str(node.values[FILE]))
-        try:
-            return path.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"--params: {FILE}: cannot read {path}: {error}") from error
+        return read_calibration(Path(str(node.values[FILE])))
     if not run.calibration:
         raise UserError(
             f"{run.path} has images but no calibration: name one with --params "

@@ -27,10 +27,10 @@ from needle_bags.ros.parameter_snapshots import ParameterSnapshots
 from needle_bags.ros.recorder_parameters import RecorderParameters
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
 from needle_common.files.bag_path import recover_hint
 from needle_common.files.bag_records import RUN_RECORD
 from needle_common.files.bag_topic import BagTopic
+from needle_common.files.calibration_text import read_calibration
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.discovery import PARAMETERS_OF
@@ -88,7 +88,8 @@ class Recorder(WholeNode):
         super().__init__("recorder")
         self._settings = NodeParameters(self, RecorderParameters).values
         bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")
-        calibration = _read_calibration(self._settings.calibration_file)
+        file = self._settings.calibration_file
+        calibration = read_calibration(Path(file)) if file else ""
         self._diagnostics = DiagnosticsPublisher(self)
         self._topics = GraphTopics(self, self._settings.choice, self._take_topic, self._take)
         self._not_understood = NotUnderstood()
@@ -273,15 +274,6 @@ class Recorder(WholeNode):
         if lost:
             print(f"warning: messages lost: {json.dumps(lost)}", file=sys.stderr)
         return EXIT_DONE if self.recording.error is None else EXIT_MISSED
-
-
-def _read_calibration(path: str) -> str:
-    if not path:
-        return ""
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"calibration_file: cannot read {path}: {error}") from error
 
 
 def _spin_once(executor: WaitListExecutor, recorder: Recorder, timeout: float) -> None:

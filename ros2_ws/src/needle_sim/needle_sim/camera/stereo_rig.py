@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from needle_common.errors import UserError
-from needle_common.files.plain_yaml import read_yaml
+from needle_common.files.calibration_text import read_calibration
+from needle_common.files.plain_yaml import load_plain
 from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
@@ -103,7 +104,11 @@ def load_stereo_rig(path: Path | str) -> StereoRig:
         If it cannot be read or says something that cannot be, naming file, key and value.
     """
     path = Path(path)
-    document = read_yaml(path)
+    text = read_calibration(path)
+    try:
+        document = load_plain(text, aliases=True)
+    except ValueError as error:
+        raise UserError(f"calibration {path}: {error}") from error
     try:
         return _stereo_rig(_Entries(document))
     except UserError as error:

@@ -41,7 +41,8 @@ def read_reference(folder: Path, calibration: StereoCalibration) -> tuple[Image,
         for side, image, total in zip(SIDES, (pair.left, pair.right), sums, strict=True):
             if image is None or image.shape != total.shape:
                 size = f"{total.shape[1]}x{total.shape[0]}"
-                raise UserError(f"{folder / side / pair.name}: not an image of {size}, 8 bits")
+                path = pair.files[SIDES.index(side)]
+                raise UserError(f"{path}: not an image of {size}, 8 bits")
             np.add(total, image, out=total)
         count += 1
     first, second = (np.asarray(np.rint(total / count), np.uint8) for total in sums)

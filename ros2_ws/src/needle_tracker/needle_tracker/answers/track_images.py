@@ -32,11 +32,12 @@ from needle_tracker.tracking.track import TrackState
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names
-(numbers count as numbers), or in two videos frame by frame (names are 000000, 000001, ...).
+(numbers count as numbers), or in two videos frame by frame (names are 000000, 000001, ...). Names
+are equal or differ in left and right, l and r, cam0 and cam1 (left-0001.png, right-0001.png: 0001).
 """
 EPILOG = """\
 The output is a CSV file, one line for each pair:
-  name            file name (video: number of the frame)
+  name            file name without left or right (video: number of the frame)
   valid           1 with a tip, 0 without; then the other fields are empty
   x_m y_m z_m     the tip in rig: x up, z along the insertion, from the needle's entry point
   sigma_*_m       its standard deviations
@@ -108,7 +109,7 @@ def _run(words: Sequence[str]) -> int:
 
     def on_measured(pair: NamedPair, measured: Measurement) -> None:
         if truth is not None:
-            truth.add(pair.name, measured)
+            truth.add(pair.names, measured)
         if overlays is not None and pair.left is not None and pair.right is not None:
             write_overlay(overlays, pair.name, annotate(pair.left, pair.right, measured))
 
@@ -186,7 +187,7 @@ def track_sequence(
     calibration : StereoCalibration
         The tracker's.
     insertions : mapping or None
-        Insertion [m] by name (with or without the file's ending), None where not known at all.
+        Insertion [m] by any of a pair's names, None where not known at all.
     on_measured : callable
         Told each pair and what it gave.
 
@@ -216,7 +217,8 @@ def track_sequence(
     for pair in bar:
         insertion = None
         if insertions is not None:
-            insertion = insertions.get(pair.name, insertions.get(Path(pair.name).stem))
+            known = (insertions[name] for name in pair.names if name in insertions)
+            insertion = next(known, None)
         without += insertion is None
         if insertion is not None:
             if last is not None and abs(insertion - last) > _NEW_RUN:

@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from needle_common.commands.cli import JsonValue
-from needle_common.errors import UserError
-from needle_tracker.sources.image_files import finite_field
+from needle_tracker.sources.image_files import read_numbers
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.track import TrackState
 
 Array = npt.NDArray[np.float64]
 
-_COLUMNS = ("name", "x_m", "y_m", "z_m")
 _INSIDE_95 = 7.814728
 """Square of a normal error of three axes, in sigmas, that 95 % stay within."""
 
@@ -38,10 +35,10 @@ class TruthComparison:
         self._squares: list[float] = []
         self._missed = self._false = self._untold = 0
 
-    def add(self, name: str, measured: Measurement) -> None:
-        """Take what a pair gave; a tip from the stage alone is none."""
-        key = name if name in self._tips else Path(name).stem
-        if key not in self._tips:
+    def add(self, names: Sequence[str], measured: Measurement) -> None:
+        """Take what a pair of any of these names gave; a tip from the stage alone is none."""
+        key = next((name for name in names if name in self._tips), None)
+        if key is None:
             self._untold += 1
             return
         true, tip = self._tips[key], measured.tip
@@ -118,28 +115,7 @@ def read_truth(path: Path) -> dict[str, Array | None]:
     Raises
     ------
     UserError
-        Unreadable, a column missing, a value that is not a finite number, or a name given twice.
+            As `image_files.read_numbers`.
     """
-    tips: dict[str, Array | None] = {}
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            rows = csv.DictReader(file, skipinitialspace=True)
-            columns = rows.fieldnames or []
-            for column in _COLUMNS:
-                if column not in columns:
-                    raise UserError(f"--truth {path}: no column {column!r} in its first line")
-            for row in rows:
-                where = f"--truth {path}, line {rows.line_num}"
-                name = (row["name"] or "").strip()
-                if name in tips:
-                    raise UserError(f"{where}: {name!r} has a truth already")
-                texts = {column: (row[column] or "").strip() for column in _COLUMNS[1:]}
-                tips[name] = None
-                if any(texts.values()):
-                    values = [finite_field(text, where, column) for column, text in texts.items()]
-                    tips[name] = np.array(values)
-    except OSError as error:
-        raise UserError(f"--truth {path}: {error.strerror}") from error
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"--truth {path} is not a CSV file: {error}") from error
-    return tips
+    read = read_numbers("--truth", path, ("x_m", "y_m", "z_m"))
+    return {name: None if tip is None else np.array(tip) for name, tip in read.items()}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from needle_common.errors import UserError
+from needle_tracker.calibrating.board_recognition import check_board_seen
 from needle_tracker.calibrating.calibration_session import Session
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES
@@ -17,25 +18,6 @@ from needle_tracker.sources.image_files import Image, open_pairs
 
 Array = NDArray[np.float64]
 Sizes = dict[str, tuple[int, int]]
-
-
-def board_view(name: str, session: Session, images: dict[str, Image]) -> BoardView:
-    """Return what both cameras saw of the board in one exposure.
-
-    Parameters
-    ----------
-    name : str
-        The exposure's name; the session says by it where the board lay.
-    session : Session
-        Board and places.
-    images : dict of str to ndarray
-        The left and the right image, grey.
-    """
-    seen = []
-    for side in SIDES:
-        numbers, pixels = session.board.find(images[side])
-        seen.append(Corners(session.board.corners[numbers], pixels))
-    return BoardView(name, session.place_of(name), seen[0], seen[1])
 
 
 def views_in_folders(
@@ -46,7 +28,7 @@ def views_in_folders(
     Parameters
     ----------
     left, right : Path
-        Folders with images of the same names, or two videos (names: the frames' numbers).
+        Folders of images paired by name, or two videos (names: the frames' numbers).
     session : Session
         Board and places.
     all_places : bool
@@ -62,8 +44,8 @@ def views_in_folders(
     Raises
     ------
     UserError
-        Folders, names or files that are wrong, images of different sizes, a place in the session
-        that no image has.
+        Folders, names or files that are wrong, images of different sizes, another board or none, a
+        place in the session that no image has.
     """
     views: list[BoardView] = []
     sizes: Sizes = {}
@@ -79,18 +61,23 @@ def views_in_folders(
         leave=False,
         disable=not sys.stderr.isatty(),
     ):
-        images = {}
-        for side, folder, image in (("left", left, pair.left), ("right", right, pair.right)):
+        seen = []
+        for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
             if image is None:
-                raise UserError(f"cannot read {folder / pair.name}: not an image in 8 bit")
+                raise UserError(f"cannot read {path}: not an image in 8 bit")
             size = (image.shape[1], image.shape[0])
             if sizes.setdefault(side, size) != size:
                 raise UserError(
-                    f"{folder / pair.name} is {size[0]}x{size[1]}, the {side} images before it "
+                    f"{path} is {size[0]}x{size[1]}, the {side} images before it "
                     f"are {sizes[side][0]}x{sizes[side][1]}"
                 )
-            images[side] = image
-        views.append(board_view(Path(pair.name).stem, session, images))
+            numbers, pixels = session.board.find(image)
+            seen.append(Corners(session.board.corners[numbers], pixels))
+        names = [Path(path).stem for path in (pair.name, *pair.files)]
+        views.append(BoardView(names[0], session.place_of(*names), *seen))
+    if all(nothing_seen(view) for view in views):
+        images = (image for pair in pairs for image in (pair.left, pair.right) if image is not None)
+        check_board_seen(images, session.board)
     used = [view.place for view in views]
     for name, place in session.places.items():
         if all_places and not any(place is one for one in used):
@@ -125,4 +112,7 @@ def averaged_view(name: str, session: Session, pairs: list[dict[str, Image]]) ->
         kept = sorted(n for n, pixels in found.items() if 2 * len(pixels) > len(pairs))
         pixels = np.array([np.mean(found[n], axis=0) for n in kept]).reshape(-1, 2)
         seen.append(Corners(session.board.corners[kept], pixels))
-    return BoardView(name, session.place_of(name), seen[0], seen[1])
+    view = BoardView(name, session.place_of(name), seen[0], seen[1])
+    if nothing_seen(view):
+        check_board_seen([image for images in pairs for image in images.values()], session.board)
+    return view

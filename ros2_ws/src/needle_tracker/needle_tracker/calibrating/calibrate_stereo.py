@@ -18,6 +18,8 @@ from needle_tracker.calibrating.calibration_file import save_calibration
 from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error
 from needle_tracker.calibrating.calibration_session import load_session
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
+from needle_tracker.calibrating.imported_lenses import read_lenses
+from needle_tracker.calibrating.pair_consistency import PairsApartError, apart_in_words
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import SURFACE, BoardView
 from needle_tracker.optics.calibration import SIDES
@@ -25,8 +27,10 @@ from needle_tracker.optics.calibration import SIDES
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
 
-LEFT and RIGHT hold the images of each camera, paired by file name. The session file says what the
-board is and where it lay:
+LEFT and RIGHT hold the images of each camera. Paired are equal names, and names that differ in
+left and right, l and r, or cam0 and cam1 (then LEFT and RIGHT may be one folder). The session file
+says what the board is and where it lay, in metres in the frame `rig` (x up, z along the insertion,
+origin at the needle's entry point):
 
   board: {columns: 12, rows: 9, square: 0.010, marker: 0.0075, dictionary: DICT_5X5_100}
   phantom: {surface_height: 0.0175, refractive_index: 1.33}      # kept where not determined
@@ -36,25 +40,15 @@ board is and where it lay:
     under_wedge: {origin: [-0.0125, -0.045, 0.004], columns: [0.2079, 0, 0.9781],
                   under_surface: true, sigma: 2.0e-5}
 
-All in metres, in the frame `rig` (x up, z along the insertion, origin at the needle's entry point).
-`origin` is the outer corner of the pattern's first square: the top left one as printed, with the
-first marker beside it. `columns` is the direction in which the columns count (the print's left to
-right; default [0, 0, 1], along the insertion), `rows` that of the rows (top to bottom; default
-[0, 1, 0]). So a board flat on the surface lies print up, its first corner nearest to the entry and
-at the smallest y, its x = surface height + thickness of the board. It defines `rig`; laid there
-twice, a measured way apart, it tells whether the squares have the size that is said.
+`origin` is the outer corner of the pattern's first square, top left as printed; `columns` and
+`rows` are the directions in which these count (default [0, 0, 1] and [0, 1, 0]); `sigma` is how
+well the place is known. An image whose name has no place is a board held freely in air: 6 at
+least, 20 are better, tilted by 15 to 45 deg in all directions. docs/calibration.md says how to take
+the images, and how to calibrate cameras that look through walls or from aside.
 
-An image whose name has no place is a board held freely in air: at least 6, better 20, tilted by 15
-to 45 deg in all directions. Boards under the surface, of known place and at different depths (a
-wedge), tell refractive index and surface height; `sigma` is how well the place is known.
-
-Cameras that look through walls, or from aside, have a window each in place of phantom:
-
-  left: {window: {point: [0.0225, 0, 0], normal: [1, 0, 0],
-                  layers: [{thickness: 0.005, refractive_index: 1.49}], inside: 1.34}}
-
-likewise right. A board at one known place in the box defines `rig`; others are held in it freely:
-a place `box_*: {under_surface: true}` without an origin. See docs/calibration.md.
+--lenses keeps lenses and relative pose as ROS (LEFT.yaml RIGHT.yaml), Kalibr (camchain.yaml; cam0
+is left) or OpenCV (intrinsics.yml extrinsics.yml) wrote them, in metres: then a board at one place
+in air, and those under the surface, suffice.
 """
 _SCALE_TOLD = 0.1  # [%]
 _EPILOG = """\
@@ -64,9 +58,9 @@ examples:
   ros2 run needle_tracker calibrate_stereo --board board.pdf
   ros2 run needle_tracker calibrate_stereo --left L --right R --session S.yaml --output rig.yaml
 
-exit codes: 0 done; 1 calibrated and written, but tips are not expected within --goal-mm, or places
-and squares contradict each other; 2 bad input or a set of views that cannot determine the rig
-(nothing written); 130 interrupted
+exit codes: 0 done; 1 calibrated and written, but NOT OK, or tips are not expected within --goal-mm;
+1, and nothing written, where many pairs were not taken at once; 2 bad input or a set of views that
+cannot determine the rig (nothing written); 130 interrupted
 """
 
 
@@ -93,14 +87,17 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
     session = load_session(options.session)
     views, sizes = views_in_folders(options.left, options.right, session)
     empty = [view.name for view in views if nothing_seen(view) and view.place is None]
-    if all(nothing_seen(view) for view in views):
-        raise UserError(
-            f"none of {len(views)} image pairs shows the session's board ({session.board}): is it "
-            "another one?"
-        )
     if empty:
         print(f"left out, no board found: {', '.join(empty)}")
-    result = calibrate([view for view in views if view.name not in empty], sizes, session.windows)
+    views = [view for view in views if view.name not in empty]
+    lenses = options.lenses and read_lenses(options.lenses, sizes, session.windows)
+    try:
+        result = calibrate(views, sizes, session.windows, lenses)
+    except PairsApartError as error:
+        print(f"NOT OK: {error}; nothing is written")
+        if options.json is not None:
+            write_json(options.json, {"problem": str(error)})
+        return EXIT_MISSED
     size = square_error(result)
     problems = doubts(result, size)
     text = "\n".join(
@@ -152,7 +149,12 @@ def report(result: RigCalibration, size: tuple[float, float], goal_mm: float) ->
         f"reprojection error, {side} camera, {name} boards: {error:.3f} px rms"
         for (side, name), error in reprojection_by_set(result).items()
     ]
+    if result.apart:
+        lines.append(f"WARNING: {apart_in_words(result.apart)}; left out")
     lines += [f"WARNING: {text}" for view, text in misfits(result) if view.place is None]
+    if "left.fx" not in result.parameters:
+        pose = " and relative pose" if result.model.tied else ""
+        lines.append(f"lenses{pose}: as given; an error of theirs adds to that of tips below")
     for name, found in result.parameters.items():
         scale, unit = _unit(name)
         value, given, sigma = (scale * v for v in (found.value, found.given, found.sigma))
@@ -221,9 +223,10 @@ def _parser() -> CommandParser:
     parser = CommandParser("calibrate_stereo", _DESCRIPTION, _EPILOG)
     add = parser.add_argument
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
-    add("--right", type=Path, metavar="DIR", help="images of the right camera, of the same names")
+    add("--right", type=Path, metavar="DIR", help="images of the right camera")
     add("--session", type=Path, metavar="FILE", help="board, windows and places (YAML)")
     add("--output", type=Path, metavar="FILE.yaml", help="the calibration file to write")
+    add("--lenses", type=Path, nargs="+", metavar="FILE", help="keep these lenses (see above)")
     add("--goal-mm", type=float, default=0.06, metavar="MM", help="wanted tip error (0.06)")
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
     add("--board", type=Path, metavar="FILE.pdf|.png", help="write a board to print and end")

@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import dataclasses
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
-from needle_tracker.calibrating.calibration_start import LEAST_CORNERS
-from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
+from needle_tracker.calibrating.calibration_start import boards_seen, checked_view
+from needle_tracker.calibrating.rig_fit import (
+    LARGEST_MISFIT_PX,
+    RigFit,
+    board_parameters_free,
+    fit,
+    misfit_px,
+)
 from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
     LENS,
@@ -24,14 +28,12 @@ from needle_tracker.calibrating.rig_model import (
     camera_slice,
 )
 from needle_tracker.calibrating.tip_error import tip_error_p95, tip_shifts
-from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
-from needle_tracker.optics.camera_model import optical_rays
+from needle_tracker.optics.calibration import SIDES, StereoCalibration
 
 Array = NDArray[np.float64]
 
 CAMERAS = tuple(f"{side}_camera_turned" for side in SIDES)
 LEAST_IMPROVEMENT = 30.0  # of chi squared: no noise does that
-LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
 EXPLAINED_PX = 1.0  # a larger misfit, and the causes found explain nothing
 NOTHING_SHOWN = 1.0  # an unseen error of tips from which on a target shows nothing at all [m]
 TURN_LIMIT = np.deg2rad(0.01)  # a camera turned by more was touched, whatever it does to tips
@@ -118,19 +120,12 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
     UserError
         A target that one camera does not see, or none of known place.
     """
-    for view in views:
-        for side in SIDES:
-            if len(view.corners(side).points) < LEAST_CORNERS:
-                raise UserError(
-                    f"{view.name}: the {side} camera sees {len(view.corners(side).points)} corners "
-                    f"of the target, {LEAST_CORNERS} are needed"
-                )
-    boards = np.stack([_board(calibration, view) for view in views])
-    model = RigModel(calibration, views, boards)
+    views = [checked_view(view) for view in views]
+    model = RigModel(calibration, views, boards_seen(calibration, views))
     causes = _all_causes(model)
     everything = _fit(model, list(causes), None)
     sigma = everything.corner_sigma_px
-    misfit = float(np.sqrt(max(np.mean(everything.residuals**2) - _noise_px(views) ** 2, 0.0)))
+    misfit = misfit_px(model, everything)
     covariance = everything.covariance[: model.shared, : model.shared]
     unseen = tip_error_p95(calibration, covariance)
     asis = _fit(model, [], sigma).residuals.reshape(-1, 2)
@@ -166,27 +161,6 @@ def check(calibration: StereoCalibration, views: list[BoardView], limit: float) 
             + ": lay it at known places on and under the surface, tilted"
         )
     return CheckResult(causes, deviations, shift, unseen, sigma, reprojection, problems)
-
-
-def _noise_px(views: list[BoardView]) -> float:
-    """Return a corner's noise, whatever the calibration: what a smooth map leaves [px].
-
-    A polynomial of degree 4 in the board's coordinates follows perspective, lens and refraction to
-    a few thousandths of a pixel.
-    """
-    total, spare = 0.0, 0
-    for view in views:
-        for side in SIDES:
-            seen = view.corners(side)
-            degree = 4 if len(seen.points) >= 40 else 2
-            flat = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
-            x, y = (flat / np.abs(flat).max()).T
-            terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
-            basis = np.stack(terms, axis=-1)
-            rest = seen.pixels - basis @ np.linalg.lstsq(basis, seen.pixels, rcond=None)[0]
-            total += float(np.sum(rest**2))
-            spare += 2 * max(len(seen.points) - basis.shape[1], 0)
-    return float(np.sqrt(total / spare)) if spare else 0.0
 
 
 def _all_causes(model: RigModel) -> tuple[str, ...]:
@@ -240,22 +214,3 @@ def _deviation(model: RigModel, best: RigFit, cause: str) -> Deviation:
 
 def _p95(assumed: StereoCalibration, true: StereoCalibration) -> float:
     return float(np.percentile(np.linalg.norm(tip_shifts(assumed, true), axis=-1), 95.0))
-
-
-def _board(calibration: StereoCalibration, view: BoardView) -> Array:
-    """Return T_rig_board: as given, or as the left camera sees a board in air."""
-    if view.place is not None and view.place.is_known:
-        return view.place.T_rig_board
-    return np.asarray(np.linalg.inv(calibration.left.T_optical_rig) @ _seen(calibration.left, view))
-
-
-def _seen(camera: Camera, view: BoardView) -> Array:
-    rays = optical_rays(camera, view.left.pixels)
-    flat = np.ascontiguousarray(rays[:, :2] / rays[:, 2:])
-    _, rotation, translation = cv2.solvePnP(
-        view.left.points, flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-    )
-    pose = np.eye(4)
-    pose[:3, :3] = cv2.Rodrigues(np.asarray(rotation).reshape(3))[0]
-    pose[:3, 3] = np.asarray(translation).reshape(3)
-    return pose

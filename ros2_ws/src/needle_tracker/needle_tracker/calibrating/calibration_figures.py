@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
@@ -26,7 +25,6 @@ _MM = 1e3
 def rig_figure(result: RigCalibration) -> Figure:
     """Return the rig from the side and along the needle: cameras, surface, boards, frustums."""
     figure = Figure(figsize=(9.0, 8.5), layout="constrained")
-    FigureCanvasAgg(figure)
     calibration = result.calibration
     planes = ((2, "z (insertion) [mm]"), (1, "y [mm]"))
     for number, (axis, axis_label) in enumerate(planes):
@@ -62,7 +60,6 @@ def rig_figure(result: RigCalibration) -> Figure:
 def residual_figure(result: RigCalibration) -> Figure:
     """Return each camera's residuals over the image (enlarged) and the error of every view."""
     figure = Figure(figsize=(11.0, 8.5))
-    FigureCanvasAgg(figure)
     enlarged = 20.0 / max(result.fit.corner_sigma_px, 1e-3)
     for number, side in enumerate(SIDES):
         camera = result.calibration.left if side == "left" else result.calibration.right

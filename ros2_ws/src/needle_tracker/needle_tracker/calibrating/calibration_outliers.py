@@ -10,10 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from needle_tracker.calibrating.pair_consistency import apart_in_words
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_fit import (
+    LARGEST_MISFIT_PX,
     LEAST_CORNER_SIGMA_PX,
     given_rows,
+    misfit_px,
     outlier_weights,
     place_deviations,
 )
@@ -24,6 +27,9 @@ Array = NDArray[np.float64]
 
 LARGEST_PULL = 4.0  # standard deviations of a place: no noise does that
 LARGEST_SCALE_ERROR = 1e-3  # of the squares: 0.13 mm at the tip
+_RINGS = 10
+_RING_SIGMAS = 5.0  # 3.4 at most in 8 x 40 simulated sessions of lenses without a pattern
+_LEAST_PATTERN_PX = 0.02
 _LEAST_SHARE = 1e-9  # of what the size does to corners: rounding, where all of it is absorbed
 _TRANSLATION = np.arange(3, 6)  # of a board's six parameters
 
@@ -39,6 +45,19 @@ def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
         Its `square_error`.
     """
     found = [text for view, text in misfits(result) if view.place is not None]
+    if any(view.place is not None for view in result.apart):
+        found.insert(0, apart_in_words(result.apart))
+    found += [
+        f"{side} camera: corners miss by up to {miss:.2f} px in a pattern of rings: its lens has "
+        "more distortion than k1, k2, k3, p1 and p2 describe"
+        for side, miss in ring_patterns(result).items()
+    ]
+    misfit = misfit_px(result.model, result.fit)
+    if misfit > LARGEST_MISFIT_PX:
+        found.append(
+            f"corners miss by {misfit:.2f} px in a way that nothing here explains: a board that is "
+            "not flat, another lens, focus or image size than given"
+        )
     error, sigma = size
     if abs(error) > max(LARGEST_SCALE_ERROR, LARGEST_PULL * sigma):
         found.append(
@@ -78,6 +97,32 @@ def misfits(result: RigCalibration) -> list[tuple[BoardView, str]]:
         for view, side, error in errors
         if error > 2.0 * typical + 0.05
     ]
+
+
+def ring_patterns(result: RigCalibration) -> dict[str, float]:
+    """Return the cameras whose corners miss towards or from the middle, and by how much [px].
+
+    Noise averages out in a ring about the principal point, distortion that the lens model lacks
+    does not.
+
+    Parameters
+    ----------
+    result : RigCalibration
+        The calibration.
+    """
+    found = {}
+    for side, camera in zip(
+        SIDES, (result.calibration.left, result.calibration.right), strict=True
+    ):
+        outwards = result.model.pixels[side] - camera.camera_matrix[:2, 2]
+        radii = np.linalg.norm(outwards, axis=-1)
+        radial = np.sum(result.residuals(side) * outwards, axis=-1) / np.maximum(radii, 1.0)
+        rings = np.array_split(radial[np.argsort(radii)], _RINGS)
+        means = np.array([np.mean(ring) for ring in rings])
+        errors = np.array([np.std(ring) / np.sqrt(len(ring)) for ring in rings])
+        if np.any((np.abs(means) > _RING_SIGMAS * errors) & (np.abs(means) > _LEAST_PATTERN_PX)):
+            found[side] = float(np.abs(means).max())
+    return found
 
 
 def square_error(result: RigCalibration) -> tuple[float, float]:

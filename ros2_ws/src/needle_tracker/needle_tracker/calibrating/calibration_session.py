@@ -15,7 +15,13 @@ from needle_common.errors import UserError
 from needle_common.files.plain_yaml import read_yaml
 from needle_common.settings.bounds import check_bounds
 from needle_tracker.calibrating.charuco import CharucoBoard
-from needle_tracker.optics.calibration import SIDES, parse_windows
+from needle_tracker.optics.calibration import (
+    SIDES,
+    number,
+    numbers,
+    parse_windows,
+    value_of,
+)
 from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
@@ -23,7 +29,7 @@ Array = NDArray[np.float64]
 _LEAST_SINE = math.cos(math.radians(5.0))
 _PLACE_KEYS = ("origin", "columns", "rows", "under_surface", "sigma")
 _SURFACE_KEYS = ("surface_height", "refractive_index")
-_BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary")
+_BOARD_KEYS = ("columns", "rows", "square", "marker", "dictionary", "legacy")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,20 +75,21 @@ class Session:
     windows: tuple[Window, Window]
     places: dict[str, Place]
 
-    def place_of(self, name: str) -> Place | None:
+    def place_of(self, *names: str) -> Place | None:
         """Return where the board of an image lay; None where it was held freely.
 
         Parameters
         ----------
-        name : str
-            The image's file name without its ending.
+        *names : str
+            What the image may be called: file names without ending.
         """
-        if name in self.places:
-            return self.places[name]
-        for pattern, place in self.places.items():
-            if fnmatch.fnmatchcase(name, pattern):
-                return place
-        return None
+        exact = [self.places[name] for name in names if name in self.places]
+        like = [
+            place
+            for pattern, place in self.places.items()
+            if any(fnmatch.fnmatchcase(name, pattern) for name in names)
+        ]
+        return next(iter(exact + like), None)
 
 
 def load_session(path: Path) -> Session:
@@ -172,29 +179,25 @@ def _check_side(
 
 def _board(content: Any) -> CharucoBoard:
     board = _mapping(content, "board", _BOARD_KEYS)
-    counts = []
-    for key in ("columns", "rows"):
-        if not isinstance(board.get(key), int) or isinstance(board.get(key), bool):
-            raise UserError(f"board.{key} = {board.get(key)!r} is not a whole number")
-        counts.append(board[key])
-    sides = [_number(board, ("board", key), (1e-4, 1.0), "m") for key in ("square", "marker")]
-    return CharucoBoard(counts[0], counts[1], sides[0], sides[1], str(board.get("dictionary")))
+    columns, rows = (value_of({"board": board}, "board", key) for key in ("columns", "rows"))
+    for key, count in (("columns", columns), ("rows", rows)):
+        if not isinstance(count, int) or isinstance(count, bool):
+            raise UserError(f"board.{key} = {count!r} is not a whole number")
+    square, marker = (number({"board": board}, "board", key) for key in ("square", "marker"))
+    legacy = _flag(board, "board", "legacy")
+    return CharucoBoard(columns, rows, square, marker, str(board.get("dictionary")), legacy)
 
 
 def _place(content: Any, name: str) -> Place:
     place = _mapping(content, name, _PLACE_KEYS)
-    under = place.get("under_surface", False)
-    if not isinstance(under, bool):
-        raise UserError(f"{name}.under_surface = {under!r} is not true or false")
+    under = _flag(place, name, "under_surface")
     if under and set(place) == {"under_surface"}:
         return Place(np.eye(4), under, math.inf)
-    origin = _vector(place, name, "origin", None)
-    along = _vector(place, name, "columns", [0.0, 0.0, 1.0])
-    across = _vector(place, name, "rows", [0.0, 1.0, 0.0])
-    sigma = 0.0
-    if "sigma" in place:
-        sigma = _number(place, (name, "sigma"), (0.0, 0.01), "m")
-    x, y = along / np.linalg.norm(along), across / np.linalg.norm(across)
+    entry = {name: {"columns": [0.0, 0.0, 1.0], "rows": [0.0, 1.0, 0.0], "sigma": 0.0} | place}
+    origin, along, across = (numbers(entry, 3, name, key) for key in ("origin", "columns", "rows"))
+    sigma = number(entry, name, "sigma")
+    check_bounds(f"{name}.sigma", sigma, 0.0, 0.01, "m")
+    x, y = (v / max(float(np.linalg.norm(v)), 1e-12) for v in (along, across))
     if float(np.linalg.norm(np.cross(x, y))) < _LEAST_SINE:
         raise UserError(f"{name}: columns {along} and rows {across} are not at right angles")
     y = y - x * float(x @ y)
@@ -214,27 +217,8 @@ def _mapping(content: Any, name: str, keys: tuple[str, ...]) -> dict[str, Any]:
     return content
 
 
-def _number(
-    content: dict[str, Any], where: tuple[str, str], bounds: tuple[float, float], unit: str
-) -> float:
-    name, key = where
-    value = content.get(key)
-    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
-        raise UserError(f"{name}.{key} = {value!r} is not a finite number")
-    check_bounds(f"{name}.{key}", value, *bounds, unit)
-    return float(value)
-
-
-def _vector(content: dict[str, Any], name: str, key: str, default: list[float] | None) -> Array:
-    value = content.get(key, default)
-    numbers = [
-        item
-        for item in (value if isinstance(value, list) else [])
-        if isinstance(item, (int, float)) and not isinstance(item, bool) and math.isfinite(item)
-    ]
-    if not isinstance(value, list) or len(value) != 3 or len(numbers) != 3:
-        raise UserError(f"{name}.{key} = {value!r} is not three finite numbers")
-    vector = np.array(numbers, dtype=np.float64)
-    if key != "origin" and not float(np.linalg.norm(vector)) > 1e-6:
-        raise UserError(f"{name}.{key} = {value!r} has no direction")
-    return vector
+def _flag(content: dict[str, Any], name: str, key: str) -> bool:
+    value = content.get(key, False)
+    if not isinstance(value, bool):
+        raise UserError(f"{name}.{key} = {value!r} is not true or false")
+    return value

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
 from needle_tracker.calibrating.rig_model import BoardView, Corners
-from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration
-from needle_tracker.optics.window import Window, common_surface
+from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, Camera, StereoCalibration
+from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
 LEAST_CORNERS = 12
 LEAST_FREE_VIEWS = 6
 LEAST_TILT_DEG = 10.0
-_FLAGS = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2
+_K1_ALONE = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K2
 
 
-def checked_views(views: list[BoardView], windows: tuple[Window, Window]) -> list[BoardView]:
+def checked_views(
+    views: list[BoardView], surface: Window | None, least_free: int = LEAST_FREE_VIEWS
+) -> list[BoardView]:
     """Refuse a set of views that cannot determine the rig; return what of it counts.
 
     Cameras with windows of their own may see hardly anything in common but through these: a board
@@ -29,25 +33,26 @@ def checked_views(views: list[BoardView], windows: tuple[Window, Window]) -> lis
     ----------
     views : list of BoardView
         What was seen.
-    windows : pair of Window
-        Of the left and the right camera.
+    surface : Window or None
+        What both cameras look through; None where each has a window of its own.
+    least_free : int
+        So many boards held freely are needed.
 
     Raises
     ------
     UserError
         Too few views or corners, a board seen by one camera only, no board of known place.
     """
-    surface = common_surface(*windows)
-    checked = [_checked(view, alone=surface is None and view.place is None) for view in views]
+    checked = [checked_view(v, alone=surface is None and v.place is None) for v in views]
     for side in SIDES:
         held = [v for v in checked if v.place is None and len(v.corners(side).points)]
-        if len(held) < LEAST_FREE_VIEWS:
+        if len(held) < least_free:
             raise UserError(
                 f"{len(held)} views of the board held freely in air"
                 f"{'' if surface else f' that the {side} camera sees'}, at least "
-                f"{LEAST_FREE_VIEWS} are needed (20 are good)"
+                f"{least_free} are needed (20 are good)"
             )
-    if _anchor(checked, surface) is None:
+    if anchor_view(checked, surface) is None:
         raise UserError(
             "no view of the board at a known place in air: nothing says where `rig` is (give the "
             "place of the board on the surface in the session file)"
@@ -57,7 +62,7 @@ def checked_views(views: list[BoardView], windows: tuple[Window, Window]) -> lis
     return checked
 
 
-def _checked(view: BoardView, *, alone: bool) -> BoardView:
+def checked_view(view: BoardView, *, alone: bool = False) -> BoardView:
     """Return a view without the camera that sees too little, if the other one may see it alone."""
     counts = {side: len(view.corners(side).points) for side in SIDES}
     few = [side for side in SIDES if counts[side] < LEAST_CORNERS]
@@ -75,20 +80,17 @@ def _checked(view: BoardView, *, alone: bool) -> BoardView:
     return view
 
 
-def _anchor(views: list[BoardView], surface: Window | None) -> int | None:
+def anchor_view(views: list[BoardView], surface: Window | None) -> BoardView | None:
     """Return the view that says where `rig` is: in air if possible, and always under a surface."""
-    known = [i for i, view in enumerate(views) if view.place and view.place.is_known]
-    in_air = [i for i in known if not views[i].under_surface]
+    known = [view for view in views if view.place and view.place.is_known]
+    in_air = [view for view in known if not view.under_surface]
     return next(iter(in_air if surface else in_air + known), None)
 
 
-def first_calibration(
+def cameras_alone(
     views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
-) -> tuple[StereoCalibration, Array]:
-    """Return a calibration good enough to start the adjustment from.
-
-    Each camera by itself from the views in air (Zhang's method, OpenCV), `rig` from a board of
-    known place, all of it as if there were no windows.
+) -> StereoCalibration:
+    """Return each camera by itself, from the views in air (Zhang's method, OpenCV).
 
     Parameters
     ----------
@@ -97,7 +99,44 @@ def first_calibration(
     sizes : dict of str to (int, int)
         Width and height of each side's images [px].
     windows : pair of Window
-        Of the left and the right camera, as given.
+        Of the left and the right camera.
+
+    Returns
+    -------
+    StereoCalibration
+        Both lenses; how the cameras stand is left open, both are at the origin.
+
+    Raises
+    ------
+    UserError
+        Views that do not determine the cameras: all parallel, or contradictory.
+    """
+    cameras = []
+    for side, window in zip(SIDES, windows, strict=True):
+        seen = [view.corners(side) for view in views if not view.under_surface]
+        lens = _lens([corners for corners in seen if len(corners.points)], side, sizes[side])
+        cameras.append(Camera(*sizes[side], *lens, np.eye(4), window))
+    return StereoCalibration(*cameras)
+
+
+def are_posed(cameras: StereoCalibration) -> bool:
+    """Return whether it is known how the cameras stand to each other."""
+    return bool(np.linalg.norm(cameras.right.centre - cameras.left.centre) >= LEAST_BASELINE)
+
+
+def first_calibration(
+    views: list[BoardView], cameras: StereoCalibration
+) -> tuple[StereoCalibration, Array]:
+    """Return a calibration good enough to start the adjustment from.
+
+    `rig` comes from a board of known place, as if there were no windows.
+
+    Parameters
+    ----------
+    views : list of BoardView
+        From `checked_views`.
+    cameras : StereoCalibration
+        Lenses, windows, and the cameras' relative pose where that is known (`are_posed`).
 
     Returns
     -------
@@ -109,54 +148,71 @@ def first_calibration(
     Raises
     ------
     UserError
-        Views that do not determine the cameras: all parallel, or contradictory.
+        A camera that comes out behind its window.
     """
-    anchor = _anchor(views, common_surface(*windows))
+    anchor = anchor_view(views, cameras.surface)
     assert anchor is not None
-    place = views[anchor].place
-    assert place is not None
-    cameras = []
-    boards = [
-        view.place.T_rig_board if view.place is not None and view.place.is_known else None
-        for view in views
-    ]
-    for side, window in zip(SIDES, windows, strict=True):
-        seen = [view.corners(side) for view in views]
-        in_air = [
-            corners
-            for view, corners in zip(views, seen, strict=True)
-            if not view.under_surface and len(corners.points)
-        ]
-        matrix, distortion = _single_camera(in_air, side, sizes[side])
-        transform = _board_pose(seen[anchor], matrix, distortion) @ np.linalg.inv(place.T_rig_board)
-        camera = Camera(*sizes[side], matrix, distortion, transform, window)
-        if window.height(camera.centre) <= 0.0:
+    assert anchor.place is not None
+    placed: list[Camera] = []
+    for side, alone in zip(SIDES, (cameras.left, cameras.right), strict=True):
+        board = board_pose(alone, anchor.corners(side))
+        transform = board @ np.linalg.inv(anchor.place.T_rig_board)
+        if placed and are_posed(cameras):
+            to_left = np.linalg.inv(cameras.left.T_optical_rig)
+            transform = alone.T_optical_rig @ to_left @ placed[0].T_optical_rig
+        camera = dataclasses.replace(alone, T_optical_rig=transform)
+        if camera.window.height(camera.centre) <= 0.0:
             raise UserError(
                 f"the {side} camera comes out below the surface, at "
                 f"{np.round(camera.centre, 3).tolist()} m: "
-                f"the place given for {views[anchor].name} cannot be right"
+                f"the place given for {anchor.name} cannot be right"
             )
-        cameras.append(camera)
-        for i, corners in enumerate(seen):
-            if boards[i] is None and len(corners.points):
-                own = _board_pose(corners, matrix, distortion)
-                boards[i] = np.linalg.inv(transform) @ own
-    poses = [board for board in boards if board is not None]
-    return StereoCalibration(cameras[0], cameras[1]), np.stack(poses)
+        placed.append(camera)
+    calibration = StereoCalibration(*placed)
+    return calibration, boards_seen(calibration, views)
 
 
-def _single_camera(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Array, Array]:
+def boards_seen(calibration: StereoCalibration, views: list[BoardView]) -> Array:
+    """Return T_rig_board of each view, shape (n, 4, 4): as given, else as the first camera sees it.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        Windows are passed over.
+    views : list of BoardView
+        Seen by one camera at least.
+    """
+    boards = []
+    for view in views:
+        if view.place is not None and view.place.is_known:
+            boards.append(view.place.T_rig_board)
+            continue
+        side = next(side for side in SIDES if len(view.corners(side).points))
+        camera = calibration.left if side == "left" else calibration.right
+        boards.append(np.linalg.inv(camera.T_optical_rig) @ board_pose(camera, view.corners(side)))
+    return np.stack(boards)
+
+
+def _lens(corners: list[Corners], side: str, size: tuple[int, int]) -> tuple[Array, Array]:
     points = [c.points.astype(np.float32) for c in corners]
     pixels = [c.pixels.astype(np.float32).reshape(-1, 1, 2) for c in corners]
+    matrix, distortion, flags = np.eye(3), np.zeros(5), _K1_ALONE
     try:
-        _, matrix, distortion, _, _ = cv2.calibrateCamera(
-            points, pixels, size, np.eye(3), np.zeros(5), flags=_FLAGS
-        )
+        # At last without images that do not fit, such as of a board in the phantom.
+        for _ in range(3):
+            _, matrix, distortion, turns, *_, misses = cv2.calibrateCameraExtended(
+                points, pixels, size, matrix, distortion, flags=flags
+            )
+            if flags == cv2.CALIB_USE_INTRINSIC_GUESS:
+                kept = np.flatnonzero(misses <= 2.0 * np.median(misses) + 0.05)
+                points, pixels = [points[i] for i in kept], [pixels[i] for i in kept]
+            flags = cv2.CALIB_USE_INTRINSIC_GUESS
     except cv2.error as error:
         raise UserError(
             f"the {side} camera cannot be calibrated from these views: are all of them parallel?"
         ) from error
-    tilt = _tilt_range_deg(corners, matrix)
+    normals = np.stack([cv2.Rodrigues(turn)[0][:, 2] for turn in turns])
+    tilt = float(np.rad2deg(np.arccos(np.clip(normals @ normals.T, -1.0, 1.0).min())))
     if not tilt >= LEAST_TILT_DEG:
         raise UserError(
             f"{side} camera: the views are all parallel (tilts within {tilt:.1f} deg, at least "
@@ -165,26 +221,14 @@ def _single_camera(corners: list[Corners], side: str, size: tuple[int, int]) -> 
     return np.asarray(matrix, dtype=np.float64), np.asarray(distortion).reshape(-1)[:5].copy()
 
 
-def _tilt_range_deg(corners: list[Corners], matrix: Array) -> float:
-    """Return the largest angle between two boards, from the vanishing lines of their planes."""
-    normals = []
-    for seen in corners:
-        homography, _ = cv2.findHomography(seen.points[:, :2], seen.pixels)
-        if homography is None:
-            continue
-        # The plane's horizon l gives its normal: K^T l.
-        normal = matrix.T @ np.linalg.inv(homography).T @ np.array([0.0, 0.0, 1.0])
-        normals.append(normal / np.linalg.norm(normal))
-    if not normals:
-        return 0.0
-    stacked = np.stack(normals)
-    cosines = np.abs(np.clip(stacked @ stacked.T, -1.0, 1.0))
-    return float(np.rad2deg(np.arccos(cosines.min())))
-
-
-def _board_pose(corners: Corners, matrix: Array, distortion: Array) -> Array:
+def board_pose(camera: Camera, corners: Corners) -> Array:
+    """Return the board's pose in a camera's optical frame, shape (4, 4), without a window."""
     _, rotation, translation = cv2.solvePnP(
-        corners.points, corners.pixels, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
+        corners.points,
+        corners.pixels,
+        camera.camera_matrix,
+        camera.distortion,
+        flags=cv2.SOLVEPNP_IPPE,
     )
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.asarray(rotation).reshape(3))[0]

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PatchCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -39,6 +38,9 @@ class CharucoBoard:
         Side of a square and of a marker, as measured on the printed board [m].
     dictionary : str
         OpenCV's name of the marker dictionary.
+    legacy : bool
+        Whether it was printed by OpenCV before 4.6: with an even number of rows, its first square
+        then is white.
 
     Raises
     ------
@@ -51,6 +53,7 @@ class CharucoBoard:
     square: float = 0.010
     marker: float = 0.0075
     dictionary: str = "DICT_5X5_100"
+    legacy: bool = False
 
     def __post_init__(self) -> None:
         """Check the fields."""
@@ -73,7 +76,7 @@ class CharucoBoard:
         """Return what it is, for a person."""
         return (
             f"{self.columns} x {self.rows} squares of {1e3 * self.square:g} mm, markers "
-            f"{1e3 * self.marker:g} mm, {self.dictionary}"
+            f"{1e3 * self.marker:g} mm, {self.dictionary}{', legacy' if self.legacy else ''}"
         )
 
     @property
@@ -96,7 +99,9 @@ class CharucoBoard:
         ndarray, shape (n, 3)
             x and y of the corner nearest to the origin, and the side, in the board's frame [m].
         """
-        rows, columns = np.nonzero(np.add.outer(range(self.rows), range(self.columns)) % 2 == 0)
+        white_first = self.legacy and self.rows % 2 == 0
+        parity = np.add.outer(range(self.rows), range(self.columns)) % 2
+        rows, columns = np.nonzero(parity == white_first)
         sides = np.full(len(rows), self.square)
         parts = [np.column_stack([self.square * columns, self.square * rows, sides])]
         board = self._opencv()
@@ -148,9 +153,11 @@ class CharucoBoard:
 
     def _opencv(self) -> cv2.aruco.CharucoBoard:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
-        return cv2.aruco.CharucoBoard(
+        board = cv2.aruco.CharucoBoard(
             (self.columns, self.rows), self.square, self.marker, dictionary
         )
+        board.setLegacyPattern(self.legacy)
+        return board
 
 
 def write_board(board: CharucoBoard, path: Path) -> None:
@@ -173,7 +180,6 @@ def write_board(board: CharucoBoard, path: Path) -> None:
     length, height = board.size
     paper = (length + 2 * _MARGIN, height + 2 * _MARGIN)
     figure = Figure(figsize=(paper[0] / _INCH, paper[1] / _INCH))
-    FigureCanvasAgg(figure)
     axes = figure.add_axes(
         (_MARGIN / paper[0], _MARGIN / paper[1], length / paper[0], height / paper[1])
     )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
+from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -41,24 +41,8 @@ exit codes: 0 OK; 1 NOT OK, or this target cannot show it; 2 bad input, no image
 """  # noqa: E501 - command lines stay whole
 
 
-@dataclasses.dataclass(frozen=True)
-class CheckOptions:
-    """Options of the command; SI."""
-
-    calibration: Path
-    session: Path
-    left: Path | None
-    right: Path | None
-    live: str | None
-    count: int
-    timeout: float
-    pair_tolerance: float
-    limit: float
-    json: Path | None
-
-
-def parse(arguments: Sequence[str]) -> CheckOptions:
-    """Return the options of a command line (without the program's name).
+def parse(arguments: Sequence[str]) -> Namespace:
+    """Return the options of a command line (without the program's name); `limit` is in metres.
 
     Raises
     ------
@@ -77,18 +61,8 @@ def parse(arguments: Sequence[str]) -> CheckOptions:
         ("limit_mm", 0.001, 10.0, "mm"),
     ):
         check_bounds(f"--{name.replace('_', '-')}", getattr(given, name), lower, upper, unit)
-    return CheckOptions(
-        calibration=given.calibration,
-        session=given.session,
-        left=given.left,
-        right=given.right,
-        live=given.live,
-        count=given.count,
-        timeout=given.timeout,
-        pair_tolerance=given.pair_tolerance,
-        limit=1e-3 * given.limit_mm,
-        json=given.json,
-    )
+    given.limit = 1e-3 * given.limit_mm
+    return given
 
 
 def report(result: CheckResult) -> str:
@@ -164,7 +138,7 @@ def _parser() -> CommandParser:
     add("--calibration", type=Path, required=True, metavar="FILE", help="what is checked")
     add("--session", type=Path, required=True, metavar="FILE", help="board and places (YAML)")
     add("--left", type=Path, metavar="DIR", help="images of the left camera")
-    add("--right", type=Path, metavar="DIR", help="images of the right camera, of the same names")
+    add("--right", type=Path, metavar="DIR", help="images of the right camera")
     add("--live", metavar="NAME", help="take images from topics, the board at this place")
     add("--count", type=int, default=10, metavar="N", help="pairs to take live (10)")
     add("--timeout", type=float, default=10.0, metavar="S", help="wait for them so long (10 s)")

@@ -11,7 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
-from needle_tracker.calibrating.calibration_start import checked_views, first_calibration
+from needle_tracker.calibrating.calibration_start import (
+    LEAST_FREE_VIEWS,
+    are_posed,
+    cameras_alone,
+    checked_views,
+    first_calibration,
+)
+from needle_tracker.calibrating.pair_consistency import consistent_views
 from needle_tracker.calibrating.rig_fit import RigFit, board_parameters_free, fit
 from needle_tracker.calibrating.rig_model import (
     CAMERA_PARAMETERS,
@@ -19,10 +26,11 @@ from needle_tracker.calibrating.rig_model import (
     POSE,
     BoardView,
     RigModel,
+    camera_slice,
 )
 from needle_tracker.calibrating.tip_error import tip_error_p95
 from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, StereoCalibration
-from needle_tracker.optics.window import Window
+from needle_tracker.optics.window import Window, common_surface
 
 Array = NDArray[np.float64]
 
@@ -35,12 +43,14 @@ LIMITS = {
     "k2": 1.0,
     "p1": 0.003,
     "p2": 0.003,
+    "k3": 0.05,
 }
 _FIRST_SIGMA_PX = 10.0  # of corners, while cameras and boards come near
 _FOCAL_LIMIT = 0.005  # of the focal length, and of the image's width for the principal point
 # Of the image's width: boards on a surface hold the cameras that look through it, a small one in a
 # box does less; there a shifted principal point and a turned camera are much alike, and harmless.
 _OWN_WINDOWS_CENTRE_LIMIT = 0.01
+_LARGEST_TURN = 0.2  # between a given relative pose and that of the views [rad]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,6 +79,8 @@ class RigCalibration:
         By name: `left.fx` ... `right.k3`, and the windows' (`rig_model.window_names`).
     tip_error_p95 : float
         Expected 95 % error of a tip in the phantom from this calibration alone [m].
+    apart : list of BoardView
+        Views that were left out: left and right do not belong together.
     """
 
     calibration: StereoCalibration
@@ -76,6 +88,7 @@ class RigCalibration:
     model: RigModel
     parameters: dict[str, Determined]
     tip_error_p95: float
+    apart: list[BoardView]
 
     def reprojection_rms_px(self, side: str, view: int | None = None) -> float:
         """Return the reprojection error of a camera, over all views or one [px].
@@ -100,7 +113,10 @@ class RigCalibration:
 
 
 def calibrate(
-    views: list[BoardView], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
+    views: list[BoardView],
+    sizes: dict[str, tuple[int, int]],
+    windows: tuple[Window, Window],
+    lenses: StereoCalibration | None = None,
 ) -> RigCalibration:
     """Calibrate the rig from views of a board.
 
@@ -112,6 +128,8 @@ def calibrate(
         Width and height of each side's images [px].
     windows : pair of Window
         Of the left and the right camera, as given; what the views do not tell of them is kept.
+    lenses : StereoCalibration, optional
+        Cameras whose lenses are kept, and their relative pose if they are not in one place.
 
     Returns
     -------
@@ -123,19 +141,28 @@ def calibrate(
     UserError
         A set of views that does not determine the cameras.
     """
-    views = checked_views(views, windows)
-    start, boards = first_calibration(views, sizes, windows)
-    model = RigModel(start, views, boards)
+    least_free = LEAST_FREE_VIEWS if lenses is None else 0
+    views = checked_views(views, common_surface(*windows), least_free)
+    cameras = lenses or cameras_alone(views, sizes, windows)
+    views, apart, seen = consistent_views(views, cameras, least_free)
+    tied = are_posed(cameras)
+    if tied and seen is not None:
+        _check_relative_pose(cameras.right.T_optical_rig, seen)
+    start, boards = first_calibration(views, cameras)
+    model = RigModel(start, views, boards, tied=tied)
     names = list(model.names)
-    given = _given_values(model)
+    # What parameters are kept at: the windows as given, a lens without distortion.
+    given = model.start[: model.shared].copy()
+    given[[name.split(".")[-1] in LENS[4:] for name in names]] = 0.0
     free = board_parameters_free(model)
     # The start ignores what refracts: where no board of known place in air holds the cameras, they
     # and the boards first have to come near.
     poses = free.copy()
     poses[: model.shared] = [name.split(".")[-1] in POSE for name in names]
+    poses[camera_slice("right")] &= not tied
     free[: model.shared] = True
-    for side in SIDES:
-        free[names.index(f"{side}.k3")] = False
+    if lenses is not None:
+        free[:CAMERA_PARAMETERS] = poses[:CAMERA_PARAMETERS]
     if not any(view.under_surface for view in views):
         free[CAMERA_PARAMETERS : model.shared] = False
     sigmas = dict.fromkeys(names, np.inf)
@@ -165,21 +192,25 @@ def calibrate(
             kept=not bool(free[i]),
         )
         for i, name in enumerate(names)
-        if name.split(".")[-1] in LENS or i >= CAMERA_PARAMETERS
+        if i >= CAMERA_PARAMETERS or (lenses is None and name.split(".")[-1] in LENS)
     }
     shared = result.covariance[: model.shared, : model.shared]
-    return RigCalibration(
-        calibration, result, model, determined, tip_error_p95(calibration, covariance=shared)
-    )
+    tip_error = tip_error_p95(calibration, shared, tied=tied)
+    return RigCalibration(calibration, result, model, determined, tip_error, apart)
 
 
-def _given_values(model: RigModel) -> Array:
-    """Return what parameters are kept at: the windows as given, a lens without distortion."""
-    given: Array = model.start[: model.shared].copy()
-    for i, name in enumerate(model.names[:CAMERA_PARAMETERS]):
-        if name.split(".")[-1] not in ("fx", "fy", "cx", "cy"):
-            given[i] = 0.0
-    return given
+def _check_relative_pose(given: Array, seen: Array) -> None:
+    """Refuse a relative pose in another unit, or of other cameras, than the views show."""
+    lengths = np.linalg.norm([given[:3, 3], seen[:3, 3]], axis=-1)
+    turn = np.abs(given[:3, :3] - seen[:3, :3]).max()
+    aside = np.abs(given[:3, 3] / lengths[0] - seen[:3, 3] / lengths[1]).max()
+    alike = max(turn, aside) < _LARGEST_TURN
+    if not (alike and 0.9 < lengths[0] / lengths[1] < 1.1):
+        raise UserError(
+            f"the given cameras are {1e3 * lengths[0]:.4g} mm apart, those of the views "
+            f"{1e3 * lengths[1]:.1f} mm"
+            + (": give metres" if alike else ", elsewhere: were left and right exchanged?")
+        )
 
 
 def _least_determined(names: list[str], result: RigFit) -> int | None:

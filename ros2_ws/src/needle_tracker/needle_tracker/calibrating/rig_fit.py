@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.calibrating.rig_model import WINDOW, RigModel
+from needle_tracker.optics.calibration import SIDES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEAST_CORNER_SIGMA_PX = 0.02
+LARGEST_MISFIT_PX = 0.1  # about 0.05 mm of depth
 _OUTLIER = 3.0  # in standard deviations: beyond, a residual counts linearly
 _LEAST_EIGENVALUE = 1e-14
 _ITERATIONS = 40
@@ -144,6 +146,35 @@ def place_deviations(model: RigModel, result: RigFit) -> list[tuple[str, float, 
         away = (poses[number] - view.place.T_rig_board) @ middle
         deviations.append((view.name, float(np.linalg.norm(away)), float(np.abs(pulls).max())))
     return deviations
+
+
+def misfit_px(model: RigModel, result: RigFit) -> float:
+    """Return what corners miss by beyond their noise, rms of a coordinate [px]: a wrong model.
+
+    The noise is what a polynomial of degree 4 in the board's coordinates leaves: it follows
+    perspective, lens and refraction to a few thousandths of a pixel.
+
+    Parameters
+    ----------
+    model : RigModel
+        What was fitted.
+    result : RigFit
+        Its fit.
+    """
+    total, spare = 0.0, 0
+    for seen in (view.corners(side) for view in model.views for side in SIDES):
+        if not len(seen.points):
+            continue
+        degree = 4 if len(seen.points) >= 40 else 2
+        flat = seen.points[:, :2] - seen.points[:, :2].mean(axis=0)
+        x, y = (flat / np.abs(flat).max()).T
+        terms = [x**i * y**j for i in range(degree + 1) for j in range(degree + 1 - i)]
+        basis = np.stack(terms, axis=-1)
+        rest = seen.pixels - basis @ np.linalg.lstsq(basis, seen.pixels, rcond=None)[0]
+        total += float(np.sum(rest**2))
+        spare += 2 * max(len(seen.points) - basis.shape[1], 0)
+    noise = total / spare if spare else 0.0
+    return float(np.sqrt(max(np.mean(result.residuals**2) - noise, 0.0)))
 
 
 def _minimise(

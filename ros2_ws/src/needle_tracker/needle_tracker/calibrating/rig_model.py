@@ -103,6 +103,9 @@ class RigModel:
         What was seen.
     boards : ndarray, shape (len(views), 4, 4)
         T_rig_board of each view that the parameters start from.
+    tied : bool
+        Whether the right camera follows the left one, at the pose relative to it that both start
+        with; its own rotation and translation then change nothing.
 
     Attributes
     ----------
@@ -114,8 +117,11 @@ class RigModel:
         The parameters that it starts from.
     """
 
-    def __init__(self, start: StereoCalibration, views: list[BoardView], boards: Array) -> None:
+    def __init__(
+        self, start: StereoCalibration, views: list[BoardView], boards: Array, *, tied: bool = False
+    ) -> None:
         self.views = views
+        self.tied = tied
         self._start = {"left": start.left, "right": start.right}
         self._windows = (start.left.window, start.right.window)
         self._surface = start.surface
@@ -208,7 +214,8 @@ class RigModel:
             seen = self._seen(self._camera(parameters, side), side, corners)
             through_lens = functools.partial(self._through_lens, side=side, seen=seen)
             of_corners = functools.partial(self._of_corners, side=side, corners=corners)
-            for column in [*range(own.start, own.stop), *range(CAMERA_PARAMETERS, self.shared)]:
+            cameras = range(0 if self.tied else own.start, own.stop)
+            for column in [*cameras, *range(CAMERA_PARAMETERS, self.shared)]:
                 if free[column]:
                     pixels = through_lens if column - own.start in range(len(LENS)) else of_corners
                     result[rows, column] = -self._slope(pixels, parameters, column).ravel()
@@ -251,15 +258,23 @@ class RigModel:
         slopes[:, :, 3:] = np.eye(3)
         return slopes
 
+    def _transform(self, parameters: Array, side: str) -> Array:
+        """Return T_optical_rig: turned about the camera's own centre, then shifted."""
+        start = self._start[side].T_optical_rig
+        if self.tied and side == "right":
+            left = self._start["left"].T_optical_rig
+            return np.asarray(start @ np.linalg.inv(left) @ self._transform(parameters, "left"))
+        pose = parameters[camera_slice(side)][len(LENS) :]
+        step = np.eye(4)
+        step[:3, :3] = _rotation(pose[:3])
+        step[:3, 3] = pose[3:]
+        return np.asarray(step @ start)
+
     def _camera(self, parameters: Array, side: str) -> Camera:
         start, own = self._start[side], parameters[camera_slice(side)]
         fx, fy, cx, cy = own[:4]
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        # Turned about its own centre, then shifted.
-        step = np.eye(4)
-        step[:3, :3] = _rotation(own[len(LENS) : len(LENS) + 3])
-        step[:3, 3] = own[len(LENS) + 3 :]
-        transform = step @ start.T_optical_rig
+        transform = self._transform(parameters, side)
         window = self._window(parameters[CAMERA_PARAMETERS : self.shared], SIDES.index(side))
         return Camera(start.width, start.height, matrix, own[4:9].copy(), transform, window)
 

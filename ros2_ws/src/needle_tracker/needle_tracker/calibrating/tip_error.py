@@ -86,7 +86,9 @@ def measured_points(assumed: StereoCalibration, left: Array, right: Array) -> Ar
     return np.stack([midpoint(views, pair) for pair in zip(left, right, strict=True)])
 
 
-def tip_error_p95(calibration: StereoCalibration, covariance: Array) -> float:
+def tip_error_p95(
+    calibration: StereoCalibration, covariance: Array, *, tied: bool = False
+) -> float:
     """Return the 95 % error of tips that a calibration's uncertainty causes [m].
 
     Parameters
@@ -95,16 +97,18 @@ def tip_error_p95(calibration: StereoCalibration, covariance: Array) -> float:
         The calibration.
     covariance : ndarray, shape (s, s)
         Of the parameters that all views share (`RigModel.names`).
+    tied : bool
+        Whether the right camera follows the left one.
     """
     generator = np.random.default_rng(_SEED)
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     draws = generator.standard_normal((_DRAWS, len(covariance))) @ root.T
-    shifts = np.einsum("nij,dj->dni", _tip_slopes(calibration), draws)
+    shifts = np.einsum("nij,dj->dni", _tip_slopes(calibration, tied=tied), draws)
     return float(np.percentile(np.linalg.norm(shifts, axis=-1), 95.0))
 
 
-def _tip_slopes(calibration: StereoCalibration) -> Array:
+def _tip_slopes(calibration: StereoCalibration, *, tied: bool) -> Array:
     """Return d(tip)/d(shared parameters), shape (points, 3, s).
 
     The pixels stay: J_tip d(tip) + J_parameters d(parameters) = 0, in the least squares sense.
@@ -112,7 +116,7 @@ def _tip_slopes(calibration: StereoCalibration) -> Array:
     points = needle_points(calibration)
     nowhere = Corners(points, np.zeros((len(points), 2)))
     view = BoardView("", Place(np.eye(4), under_surface=True), nowhere, nowhere)
-    model = RigModel(calibration, [view], np.eye(4)[None])
+    model = RigModel(calibration, [view], np.eye(4)[None], tied=tied)
     free = np.zeros(len(model.start), dtype=bool)
     free[: model.shared] = True
     # Residuals are seen minus expected: the sign turns twice.

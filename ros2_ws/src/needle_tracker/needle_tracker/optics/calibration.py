@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_common.errors import UserError
+from needle_common.files.calibration_text import read_calibration
 from needle_common.files.plain_yaml import load_plain
 from needle_common.settings.bounds import ABOVE_0, check_bounds
 from needle_tracker.optics.window import Layer, Window, common_surface, surface_from_above
@@ -91,15 +93,6 @@ def load_calibration(path: Path) -> StereoCalibration:
     return calibration_from(read_calibration(path), path)
 
 
-def read_calibration(path: Path) -> str:
-    """Return the text of a calibration file; a `UserError` says why it cannot be read."""
-    try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UserError(f"cannot read calibration {path}: {reason}") from error
-
-
 def calibration_from(text: str, path: Path) -> StereoCalibration:
     """Return what the text of a calibration file says; raises as `load_calibration`."""
     try:
@@ -169,15 +162,15 @@ def parse_windows(content: Any) -> tuple[Window, Window]:
             "phantom is missing, and so are left.window and right.window: give "
             "phantom for one level surface, or each camera its window"
         )
-    height = _number(content, "phantom", "surface_height")
+    height = number(content, "phantom", "surface_height")
     index = _index(content, "phantom", "refractive_index")
     surface = surface_from_above(height, index)
     return surface, surface
 
 
 def _window(content: Any, side: str) -> Window:
-    point = _numbers(content, 3, side, "window", "point")
-    normal = _numbers(content, 3, side, "window", "normal")
+    point = numbers(content, 3, side, "window", "point")
+    normal = numbers(content, 3, side, "window", "normal")
     norm = float(np.linalg.norm(normal))
     check_bounds(f"length of {side}.window.normal", norm, 0.99, 1.01, "-")
     normal = normal / norm
@@ -187,38 +180,38 @@ def _window(content: Any, side: str) -> Window:
             "sees the needle from aside only"
         )
     name = f"{side}.window.layers"
-    layers = _value(content, side, "window", "layers")
+    layers = value_of(content, side, "window", "layers")
     if not isinstance(layers, list):
         raise UserError(f"{name} = {layers!r} is not a list (of none: [])")
     found = []
-    for number, layer in enumerate(layers):
-        entry = {f"{name}[{number}]": layer}
-        thickness = _number(entry, *entry, "thickness")
-        check_bounds(f"{name}[{number}].thickness", thickness, ABOVE_0, _THICKEST, "m")
+    for i, layer in enumerate(layers):
+        entry = {f"{name}[{i}]": layer}
+        thickness = number(entry, *entry, "thickness")
+        check_bounds(f"{name}[{i}].thickness", thickness, ABOVE_0, _THICKEST, "m")
         found.append(Layer(thickness, _index(entry, *entry, "refractive_index")))
     return Window(point, normal, tuple(found), _index(content, side, "window", "inside"))
 
 
 def _index(content: Any, *keys: str) -> float:
-    index = _number(content, *keys)
+    index = number(content, *keys)
     check_bounds(".".join(keys), index, *_INDICES, "-")
     return index
 
 
 def _camera(content: Any, side: str, window: Window) -> Camera:
-    width, height = (_size(content, side, key) for key in ("image_width", "image_height"))
-    matrix = _numbers(content, 9, side, "camera_matrix", "data").reshape(3, 3)
+    width, height = (size_of(content, side, key) for key in ("image_width", "image_height"))
+    matrix = numbers(content, 9, side, "camera_matrix", "data").reshape(3, 3)
     fx, fy = matrix[0, 0], matrix[1, 1]
     if not (fx > 0.0 and fy > 0.0):
         raise UserError(f"{side}.camera_matrix: focal lengths {fx:g}, {fy:g} px are not positive")
     if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
         raise UserError(f"{side}.camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]")
-    model = _value(content, side, "distortion_model")
+    model = value_of(content, side, "distortion_model")
     if model != _DISTORTION_MODEL:
         raise UserError(f"{side}.distortion_model = {model!r}, wants {_DISTORTION_MODEL!r}")
-    distortion = _numbers(content, 5, side, "distortion_coefficients", "data")
-    translation = _numbers(content, 3, side, "T_optical_rig", "translation")
-    quaternion = _numbers(content, 4, side, "T_optical_rig", "rotation")
+    distortion = numbers(content, 5, side, "distortion_coefficients", "data")
+    translation = numbers(content, 3, side, "T_optical_rig", "translation")
+    quaternion = numbers(content, 4, side, "T_optical_rig", "rotation")
     norm = float(np.linalg.norm(quaternion))
     check_bounds(f"norm of {side}.T_optical_rig.rotation", norm, 0.99, 1.01, "-")
     transform = np.eye(4)
@@ -239,7 +232,8 @@ def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-def _value(content: Any, *keys: str) -> Any:
+def value_of(content: Any, *keys: str) -> Any:
+    """Return what stands under a path of keys; a `UserError` names the path where it is missing."""
     value = content
     for key in keys:
         if not isinstance(value, dict) or key not in value:
@@ -248,21 +242,24 @@ def _value(content: Any, *keys: str) -> Any:
     return value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
-def _number(content: Any, *keys: str) -> float:
-    value = _value(content, *keys)
+def number(content: Any, *keys: str) -> float:
+    """Return the finite number under a path of keys; a `UserError` names it where it is none."""
+    value = value_of(content, *keys)
     if not _is_number(value) or not math.isfinite(value):
         raise UserError(f"{'.'.join(keys)} = {value!r} is not a finite number")
     return float(value)
 
 
-def _numbers(content: Any, count: int, *keys: str) -> NDArray[np.float64]:
-    value = _value(content, *keys)
-    name = ".".join(keys)
-    if not isinstance(value, list) or len(value) != count:
+def numbers(content: Any, count: int | None, *keys: str) -> NDArray[np.float64]:
+    """Return the list of finite numbers under a path of keys, shape (count,); None: any count.
+
+    Rows of a matrix are joined. A `UserError` names the list where it is none.
+    """
+    value, name = value_of(content, *keys), ".".join(keys)
+    if isinstance(value, list):
+        rows = (item if isinstance(item, list) else [item] for item in value)
+        value = list(itertools.chain.from_iterable(rows))
+    if not isinstance(value, list) or len(value) != (len(value) if count is None else count):
         got = f"{len(value)} values" if isinstance(value, list) else repr(value)
         raise UserError(f"{name} wants {count} numbers, has {got}")
     if not all(_is_number(item) and math.isfinite(item) for item in value):
@@ -270,8 +267,13 @@ def _numbers(content: Any, count: int, *keys: str) -> NDArray[np.float64]:
     return np.array(value, dtype=np.float64)
 
 
-def _size(content: Any, *keys: str) -> int:
-    value = _value(content, *keys)
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def size_of(content: Any, *keys: str) -> int:
+    """Return the side of an image under a path of keys [px]; a `UserError` where it is none."""
+    value = value_of(content, *keys)
     if not isinstance(value, int) or isinstance(value, bool) or not 16 <= value <= 16384:
         raise UserError(f"{'.'.join(keys)} = {value!r} is not a size in [16, 16384] px")
     return value

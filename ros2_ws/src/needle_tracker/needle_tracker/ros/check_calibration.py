@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from argparse import Namespace
 from collections.abc import Sequence
 
 import numpy as np
@@ -24,7 +25,7 @@ from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
 from needle_tracker.calibrating.calibration_check import check
 from needle_tracker.calibrating.calibration_session import Session, load_session
-from needle_tracker.calibrating.check_options import CheckOptions, figures, parse, report
+from needle_tracker.calibrating.check_options import figures, parse, report
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.ros.conversions import to_frame
@@ -37,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_command(lambda: check_calibration(parse(remove_ros_args(words)[1:]), words))
 
 
-def check_calibration(options: CheckOptions, words: list[str]) -> int:
+def check_calibration(options: Namespace, words: list[str]) -> int:
     """Check as asked, print and write the result."""
     calibration, session = load_calibration(options.calibration), load_session(options.session)
     if options.left is not None and options.right is not None:
@@ -62,7 +63,7 @@ def check_calibration(options: CheckOptions, words: list[str]) -> int:
 
 
 def _live_view(
-    options: CheckOptions, calibration: StereoCalibration, session: Session, words: list[str]
+    options: Namespace, calibration: StereoCalibration, session: Session, words: list[str]
 ) -> BoardView:
     name = str(options.live)
     if session.place_of(name) is None:
@@ -82,7 +83,7 @@ class _Capture(WholeNode):
     """Takes a number of image pairs from the topics."""
 
     def __init__(
-        self, context: Context, calibration: StereoCalibration, options: CheckOptions
+        self, context: Context, calibration: StereoCalibration, options: Namespace
     ) -> None:
         super().__init__("check_calibration", context=context)
         self._options = options

@@ -15,6 +15,7 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import String
 
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.files.calibration_text import read_calibration
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
 from needle_common.ros.conversions import IMAGES, LATCHED, RELIABLE
 from needle_common.ros.discovery import AnsweringNodes, unpublished, unrecorded
@@ -25,7 +26,7 @@ from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.pair_answers import Answer
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
-from needle_tracker.optics.calibration import SIDES, calibration_from, read_calibration
+from needle_tracker.optics.calibration import SIDES, calibration_from
 from needle_tracker.ros.conversions import to_image
 from needle_tracker.ros.tracker_messages import (
     OUTPUTS,

@@ -20,6 +20,10 @@ Image = NDArray[np.uint8]
 _SUFFIXES = frozenset(
     (".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".pnm", ".ppm", ".tif", ".tiff", ".webp", ".jp2")
 )
+# How the file names of two cameras differ: in the left one's a pattern, in the right one's a text.
+_CAMERA_NUMBER = "(?:(?<=cam)|(?<=cam[-_])|(?<=camera)|(?<=camera[-_]))%d(?!\\d)"
+_SIDES = (("left", "right"), (_CAMERA_NUMBER % 0, "1"), (_CAMERA_NUMBER % 1, "2"), ("l", "r"))
+_SEPARATORS = "-_. "
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,14 +33,24 @@ class NamedPair:
     Attributes
     ----------
     name : str
-        File name; for videos the frame's number, from 000000 on.
+        File name, without `left` or `right` where the files differ by that; for videos the frame's
+        number, from 000000 on.
     left, right : ndarray of uint8, shape (height, width), or None
         Grey images.
+    files : pair of Path
+        The left and the right file.
     """
 
     name: str
     left: Image | None
     right: Image | None
+    files: tuple[Path, Path]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names that a session or a CSV may use for the pair, with and without ending."""
+        paths = (Path(self.name), *self.files)
+        return tuple(dict.fromkeys(name for path in paths for name in (path.name, path.stem)))
 
 
 @dataclasses.dataclass
@@ -58,7 +72,7 @@ class PairSequence:
     unpaired: list[str]
     _left: Path
     _right: Path
-    _videos: bool
+    _files: list[tuple[str, str]] | None
     cut_off: int = 0
 
     @property
@@ -73,11 +87,12 @@ class PairSequence:
 
     def __iter__(self) -> Iterator[NamedPair]:
         """Read pair after pair."""
-        return self._frames() if self._videos else self._files()
+        return self._frames() if self._files is None else self._images(self._files)
 
-    def _files(self) -> Iterator[NamedPair]:
-        for name in self.names:
-            yield NamedPair(name, _read(self._left / name), _read(self._right / name))
+    def _images(self, files: list[tuple[str, str]]) -> Iterator[NamedPair]:
+        for name, (left, right) in zip(self.names, files, strict=True):
+            paths = self._left / left, self._right / right
+            yield NamedPair(name, _read(paths[0]), _read(paths[1]), paths)
 
     def _frames(self) -> Iterator[NamedPair]:
         left, right = (cv2.VideoCapture(str(path)) for path in (self._left, self._right))
@@ -88,7 +103,9 @@ class PairSequence:
                 frames = [_next_frame(video) for video in (left, right)]
                 if frames[0] is None or frames[1] is None:
                     break
-                yield NamedPair(f"{number:06d}", frames[0], frames[1])
+                name = f"{number:06d}"
+                paths = self._left / name, self._right / name
+                yield NamedPair(name, frames[0], frames[1], paths)
                 number += 1
             for side, video, more in (("left", left, frames[0]), ("right", right, frames[1])):
                 rest, unpaired = more, number
@@ -128,18 +145,57 @@ def open_pairs(left: Path, right: Path) -> PairSequence:
     if not left.is_dir():
         counts = [_frame_count(side, path) for side, path in (("left", left), ("right", right))]
         names = [f"{number:06d}" for number in range(max(min(counts), 0))]
-        return PairSequence(names, [], left, right, True)
+        return PairSequence(names, [], left, right, None)
+    one_folder = left.samefile(right)
+    left, right = _image_folder(left), _image_folder(right)
     found = [_images_in(side, path) for side, path in (("left", left), ("right", right))]
-    names = sorted(found[0] & found[1], key=_natural)
-    unpaired = [f"left {name}" for name in sorted(found[0] - found[1], key=_natural)]
-    unpaired += [f"right {name}" for name in sorted(found[1] - found[0], key=_natural)]
-    if not names:
+    pairs = sorted(_pair(*found, one_folder=one_folder), key=lambda pair: _natural(pair[0]))
+    if not pairs:
+        samples = [f"{len(names)}, such as {min(names, key=_natural)}" for names in found]
         raise UserError(
-            f"no image of --left {left} ({len(found[0])}, such as {min(found[0], key=_natural)}) "
-            f"has one of the same name in --right {right} ({len(found[1])}, such as "
-            f"{min(found[1], key=_natural)})"
+            f"no image of --left {left} ({samples[0]}) has a partner in --right "
+            f"{'the same folder' if one_folder else f'{right} ({samples[1]})'}: names must "
+            f"{'' if one_folder else 'be the same or '}differ in left and right, l and r, or cam0 "
+            "and cam1"
         )
-    return PairSequence(names, unpaired, left, right, False)
+    files = [(left_name, right_name) for _, left_name, right_name in pairs]
+    used = [set(names) for names in zip(*files, strict=True)]
+    rest = [found[0] - used[0], found[1] - used[1]]
+    if one_folder:
+        rest = [found[0] - used[0] - used[1], set()]
+    unpaired = [
+        f"{side} {name}"
+        for side, names in zip(("left", "right"), rest, strict=True)
+        for name in sorted(names, key=_natural)
+    ]
+    return PairSequence([name for name, *_ in pairs], unpaired, left, right, files)
+
+
+def _pair(left: set[str], right: set[str], *, one_folder: bool) -> list[tuple[str, str, str]]:
+    """Return name, left and right file of each pair: equal names, else such as sides differ by."""
+    equal = set() if one_folder else left & right
+    pairs = [(name, name, name) for name in equal]
+    unused = right - equal
+    for name in sorted(left - equal, key=_natural):
+        fitting = [pair for pair in _partners(name) if pair[0] in unused - {name}]
+        if fitting and not (one_folder and name not in unused):
+            partner, shared = fitting[0]
+            pairs.append((shared, name, partner))
+            unused -= {partner, name} if one_folder else {partner}
+    return pairs
+
+
+def _partners(name: str) -> Iterator[tuple[str, str]]:
+    """Yield what the right camera's file of this name could be called, and what both share."""
+    stem, suffix = Path(name).stem, Path(name).suffix
+    for left, right in _SIDES:
+        for match in re.finditer(left, stem, re.IGNORECASE):
+            word = match.group()
+            word = right.upper() if word.isupper() else right.title() if word.istitle() else right
+            around = stem[: match.start()], stem[match.end() :]
+            kept = [part.strip(_SEPARATORS) for part in around]
+            shared = ("_" if kept != list(around) else "").join(filter(None, kept)) or stem
+            yield around[0] + word + around[1] + suffix, shared + suffix
 
 
 def read_insertions(path: Path) -> Mapping[str, float]:
@@ -158,34 +214,61 @@ def read_insertions(path: Path) -> Mapping[str, float]:
     Raises
     ------
     UserError
+        As `read_numbers`.
+    """
+    read = read_numbers("--insertion", path, ("insertion_m",))
+    return {name: values[0] for name, values in read.items() if values is not None}
+
+
+def read_numbers(
+    option: str, path: Path, columns: tuple[str, ...]
+) -> dict[str, list[float] | None]:
+    """Read a CSV of numbers by name.
+
+    Parameters
+    ----------
+    option : str
+        For messages: the option that the file was given with.
+    path : Path
+        The file.
+    columns : tuple of str
+        Besides `name`; others are passed over.
+
+    Returns
+    -------
+    dict
+        Name to the columns' numbers, None where all of these fields are empty.
+
+    Raises
+    ------
+    UserError
         Unreadable, a column missing, a value that is not a finite number, or a name given twice;
         the message says in which line.
     """
-    insertions: dict[str, float] = {}
+    found: dict[str, list[float] | None] = {}
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             rows = csv.DictReader(file, skipinitialspace=True)
-            columns = rows.fieldnames or []
-            for column in ("name", "insertion_m"):
-                if column not in columns:
-                    raise UserError(f"--insertion {path}: no column {column!r} in its first line")
+            for column in ("name", *columns):
+                if column not in (rows.fieldnames or []):
+                    raise UserError(f"{option} {path}: no column {column!r} in its first line")
             for row in rows:
-                name, text = (row["name"] or "").strip(), (row["insertion_m"] or "").strip()
-                if not text:
-                    continue
-                where = f"--insertion {path}, line {rows.line_num}"
-                if name in insertions:
-                    raise UserError(f"{where}: {name!r} has an insertion already")
-                insertions[name] = finite_field(text, where, "insertion_m")
+                where = f"{option} {path}, line {rows.line_num}"
+                name, *texts = ((row[column] or "").strip() for column in ("name", *columns))
+                if name in found:
+                    raise UserError(f"{where}: {name!r} is there already")
+                values = zip(columns, texts, strict=True)
+                found[name] = (
+                    [_number(text, where, c) for c, text in values] if any(texts) else None
+                )
     except OSError as error:
-        raise UserError(f"--insertion {path}: {error.strerror}") from error
+        raise UserError(f"{option} {path}: {error.strerror}") from error
     except (UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"--insertion {path} is not a CSV file: {error}") from error
-    return insertions
+        raise UserError(f"{option} {path} is not a CSV file: {error}") from error
+    return found
 
 
-def finite_field(text: str, where: str, column: str) -> float:
-    """Return a field's number; raises UserError that says where if it is not a finite one."""
+def _number(text: str, where: str, column: str) -> float:
     try:
         value = float(text)
     except ValueError:
@@ -193,6 +276,13 @@ def finite_field(text: str, where: str, column: str) -> float:
     if not math.isfinite(value):
         raise UserError(f"{where}: {column} = {text!r} is not a finite number")
     return value
+
+
+def _image_folder(folder: Path) -> Path:
+    """Return where a folder's images are: in it, or in its `data` (as EuRoC and Kalibr lay it)."""
+    inner = folder / "data"
+    has_images = any(path.suffix.lower() in _SUFFIXES for path in folder.iterdir())
+    return inner if inner.is_dir() and not has_images else folder
 
 
 def _images_in(side: str, folder: Path) -> set[str]:

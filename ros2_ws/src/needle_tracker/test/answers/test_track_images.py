@@ -350,7 +350,7 @@ def test_what_was_found_is_drawn(folder: Path, calibration_path: Path) -> None:
     [
         ("name,x_m,y_m\n", "no column 'z_m'"),
         ("name,x_m,y_m,z_m\na,1,2,\n", "line 2: z_m = '' is not a finite number"),
-        ("name,x_m,y_m,z_m\na,1,2,3\na,1,2,3\n", "line 3: 'a' has a truth already"),
+        ("name,x_m,y_m,z_m\na,1,2,3\na,1,2,3\n", "line 3: 'a' is there already"),
     ],
 )
 def test_a_truth_that_is_none_is_refused_in_one_line(

@@ -34,6 +34,7 @@ def board_image(board: CharucoBoard, square_px: int) -> NDArray[np.uint8]:
     dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     shape = (board.columns, board.rows)
     pattern = cv2.aruco.CharucoBoard(shape, board.square, board.marker, dictionary)
+    pattern.setLegacyPattern(board.legacy)
     image = pattern.generateImage((shape[0] * square_px, shape[1] * square_px))
     return np.asarray(image, dtype=np.uint8)
 

@@ -55,7 +55,7 @@ def test_from_images_to_a_calibration_that_its_check_accepts(
     words = arguments(recorded, "--output", str(output), "--json", str(figures))
     assert calibrate_stereo(words) == 0
     text = capsys.readouterr().out
-    for line in ("left camera, under boards", "surface_height: 17.", "left.k3: not asked"):
+    for line in ("left camera, under boards", "surface_height: 17.", "left.k3: NOT DETERMINED"):
         assert line in text
     calibration = load_calibration(output)
     assert calibration.left.window.inside == pytest.approx(1.3, abs=0.003)
@@ -67,7 +67,7 @@ def test_from_images_to_a_calibration_that_its_check_accepts(
     assert values["tip_error_p95_mm"] < 0.06
     assert values["reprojection_left_under_px"] < 0.1
     assert values["determined_refractive_index"] is True
-    assert values["sigma_left_k3"] is None
+    assert values["determined_left_k3"] is False
     assert values["problem"] is None
 
     words = arguments(recorded, "--calibration", str(output), "--json", str(figures))

@@ -10,7 +10,7 @@ import pytest
 
 from needle_common.errors import UserError
 from needle_tracker.calibrating.calibration_file import save_calibration
-from needle_tracker.calibrating.calibration_start import first_calibration
+from needle_tracker.calibrating.calibration_start import cameras_alone, first_calibration
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
 from needle_tracker.calibrating.tip_error import measured_points
@@ -101,7 +101,8 @@ def test_outliers_do_not_bend_it(rig: TrueRig) -> None:
 
 def test_the_jacobian_is_that_of_the_residuals(rig: TrueRig) -> None:
     views = take(rig, np.random.default_rng(4), free=6, noise=0.0)
-    start, boards = first_calibration(views, SIZES, given(0.0175, 1.3))
+    cameras = cameras_alone(views, SIZES, given(0.0175, 1.3))
+    start, boards = first_calibration(views, cameras)
     model = RigModel(start, views, boards)
     everything = np.ones(len(model.start), dtype=bool)
     # Boards turned and shifted from where they start.

@@ -1,0 +1,224 @@
+"""Lenses and relative pose of two cameras as ROS, Kalibr or OpenCV wrote them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from needle_common.errors import UserError
+from needle_common.files.calibration_text import KALIBR, OPENCV, ROS, foreign_format, read_text
+from needle_tracker.optics.calibration import (
+    SIDES,
+    Camera,
+    StereoCalibration,
+    numbers,
+    value_of,
+)
+from needle_tracker.optics.camera_model import distort
+from needle_tracker.optics.window import Window
+
+Array = NDArray[np.float64]
+
+_RATIONAL = "rational_polynomial"  # of 4, 5, 8, 12 or 14 coefficients, as OpenCV has it
+_EQUIDISTANT = "equidistant"  # of 4: OpenCV's fisheye
+_MODELS = {"plumb_bob": _RATIONAL, "radtan": _RATIONAL, "none": _RATIONAL, "fisheye": _EQUIDISTANT}
+_COUNTS = {_RATIONAL: (4, 5, 8, 12, 14), _EQUIDISTANT: (4,)}
+_CURE = (
+    "calibrate as plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
+    "leave out --lenses"
+)
+_LARGEST_SKEW = 1e-3  # of a rotation's singular values: files have few digits
+_LARGEST_MISS_PX = 0.05  # of plumb_bob in place of another lens model, anywhere in the image
+
+
+class _Lens(NamedTuple):
+    """A camera as a file has it; `size` is None where it has none."""
+
+    path: Path
+    matrix: Array
+    model: str
+    coefficients: Array
+    size: tuple[int, int] | None
+
+
+class _Found(NamedTuple):
+    """What one file says: lenses; T_right_left; T_stereo_camera of ROS's rectification."""
+
+    lenses: list[_Lens]
+    pose: Array | None = None
+    rectified: Array | None = None
+
+
+def read_lenses(
+    paths: Sequence[Path], sizes: dict[str, tuple[int, int]], windows: tuple[Window, Window]
+) -> StereoCalibration:
+    """Read both cameras' lenses, and their relative pose where it is there.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        A camera_info for left and one for right, a Kalibr chain (cam0 is left), OpenCV's intrinsics
+        and extrinsics in any order.
+    sizes : dict of str to (int, int)
+        Width and height of each side's images [px].
+    windows : pair of Window
+        Of the left and the right camera.
+
+    Returns
+    -------
+    StereoCalibration
+        The left camera at the origin, the right one too where nothing says how they stand.
+        plumb_bob stands for another lens model where it is that to 0.05 px all over the image.
+
+    Raises
+    ------
+    UserError
+        A file that cannot be read or is none of these, not two cameras, images of another size, or
+        a lens that plumb_bob cannot describe.
+    """
+    found = [_read(path) for path in paths]
+    lenses = [lens for one in found for lens in one.lenses]
+    if len(lenses) != len(SIDES):
+        raise UserError(
+            f"--lenses {' '.join(map(str, paths))}: {len(lenses)} of two cameras: give a file for "
+            "left and one for right, or one with both"
+        )
+    poses = [one.pose for one in found if one.pose is not None]
+    rectified = [one.rectified for one in found if one.rectified is not None]
+    if len(rectified) == len(SIDES):
+        poses.append(np.linalg.inv(rectified[1]) @ rectified[0])
+    cameras: list[Camera] = []
+    for side, lens, window in zip(SIDES, lenses, windows, strict=True):
+        if lens.size is not None and lens.size != sizes[side]:
+            raise UserError(
+                f"--lenses {lens.path}: for {lens.size[0]}x{lens.size[1]}, the {side} images are "
+                f"{sizes[side][0]}x{sizes[side][1]}"
+            )
+        pose = poses[0] if poses and cameras else np.eye(4)
+        distortion = _plumb_bob(lens, sizes[side])
+        cameras.append(Camera(*sizes[side], lens.matrix, distortion, pose, window))
+    return StereoCalibration(*cameras)
+
+
+def _read(path: Path) -> _Found:
+    text = read_text(path, "lenses")
+    kind = foreign_format(text)
+    try:
+        if kind == OPENCV:
+            return _opencv(text, path)
+        if kind in (KALIBR, ROS):
+            content = next(iter(yaml.safe_load_all(text)))
+            return _kalibr(content, path) if kind == KALIBR else _camera_info(content, path)
+    except yaml.YAMLError as error:
+        reason = " ".join(str(error).split())
+        raise UserError(f"--lenses {path} is not YAML: {reason}") from error
+    except UserError as error:
+        raise UserError(f"--lenses {path}, {kind}: {error}") from error
+    raise UserError(f"--lenses {path}: neither ROS, Kalibr nor OpenCV wrote it")
+
+
+def _camera_info(content: Any, path: Path) -> _Found:
+    lens = _one_camera(content, path, str(content.get("distortion_model")))
+    rotation = numbers(content, 9, "rectification_matrix", "data").reshape(3, 3)
+    projection = numbers(content, 12, "projection_matrix", "data").reshape(3, 4)
+    shift = np.append(projection[:2, 3] / np.maximum(np.diag(projection)[:2], 1e-9), 0.0)
+    return _Found([lens], rectified=_transform(rotation, -shift))
+
+
+def _kalibr(content: Any, path: Path) -> _Found:
+    lenses = []
+    for name in sorted(content)[: len(SIDES)]:
+        camera = value_of(content, name, "camera_model")
+        if camera != "pinhole":
+            raise UserError(f"{name}.camera_model = {camera!r}: {_CURE}")
+        fx, fy, cx, cy = numbers(content, 4, name, "intrinsics")
+        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        model = str(value_of(content, name, "distortion_model"))
+        coefficients = numbers(content, None, name, "distortion_coeffs")
+        width, height = map(int, numbers(content, 2, name, "resolution"))
+        coefficients = np.zeros(4) if model == "none" else coefficients
+        lenses.append(_Lens(path, matrix, model, coefficients, (width, height)))
+    if len(lenses) < len(SIDES):
+        return _Found(lenses)
+    pose = numbers(content, 16, name, "T_cn_cnm1").reshape(4, 4)
+    return _Found(lenses, _transform(pose[:3, :3], pose[:3, 3]))
+
+
+def _opencv(text: str, path: Path) -> _Found:
+    """Return what OpenCV's samples `stereo_calib` (two files) and `calibration` write."""
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
+        content: dict[str, Any] = {
+            key: {"data": node.mat().ravel().tolist()} if node.isMap() else node.real()
+            for key, node in nodes.items()
+        }
+    except (AttributeError, SystemError, cv2.error) as error:
+        raise UserError("it is damaged") from error
+    lenses = [
+        _Lens(path, _matrix(content, key), _RATIONAL, numbers(content, None, other, "data"), None)
+        for key, other in (("M1", "D1"), ("K1", "D1"), ("M2", "D2"), ("K2", "D2"))
+        if key in content
+    ]
+    if "camera_matrix" in content:
+        model = _EQUIDISTANT if content.get("fisheye_model") else _RATIONAL
+        lenses.append(_one_camera(content, path, model))
+    if "R" not in content:
+        return _Found(lenses)
+    return _Found(lenses, _transform(_matrix(content, "R"), numbers(content, 3, "T", "data")))
+
+
+def _one_camera(content: Any, path: Path, model: str) -> _Lens:
+    width, height = (int(value_of(content, f"image_{name}")) for name in ("width", "height"))
+    coefficients = numbers(content, None, "distortion_coefficients", "data")
+    return _Lens(path, _matrix(content, "camera_matrix"), model, coefficients, (width, height))
+
+
+def _matrix(content: Any, key: str) -> Array:
+    return numbers(content, 9, key, "data").reshape(3, 3)
+
+
+def _transform(rotation: Array, translation: Array) -> Array:
+    left, scales, right = np.linalg.svd(rotation)
+    if np.abs(scales - 1.0).max() > _LARGEST_SKEW or np.linalg.det(rotation) < 0.0:
+        raise UserError(f"{np.round(rotation, 4).tolist()} is no rotation")
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = left @ right, translation
+    return transform
+
+
+def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
+    """Return k1, k2, p1, p2, k3 of a lens, shape (5,)."""
+    matrix, coefficients = lens.matrix, lens.coefficients
+    model = _MODELS.get(lens.model, lens.model)
+    if len(coefficients) not in _COUNTS.get(model, ()):
+        count = len(coefficients)
+        raise UserError(f"--lenses {lens.path}: {lens.model} of {count} coefficients: {_CURE}")
+    if model == _RATIONAL and not np.any(coefficients[5:]):
+        return np.append(coefficients, 0.0)[:5]
+    # Rays from the middle outwards, as far as they are in the image.
+    turns, slopes = np.linspace(0.0, 2.0 * np.pi, 72), np.tan(np.linspace(0.0, 1.4, 141))
+    ideal = np.stack([np.outer(np.cos(turns), slopes), np.outer(np.sin(turns), slopes)], axis=-1)
+    points = np.insert(ideal.reshape(-1, 1, 2), 2, 1.0, axis=-1)
+    project = cv2.projectPoints if model == _RATIONAL else cv2.fisheye.projectPoints
+    pixels, _ = project(points, np.zeros(3), np.zeros(3), matrix, coefficients)
+    pixels = pixels.reshape(ideal.shape)
+    inside = np.all((pixels >= 0.0) & (pixels <= np.array(size) - 1.0), axis=-1)
+    inside = np.logical_and.accumulate(inside, axis=1)
+    ideal, seen = ideal[inside], (pixels[inside] - matrix[:2, 2]) / matrix[[0, 1], [0, 1]]
+    # plumb_bob is linear in its coefficients.
+    basis = np.stack([(distort(ideal, unit) - ideal).ravel() for unit in np.eye(5)], axis=-1)
+    found = np.linalg.lstsq(basis, (seen - ideal).ravel(), rcond=None)[0]
+    miss = float(np.abs(distort(ideal, found) - seen).max() * matrix[0, 0])
+    if miss > _LARGEST_MISS_PX:
+        raise UserError(
+            f"--lenses {lens.path}: k1, k2, p1, p2 and k3 describe its {lens.model} lens to "
+            f"{miss:.2f} px only: {_CURE}"
+        )
+    return np.asarray(found)
