@@ -11,7 +11,7 @@ from needle_tracker.answers.swapped_images import SUSPICION
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 
 TROUBLE_SHOWN = 5.0  # a warning stays this long after what caused it [s]
 PARTNER_LATE = 0.5  # an image without a partner is reported after [s]

@@ -11,7 +11,7 @@ from needle_tracker.image.detection import Image
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.evidence import CLEAR_ALONG_PX, CLEAR_PX, is_sound
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 

@@ -27,8 +27,8 @@ from needle_tracker.answers.truth_comparison import TruthComparison, read_truth
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
 from needle_tracker.sources.image_files import NamedPair, PairSequence, open_pairs, read_insertions
 from needle_tracker.tracking.measurement import Measurement
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.track import TrackState
 
 DESCRIPTION = """\
 Measure the needle's tip in stereo images, paired by file name and taken in the order of their names

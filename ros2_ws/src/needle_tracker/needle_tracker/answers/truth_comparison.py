@@ -12,7 +12,7 @@ import numpy.typing as npt
 from needle_common.commands.cli import JsonValue
 from needle_tracker.sources.image_files import read_numbers
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 
 Array = npt.NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from needle_common.errors import UserError
-from needle_tracker.calibrating.board_recognition import check_board_seen
 from needle_tracker.calibrating.calibration_session import Session
+from needle_tracker.calibrating.charuco import check_board_seen
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import SIDES
 from needle_tracker.sources.image_files import Image, open_pairs

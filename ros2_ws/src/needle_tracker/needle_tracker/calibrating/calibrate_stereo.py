@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
 from needle_common.commands.options import CommandParser
 from needle_common.errors import UserError
 from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
 from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
-from needle_tracker.calibrating.calibration_file import save_calibration
 from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error
 from needle_tracker.calibrating.calibration_session import load_session
 from needle_tracker.calibrating.charuco import CharucoBoard, write_board
@@ -22,7 +22,8 @@ from needle_tracker.calibrating.imported_lenses import read_lenses
 from needle_tracker.calibrating.pair_consistency import PairsApartError, apart_in_words
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import SURFACE, BoardView
-from needle_tracker.optics.calibration import SIDES
+from needle_tracker.optics.calibration import SIDES, StereoCalibration
+from needle_tracker.optics.window import Window
 
 _DESCRIPTION = """\
 Calibrate the stereo rig from images of a ChArUco board.
@@ -231,6 +232,76 @@ def _parser() -> CommandParser:
     add("--json", type=Path, metavar="FILE", help="also write the figures as flat JSON")
     add("--board", type=Path, metavar="FILE.pdf|.png", help="write a board to print and end")
     return parser
+
+
+def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str:
+    """Return the YAML text of a calibration.
+
+    Parameters
+    ----------
+    calibration : StereoCalibration
+        What to write.
+    comments : list of str
+        Lines to put before it.
+    """
+    surface = calibration.surface
+    lines = [f"# {line}" for line in comments]
+    if surface is not None:
+        lines.append(
+            f"phantom: {{surface_height: {surface.point[0]:.9f}, "
+            f"refractive_index: {surface.inside:.6f}}}"
+        )
+    for side in SIDES:
+        camera = calibration.left if side == "left" else calibration.right
+        matrix = ", ".join(f"{value:.4f}" for value in camera.camera_matrix.ravel())
+        lens = ", ".join(f"{value:.9f}" for value in camera.distortion)
+        translation = ", ".join(f"{value:.9f}" for value in camera.T_optical_rig[:3, 3])
+        quaternion = Rotation.from_matrix(camera.T_optical_rig[:3, :3]).as_quat()
+        rotation = ", ".join(f"{value:.12f}" for value in quaternion)
+        lines += [
+            f"{side}:",
+            f"  image_width: {camera.width}",
+            f"  image_height: {camera.height}",
+            f"  camera_matrix: {{rows: 3, cols: 3, data: [{matrix}]}}",
+            "  distortion_model: plumb_bob",
+            f"  distortion_coefficients: {{rows: 1, cols: 5, data: [{lens}]}}",
+            "  T_optical_rig:",
+            f"    translation: [{translation}]",
+            f"    rotation: [{rotation}]",
+        ]
+        if surface is None:
+            lines += _window_lines(camera.window)
+    return "\n".join(lines) + "\n"
+
+
+def _window_lines(window: Window) -> list[str]:
+    point = ", ".join(f"{value:.9f}" for value in window.point)
+    normal = ", ".join(f"{value:.12f}" for value in window.normal)
+    layers = ", ".join(
+        f"{{thickness: {layer.thickness:.9f}, refractive_index: {layer.refractive_index:.6f}}}"
+        for layer in window.layers
+    )
+    return [
+        "  window:",
+        f"    point: [{point}]",
+        f"    normal: [{normal}]",
+        f"    layers: [{layers}]",
+        f"    inside: {window.inside:.6f}",
+    ]
+
+
+def save_calibration(path: Path, calibration: StereoCalibration, comments: list[str]) -> None:
+    """Write a calibration file.
+
+    Raises
+    ------
+    UserError
+        If it cannot be written.
+    """
+    try:
+        path.write_text(calibration_text(calibration, comments), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}") from error
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ class _Lens(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What one file says: lenses; T_right_left; T_stereo_camera of ROS's rectification."""
+    """Content of one file: lenses; T_right_left; T_stereo_camera of ROS's rectification."""
 
     lenses: list[_Lens]
     pose: Array | None = None

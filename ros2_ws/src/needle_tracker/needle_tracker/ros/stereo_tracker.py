@@ -34,7 +34,7 @@ from needle_tracker.ros.tracker_messages import (
     image_topic,
     output_messages,
 )
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 
 HELP = """
 stereo_tracker: where the needle's tip is, from stereo images through the phantom's surface.

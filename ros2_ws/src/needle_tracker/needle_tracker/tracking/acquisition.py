@@ -1,8 +1,7 @@
 """Find the needle where no prediction says where its end must be, and judge what is found.
 
 First along the way that the needle has gone, then everywhere that it can reach. What is found so
-has to be seen better, or more often, than what is followed; the whole shaft counts, not its end
-alone. Where something crosses the needle its path leads astray; then one view guides the other.
+must be seen better, or more often, than what is followed; the whole shaft counts.
 """
 
 from __future__ import annotations
@@ -39,14 +38,13 @@ from needle_tracker.tracking.evidence import (
 from needle_tracker.tracking.following import FOLLOW_AHEAD, SOUND_ALONG_PX, SOUND_PX, Follower
 from needle_tracker.tracking.guided_search import guided_pairs, leads, predicted_from_entry
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.refusals import NoTip
+from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.tip_prediction import Anchor
-from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Last = tuple[ImageTip, ImageTip]
-
 # A needle so short [m] is near where the entry has it, to so much of its covariance; and so near if
 # that is to say which of two ends is the needle's.
 _ENTRY_REGION, _ENTRY_SURPRISE, _ENTRY_NEAR = 15e-3, 9.0, 2.0
@@ -54,8 +52,8 @@ _FROM_ENTRY = 25e-3  # up to here the entry says about where the end is [m]
 _FITTING = 9.0  # squared, over the covariance: place and direction of what one view guides to
 _AGREE = 1e-3  # two views that say the same do so along the needle, too [m]
 _CUT = 1.2e-3  # a path's length says so well where the needle ends (one sigma) [m]
-_GRID_AHEAD = 1.5e-3
-_GRID_MARGIN = 3e-3  # needles off the grid's plane appear displaced along it [m]
+# Needles off the grid's plane appear displaced along it [m].
+_GRID_AHEAD, _GRID_MARGIN = 1.5e-3, 3e-3
 
 
 class Acquisition:

@@ -18,7 +18,7 @@ from needle_tracker.tracking.following import (
     shows_end,
 )
 from needle_tracker.tracking.following import is_sound as shows_end_well
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 
 Found = tuple[ImageTip | None, ImageTip | None]
 

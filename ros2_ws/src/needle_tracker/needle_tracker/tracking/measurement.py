@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from needle_tracker.image.tip_fit import Expected, ImageTip
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.evidence import has_come
-from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.refusals import NoTip, TrackState
+from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.triangulation import SpatialTip, triangulate
 
 Array = NDArray[np.float64]

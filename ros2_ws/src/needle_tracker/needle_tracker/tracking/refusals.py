@@ -1,8 +1,18 @@
-"""Reasons why what was seen is not the tip; their texts are counted by and told."""
+"""States of the track, and reasons why a pair gives no tip; their texts are counted and shown."""
 
 from __future__ import annotations
 
 import enum
+
+
+class TrackState(enum.Enum):
+    """The tracker's knowledge of the needle."""
+
+    SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
+    CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
+    TRACKING = "TRACKING"
+    LOST = "LOST"  # was tracked and is not seen; found again only where it can have got to
+    ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
 
 
 class NoTip(str, enum.Enum):

@@ -248,3 +248,38 @@ class Sights:
 def across(unit: Array) -> Array:
     """Return the projection onto the plane across a unit vector, (3, 3)."""
     return np.eye(3) - np.outer(unit, unit)
+
+
+_END_PITCH = 0.5e-3
+"""Insertion per end that is kept [m]."""
+_SHOULD_HAVE_MOVED = 3e-3
+"""Insertion after which a needle's end must have moved [m]."""
+_STILL = 0.25
+"""An end that moved by less than this share of the insertion stayed still."""
+_OFTEN = 2
+"""Earlier sightings that show it: a glint may move a needle's end by its face, up to 2 mm."""
+
+
+class SeenEnds:
+    """Places of an end, by insertion."""
+
+    def __init__(self) -> None:
+        self._ends: dict[int, tuple[float, Array]] = {}
+
+    def add(self, position: Array, insertion: float) -> None:
+        """Note an end at `position` in `rig` [m], seen at an insertion [m]."""
+        self._ends[round(insertion / _END_PITCH)] = insertion, position
+
+    def is_still(self, position: Array, insertion: float) -> bool:
+        """Return whether an end at `position` [m] did not move with the needle.
+
+        Parameters
+        ----------
+        position : ndarray, shape (3,)
+            The end in `rig` [m].
+        insertion : float
+            Of the needle now [m].
+        """
+        moved = [(abs(insertion - at), position - end) for at, end in self._ends.values()]
+        long = [(way, off) for way, off in moved if way >= _SHOULD_HAVE_MOVED]
+        return sum(float(np.linalg.norm(off)) < _STILL * way for way, off in long) >= _OFTEN

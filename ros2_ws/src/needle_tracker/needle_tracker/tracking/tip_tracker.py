@@ -17,8 +17,7 @@ from needle_tracker.image.looks import CLEAR_WIDTHS, MapLook
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.claims import OF_LAMP, OF_MAP, OF_OUTLINE, Claims, StagedEnd
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import NoTip, progress
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import NoTip, TrackState, progress
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip

@@ -6,15 +6,14 @@ data.
 
 from __future__ import annotations
 
-import enum
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from needle_tracker.tracking.gates import GateSettings, refusal
-from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.tip_prediction import Anchor, Sights, TipMotion
+from needle_tracker.tracking.refusals import NoTip, TrackState
+from needle_tracker.tracking.tip_prediction import Anchor, SeenEnds, Sights, TipMotion
 from needle_tracker.tracking.triangulation import SpatialTip
 
 Array = NDArray[np.float64]
@@ -29,25 +28,12 @@ _NEAR_ENTRY = 10e-3  # up to here the entry says where it is [m]
 _PITCH = 0.5e-3  # of the places that the tip has passed [m]
 # The shaft may lie so far beside them: a pre-bend, an error, tissue that gives [m].
 _BESIDE = 2.0e-3
-# An end that has gone less than a quarter of so much insertion [m] stays: twice, for a glint may
-# move a needle's end by its face, of up to 2 mm.
-_SHOULD_HAVE_GONE, _STAYS, _OFTEN = 3e-3, 0.25, 2
 _CONFIRM_KNOWN = 2
 _CONFIRM_MISSES = 2  # so many pairs may lie between
 _EXPECTED, _NO_SURPRISE = 4.0, 9.0  # squared, over its covariance
 _NEAR, _FAR = 2e-3, 3e-3  # from the prediction [m]
 _WORST_PREDICTION = 1.5e-3  # what is known worse bears nothing out (one sigma) [m]
 _LARGEST_SURPRISE = 25.0  # squared, over its covariance
-
-
-class TrackState(enum.Enum):
-    """The tracker's knowledge of the needle."""
-
-    SEARCHING = "SEARCHING"  # nothing is known: the whole reachable region is searched
-    CONFIRMING = "CONFIRMING"  # something like a needle, not believed yet
-    TRACKING = "TRACKING"
-    LOST = "LOST"  # was tracked and is not seen; found again only where it can have got to
-    ENTRY = "ENTRY"  # too short to be seen: the tip follows from the insertion
 
 
 class Track:
@@ -68,8 +54,7 @@ class Track:
         """Forget everything."""
         # Pairs of a recording in which an end may be believed that only the empty phantom lacks.
         self._unproven = self._settings.confirm_pairs
-        # Where ends were seen, each with its insertion [m].
-        self._ends: dict[int, tuple[float, Array]] = {}
+        self._ends = SeenEnds()
         self.drop()
 
     def drop(self) -> None:
@@ -93,15 +78,7 @@ class Track:
     def predict(self, insertion: float | None) -> Anchor | None:
         """Return where the tip should be now, None where there is no idea.
 
-        Parameters
-        ----------
-        insertion : float or None
-            Length of needle in the phantom at the exposure [m].
-
-        Returns
-        -------
-        Anchor or None
-            The last believed tip, moved on along its direction by the insertion since.
+        It is the last believed tip, moved along its direction by the insertion [m] since then.
         """
         anchor = self.anchor
         if anchor is None:
@@ -219,7 +196,7 @@ class Track:
         if insertion is not None:
             self._passed = [p for p in self._passed if p[0] < insertion - _PITCH]
             self._passed.append((insertion, motion.position))
-            self._ends[round(insertion / _PITCH)] = insertion, seen_at
+            self._ends.add(seen_at, insertion)
         return tip if believed else None
 
     def _seen_again(self, tip: SpatialTip, insertion: float | None, rival: Sights | None) -> Sights:
@@ -244,9 +221,7 @@ class Track:
         old track, a scratch or a screw from a needle at rest.
         """
         if insertion is not None:
-            ways = [(abs(insertion - at), tip.position - end) for at, end in self._ends.values()]
-            long = [(way, off) for way, off in ways if way >= _SHOULD_HAVE_GONE]
-            return sum(float(np.linalg.norm(off)) < _STAYS * way for way, off in long) >= _OFTEN
+            return self._ends.is_still(tip.position, insertion)
         agreeing = self._agreeing
         if self.state is not TrackState.CONFIRMING or agreeing is None:
             return False

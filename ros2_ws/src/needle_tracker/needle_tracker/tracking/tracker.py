@@ -36,9 +36,9 @@ from needle_tracker.tracking.following import (
 )
 from needle_tracker.tracking.gates import tip_at_entry
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.refusals import NoTip
+from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.single_view import Seen, kept_up, seen_alone
-from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 

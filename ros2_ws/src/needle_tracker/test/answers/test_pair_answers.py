@@ -8,7 +8,7 @@ import pytest
 from needle_tracker.answers.pair_answers import Frame, PairAnswers, PairingSettings
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
 

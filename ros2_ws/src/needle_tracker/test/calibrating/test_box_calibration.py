@@ -15,9 +15,8 @@ from needle_sim.camera.insertions import render_insertion
 from needle_sim.camera.scenarios import CLEAN
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_tracker.answers.tracker_parameters import default_settings
-from needle_tracker.calibrating.calibrate_stereo import main
+from needle_tracker.calibrating.calibrate_stereo import main, save_calibration
 from needle_tracker.calibrating.calibration_check import check
-from needle_tracker.calibrating.calibration_file import save_calibration
 from needle_tracker.calibrating.calibration_session import load_session, parse_session
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import BoardView, RigModel

@@ -16,7 +16,7 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import Camera, StereoCalibration
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 
 Exposure = tuple[float, np.ndarray, np.ndarray, np.ndarray]

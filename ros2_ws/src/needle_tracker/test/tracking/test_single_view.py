@@ -14,10 +14,9 @@ from needle_tracker.answers.health import Health
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.acquisition import Acquisition
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import NoTip
+from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.single_view import seen_alone
 from needle_tracker.tracking.tip_prediction import Anchor, TipMotion
-from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import EACH_VIEW, ONE_VIEW, StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip

@@ -16,9 +16,8 @@ from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.optics.refraction import RefractedCamera
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import NoTip, progress
+from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.track import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
@@ -374,22 +373,6 @@ def test_the_reason_is_that_of_whichever_got_farther(
     for _ in range(3):
         reason()
     assert reason() == "no clear tip in the left image"
-
-
-def test_reasons_are_in_the_order_in_which_a_pair_meets_them() -> None:
-    met = [
-        "no needle in the right image",
-        "no clear tip in the left image",
-        NoTip.NO_COMMON_POINT,
-        NoTip.DISAGREE_ALONG,
-        NoTip.SHORT_OF_INSERTION,
-        "the shaft's length is not the insertion",
-        NoTip.UNCLEAR,
-        NoTip.UNCONFIRMED,
-        NoTip.STANDS,
-    ]
-    ranks = [progress(str(reason)) for reason in met]
-    assert ranks == sorted(set(ranks))
 
 
 def test_a_new_insertion_begins_with_lines(

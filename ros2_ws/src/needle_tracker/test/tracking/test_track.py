@@ -12,8 +12,8 @@ import pytest
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.window import Layer, Window
 from needle_tracker.tracking.gates import GateSettings, refusal, tip_at_entry
-from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.refusals import NoTip, TrackState
+from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 from needle_tracker.tracking.triangulation import SpatialTip
 

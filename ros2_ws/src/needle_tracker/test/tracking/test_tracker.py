@@ -17,7 +17,7 @@ from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 

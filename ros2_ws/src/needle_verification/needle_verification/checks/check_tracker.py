@@ -9,7 +9,7 @@ import numpy as np
 from ament_index_python.packages import get_package_share_directory
 
 from needle_tracker.optics.calibration import load_calibration
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.tracking.calibration_study import calibrated_tip_errors
 from needle_verification.tracking.tracker_sequences import insertion_sequence

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from needle_tracker.answers.tracker_parameters import default_settings
 from needle_tracker.optics.calibration import StereoCalibration, load_calibration
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tip_tracker import TipTracker
-from needle_tracker.tracking.track import TrackState
 from needle_verification.tracking.tracker_sequences import Exposure, insertion_sequence
 
 Array = NDArray[np.float64]

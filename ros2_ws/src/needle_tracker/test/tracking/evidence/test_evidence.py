@@ -26,7 +26,8 @@ from needle_tracker.tracking.evidence import (
     sights_to_exclude,
 )
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.track import Track, TrackState
+from needle_tracker.tracking.refusals import TrackState
+from needle_tracker.tracking.track import Track
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 

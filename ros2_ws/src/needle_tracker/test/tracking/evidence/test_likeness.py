@@ -17,7 +17,7 @@ from needle_tracker.tracking.evidence import (
     sights_to_confirm,
 )
 from needle_tracker.tracking.measurement import Measurement, judged
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 

@@ -16,8 +16,7 @@ from needle_tracker.tracking import acquisition
 from needle_tracker.tracking import tracker as following_tracker
 from needle_tracker.tracking.evidence import VisibilityAverage
 from needle_tracker.tracking.measurement import Measurement
-from needle_tracker.tracking.refusals import NoTip
-from needle_tracker.tracking.track import TrackState
+from needle_tracker.tracking.refusals import NoTip, TrackState
 from needle_tracker.tracking.tracker import StereoTracker
 
 from .shown_needle import Arc, Drawer, Image, Views, last_seen
