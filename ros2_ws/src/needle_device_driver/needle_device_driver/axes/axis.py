@@ -62,7 +62,7 @@ class AxisSnapshot:
         Whether a stopped axis is switched off until the next order to move, since it was blocked
         short of where its controller wants it.
     unstopped : str
-        State of an axis that should have stopped and switched off long ago; empty: it has.
+        State of an axis that should have stopped and switched off long ago; empty: it did.
     origin : int
         Changes whenever `position` begins to count from elsewhere.
     """

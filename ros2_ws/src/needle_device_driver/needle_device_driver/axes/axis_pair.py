@@ -42,12 +42,12 @@ class PairSnapshot:
         return " and ".join(name for name, at in self.by_name.items() if at.let_go)
 
     def unstopped(self, oldest: float) -> str:
-        """Return which axes were stopped and switched off and are not, or do not say so.
+        """Return the axes that did not stop and switch off, or do not answer, and how.
 
         Parameters
         ----------
         oldest : float
-            Steady time from which on a reply says so [s].
+            Steady time of the oldest reply that counts as an answer [s].
         """
         return "; ".join(
             f"{name} axis {at.unstopped or 'silent'}"

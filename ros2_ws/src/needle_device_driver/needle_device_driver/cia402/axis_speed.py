@@ -7,18 +7,18 @@ import math
 from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.cia402.drive_settings import DriveSettings
 
-# Of the commanded speed, to which the axis' own margin comes [m/s], [rad/s].
+# Bound: this factor times the commanded speed, plus a margin by the axis' unit [m/s], [rad/s].
 _FACTOR = 1.5
 _MARGINS = {"m": 5e-4, "rad": 0.1}
-# In answered cycles that are too fast one after the other: a drive that goes to 0 at its home makes
-# one of them.
+# Answered cycles in a row that are too fast. One is no fault: a drive makes one when it sets its
+# position to 0 at home.
 _TOO_FAST = 2
-# A motor that lags behind its set-points goes on after them [s].
+# Time constant of a motor that lags behind its set-points [s].
 _LONGEST_LAG = 0.2
 
 
 class SpeedWatch:
-    """Compares the speed of an axis with the speed that was last commanded.
+    """Compares the speed of an axis with its commanded speed.
 
     Parameters
     ----------
@@ -30,31 +30,32 @@ class SpeedWatch:
     Attributes
     ----------
     trouble : str
-        How the axis was too fast; empty: it was not.
+        Why the axis is too fast; empty: it is not.
     """
 
     def __init__(self, settings: DriveSettings, period: float) -> None:
         self._settings = settings
         self._period = period
-        # A drive slows down on its ramp, and the motor behind it.
+        # The commanded speed fades no faster than the axis slows down.
         self._fading = math.exp(-period / max(settings.stop_time, _LONGEST_LAG))
         self.forget()
 
     def forget(self) -> None:
-        """Begin anew with an axis that was commanded nothing."""
+        """Begin anew: no speed is commanded."""
         self._commanded = 0.0
         self._cycles = 0
         self.trouble = ""
 
     def command(self, speed: float) -> None:
-        """Take a speed that is commanded for the next cycle [m/s or rad/s]."""
+        """Take the speed that is commanded for the next cycle [m/s or rad/s]."""
         self._commanded = max(self._commanded, speed)
 
     def judge(self, before: Feedback, at: Feedback, *, powered: bool) -> bool:
-        """Return whether the way between two answers is one that the axis may have gone.
+        """Return whether the axis may have gone this way between two answers.
 
-        Its time is the number of SYNC periods, by whichever of SYNCs, answers and arrival says
-        most: answers may be lost, or late, and a late SYNC finds the axis farther on.
+        The time is counted in SYNC periods: the most of the SYNCs sent, the answers received, and
+        the time between both answers. Answers get lost or come late, and a late SYNC finds the axis
+        farther along.
         """
         settings, told = self._settings, self._commanded
         periods = max(

@@ -96,10 +96,10 @@ class DriveMachine:
 
     @property
     def unstopped(self) -> str:
-        """State of a drive that should have stopped and switched off long ago; empty: it has."""
+        """State of a drive that should have stopped and switched off long ago; empty: it did."""
         powered = self.state in (*POWERED, DriveState.FAULT_REACTION_ACTIVE)
         late = self._cycles > self._longest_stop + _WINDOW
-        # Once it has come to rest without power, a hand moves it.
+        # A hand may move an axis that has come to rest without power.
         moving = late and self._goes_on and (powered or not self._rested)
         told = ["powered"] * (powered and self._cycles > LONGEST_REST) + ["moving"] * moving
         return f"still {' and '.join(told)}" if told and self._goal is Goal.OFF else ""

@@ -139,8 +139,8 @@ def _set_up_motion(
     speed = settings.magnitude(settings.speed, settings.speed_unit)
     ramp = settings.magnitude(settings.acceleration, settings.ramp_unit)
     stop_ramp = settings.magnitude(settings.quick_stop_deceleration, settings.ramp_unit)
-    # Entries that a drive need not have. Of those that a rule depends on: the least and the most
-    # that the drive may make of them, for rounded is not clipped.
+    # Entries that a drive may lack. Where a rule needs one: the least and the most that the drive
+    # may round it to; less or more is clipped.
     wanted: list[tuple[od.Entry, int, tuple[int, int] | None]] = [
         # Ramps, never coasting; without the computer's heartbeat a fault, which latches.
         (od.SHUTDOWN_OPTION, 1, None),
@@ -177,10 +177,10 @@ def _write_heartbeat(access: ObjectAccess) -> None:
 
 
 def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> None:
-    """Refuse a drive that lacks a mode; it is off.
+    """Refuse a drive that lacks a mode; the drive is off.
 
-    A drive that lists no modes (0x6502) is told each. So is one that does not list cyclic
-    synchronous position: some have it all the same.
+    Without 0x6502 each mode is tried. Cyclic synchronous position is also tried where 0x6502 does
+    not list it: an EPOS4 supports it all the same.
     """
     listed = access.ask(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
@@ -192,7 +192,7 @@ def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> None:
 
 
 def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> None:
-    """Refuse a drive that refuses to be in a mode, or does not say that it is."""
+    """Refuse a drive that does not take a mode, or does not show it."""
     access.write(od.MODE_OF_OPERATION, mode)
     until = link.clock() + _MODE_WAIT
     while (shown := access.read(od.MODE_DISPLAY)) != mode:
@@ -204,7 +204,7 @@ def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> Non
 
 
 def _set(access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, int] | None) -> str:
-    """Write an entry; return what the drive lacks. One that no rule needs it may refuse."""
+    """Write an entry; return what the drive lacks. It may refuse an entry that no rule needs."""
     try:
         if taken is None:
             access.write(entry, value)

@@ -8,11 +8,11 @@ from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSetting
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 
-# Numerators and denominators; what has no dimension is counted.
+# Codes of numerators and denominators. A quantity without dimension is in counts.
 _NUMERATORS = {0x00: "counts", 0x01: "m", 0x10: "rad", 0x41: "deg", 0xB4: "turns", 0xB5: "counts"}
 _DENOMINATORS = {0x00: "", 0x03: "/s", 0x47: "/min", 0x57: "/s^2"}
 _TURNED = {(0xB4, 0x47): "rpm", (0xC0, 0x03): "rpm/s"}
-# Of each object what it is about, and the units that are taken.
+# Quantity of each object, and the units that are accepted.
 _TAKEN = {
     od.POSITION_UNIT: ("positions", "counts"),
     od.SPEED_UNIT: ("speeds", "counts/s", "rpm"),
@@ -58,7 +58,7 @@ def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSett
         "home it without a needle first (docs/hardware.md)"
     )
     speed = speed or 1.0
-    # A homing to an index pulse is bounded by a turn, too.
+    # The bound of a homing to an index pulse includes one turn.
     turn = _counts_per_turn(access, settings) if settings.homing_method in INDEX_PULSE else 0.0
     settings = dataclasses.replace(
         settings, counts_per_turn=turn, speed_unit=speed, ramp_unit=ramp or speed

@@ -19,9 +19,9 @@ from needle_device_driver.link import objects as od
 # A homing where the axis stands ends within a cycle; so many later its end is believed although
 # the drive never took the end of the one before back.
 _INSTANT = 5
-# Of its travel an axis looks for its home over so much.
+# Share of its travel over which an axis searches for its home.
 _SEARCH = 1.2
-# Methods that end at a limit switch: where it lies, and its bit of the digital inputs.
+# Methods that end at a limit switch: its direction in counts, its bit of the digital inputs.
 _TOWARDS = {17: (-1, od.NEGATIVE_LIMIT_SWITCH), 18: (1, od.POSITIVE_LIMIT_SWITCH)}
 
 
@@ -58,7 +58,7 @@ class HomingRun:
         self._settings = settings
         self.speed = speed
         method = settings.homing_method
-        # An index pulse comes within a turn beyond the switch.
+        # An index pulse lies within one turn beyond the switch.
         turn = (method in INDEX_PULSE) * settings.counts_per_turn
         self._longest = _SEARCH * settings.travel + turn / settings.counts_per_unit
         self._towards, self._switch = _TOWARDS.get(method * switches, (0, 0))
@@ -69,7 +69,7 @@ class HomingRun:
         self.step = HomingStep.PREPARING
 
     def update(self, at: Feedback, way: int) -> None:
-        """Take what the drive says now, and its way since the last answer [counts]."""
+        """Take the newest answer, and the way since the one before [counts]."""
         attained = bool(at.statusword & HOMING_ATTAINED)
         ended = attained and bool(at.statusword & TARGET_REACHED)
         if self.step is HomingStep.PREPARING:
@@ -100,7 +100,7 @@ class HomingRun:
             self.step = HomingStep.DONE
 
     def _watch_way(self, at: Feedback, way: int) -> None:
-        """Bound the way from the begin, in the direction of the method until its switch is hit."""
+        """Bound the way from its start, and its direction until the switch was touched."""
         settings = self._settings
         self._way += way
         if at.inputs & self._switch:

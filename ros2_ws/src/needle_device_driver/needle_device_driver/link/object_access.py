@@ -76,10 +76,7 @@ class ObjectAccess:
             raise self._error("read", entry, error) from error
 
     def ask(self, entry: Entry) -> int | None:
-        """Return an entry's value; None where the drive does not have or tell it.
-
-        Raises as `read`, but for a refusal.
-        """
+        """Return an entry's value, None if the drive refuses to tell it; else raises as `read`."""
         try:
             return self.read(entry)
         except DriveRefusalError:

@@ -14,7 +14,7 @@ from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, 
 from needle_device_driver.supervisor.retraction_bound import RetractionBound
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
 
-# Of the time on a switch so much counts: its edge is looked for at a quarter of the speed.
+# Weight of the time on a switch: a drive leaves it at a quarter of the homing speed.
 _OFF_SWITCH = 0.25
 _WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
 
@@ -94,7 +94,7 @@ class DeviceCore:
 
     @property
     def fault_now(self) -> str:
-        """Reason of FAULT or ESTOPPED, and which axis did not stop for it."""
+        """Reason of FAULT or ESTOPPED, and the axes that did not stop."""
         return f"{self.fault}; {self._unstopped}" if self._unstopped else self.fault
 
     @property
@@ -363,7 +363,7 @@ class DeviceCore:
         """Read the axes and stop both for what is wrong with one."""
         at = self.poll(now)
         if self.state not in _WATCHED:
-            # A fault may be the silence itself.
+            # In FAULT the silence may be the fault itself.
             oldest = now - self._limits.reply_age_limit if self.state is State.ESTOPPED else 0.0
             told, self._unstopped = self._unstopped, at.unstopped(oldest)
             if self._unstopped not in ("", told):

@@ -15,7 +15,7 @@ from needle_sim.drives.motor import MotorSettings
 
 # Encoder of the rotation axis: 16 bits a turn, no gear.
 COUNTS_PER_RADIAN = 65536.0 / (2.0 * math.pi)
-# Of the insertion axis' screw: its way at a turn of the motor [m].
+# Lead of the insertion axis' screw: its way in one turn of the motor [m].
 _LEAD = 0.001
 _LAST_NODE = 127
 
