@@ -69,4 +69,5 @@ def test_what_once_violated_would_again(name: str, monkeypatch: pytest.MonkeyPat
 def test_a_planted_bug_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     bug = PLANTED[name]
     bug.plant(monkeypatch)
-    assert bug.invariant in violated(run(bug.seed, schedule_of(bug.seed)))
+    faults = schedule_of(bug.seed if bug.faults_of is None else bug.faults_of)
+    assert bug.invariant in violated(run(bug.seed, faults))
