@@ -17,13 +17,13 @@ _SIGNS = {
 }
 
 
-def read_text(path: Path, what: str) -> str:
-    """Return the text of a file; a `UserError` says of what it is, and why it cannot be read."""
+def read_text(path: Path) -> str:
+    """Return the text of a file; a `UserError` says why it cannot be read."""
     try:
         return path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = error.strerror if isinstance(error, OSError) else "not a text file"
-        raise UserError(f"cannot read {what} {path}: {reason}") from error
+        raise UserError(f"{path}: cannot be read: {reason}") from error
 
 
 def foreign_format(text: str) -> str:
@@ -40,7 +40,7 @@ def read_calibration(path: Path) -> str:
     UserError
         Unreadable, or the calibration of another tool.
     """
-    text = read_text(path, "calibration")
+    text = read_text(path)
     if kind := foreign_format(text):
         raise UserError(
             f"calibration {path} is {kind}: it does not say where rig and phantom are; "

@@ -233,7 +233,7 @@ def check_board_seen(images: Iterable[Image], board: CharucoBoard) -> None:
         Always.
     """
     shown = _shown_board(list(itertools.islice(images, _IMAGES)), board)
-    found = "nor one that its markers tell"
+    found = "its markers identify no other board either"
     if shown is not None:
         wanted = dataclasses.asdict(board).items()
         changes = [

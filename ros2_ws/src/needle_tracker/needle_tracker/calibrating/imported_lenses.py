@@ -107,7 +107,7 @@ def read_lenses(
 
 
 def _read(path: Path) -> _Found:
-    text = read_text(path, "lenses")
+    text = read_text(path)
     kind = foreign_format(text)
     try:
         if kind == OPENCV:

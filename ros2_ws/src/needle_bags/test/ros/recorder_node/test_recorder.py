@@ -273,7 +273,7 @@ def test_a_signal_during_start_up_leaves_a_whole_bag_or_none(domain: int, tmp_pa
     [
         ("bag:={here}", "holds a bag already"),
         ("bagg:=x", "did you mean 'bag'"),
-        ("calibration_file:={here}/none.yaml", "cannot read"),
+        ("calibration_file:={here}/none.yaml", "cannot be read"),
         ("regex:='('", "is not a regular expression"),
         ("topics:=[1, 2]", "are not names"),
         ("topics:=5", "topics = 5"),
