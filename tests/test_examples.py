@@ -27,7 +27,7 @@ from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.planning.entry import entry_state
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_sim.needle.plant import NeedlePlant, initial_pose
-from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"

@@ -46,7 +46,7 @@ def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, impor
     [
         ("needle_sim.ros.sim_rig", "rclpy"),
         ("needle_sim.ros.conversions", "geometry_msgs"),
-        ("needle_sim.ros.parameters", "needle_common.ros.parameters"),
+        ("needle_sim.ros.sim_rig", "needle_common.ros.parameters"),
         ("needle_sim.ros.sim_rig", "needle_sim.ros.conversions"),
         ("needle_sim.needle.plant", "numpy"),
         ("needle_sim.needle.plant", "needle_common.errors"),

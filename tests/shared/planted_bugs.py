@@ -16,8 +16,8 @@ from needle_bags.recording.recording import Received, Recording
 from needle_bringup.operator.joy_source import JoySource
 from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
+from needle_controller.controller_status import steering_diagnostic
 from needle_controller.laws.roll_law import RollLaw
-from needle_controller.ros import conversions
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
@@ -139,14 +139,12 @@ def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
 
 
 def _insertion_told_too_deep(patch: pytest.MonkeyPatch) -> None:
-    convert = conversions.to_diagnostic
-
     def scaled(steering: Any, preset: str) -> Any:
-        diagnostic = convert(steering, preset)
+        diagnostic = steering_diagnostic(steering, preset)
         told = {"insertion_m": repr(1.1 * steering.insertion)}
         return dataclasses.replace(diagnostic, values={**diagnostic.values, **told})
 
-    patch.setattr(conversions, "to_diagnostic", scaled)
+    patch.setattr("needle_controller.plane_controller.steering_diagnostic", scaled)
 
 
 def _rotation_wired_the_wrong_way(patch: pytest.MonkeyPatch) -> None:

@@ -4,24 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from needle_analysis.rerun.bag_pass import Output, stored
 from needle_bags.reading.bag_order import SentMessage, messages_as_sent
 from needle_bags.ros.parameter_snapshots import plain_value
+from needle_common.component import Actions, Input, Moment, Publish
+from needle_common.convert import Converter, from_ros, to_nanoseconds
 from needle_common.errors import UserError
-from needle_common.ros.conversions import to_nanoseconds, values_of
+from needle_common.message_types import rclpy_types
+from needle_common.messages import JointState
+from needle_common.ros.conversions import values_of
+from needle_controller.plane_controller import (
+    STATUS,
+    TARGET_PLANE,
+    TARGET_POINT,
+    PlaneController,
+    joint_sample,
+)
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, Log, PublishUpdate, SteeringState
-from needle_controller.ros.conversions import TARGET_PLANE, TARGET_POINT, to_joint_sample
-from needle_controller.ros.steering_messages import SteeringMessages, output_messages
+from needle_controller.protocol.steering_types import SteeringState
 
 _STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6
 """[s]"""
+_NEVER = Moment(0.0, 0)
 
 
 class ControllerStage:
@@ -55,19 +66,21 @@ class ControllerStage:
     ) -> None:
         self._node = node
         self.name = settings.controller
-        self._messages = SteeringMessages(settings)
-        self._steering = self._messages.steering
+        self._controller = PlaneController(settings)
+        self._steering = self._controller.steering
+        self._converter = Converter(rclpy_types())
         self._ends = ends
         self._steady = 0.0
         self._recorded_trips = 0
         self._recorded_state = ""
         self.tips = 0
         self.notes: list[str] = []
-        self._takers: dict[str, Callable[[Any, int], Iterable[Action]]] = {
-            **{topic: row.take for topic, row in self._messages.inputs.items()},
+        self._rows = {row.topic: row for row in self._controller.inputs}
+        self._takers: dict[str, Callable[[Any, int], Actions]] = {
+            **{topic: partial(_hand, row) for topic, row in self._rows.items()},
             "device/result": self._take_result,
-            TARGET_PLANE: self._take_plane,
-            TARGET_POINT: self._take_point,
+            TARGET_PLANE: partial(self._take_target, TARGET_PLANE),
+            TARGET_POINT: partial(self._take_target, TARGET_POINT),
             "needle/controller_status": self._take_status,
             "/parameter_events": self._take_parameters,
         }
@@ -81,34 +94,26 @@ class ControllerStage:
         """Take a message of a topic, by its relative name; return what it led to."""
         outputs = []
         for action in self._takers[topic](message, sent.time):
-            if isinstance(action, Log):
+            if not isinstance(action, Publish) or action.topic == STATUS:
                 continue
-            self.tips += isinstance(action, PublishUpdate)
-            outputs += [
-                Output(name, sent.log_time, action.stamp_ns, stored(content))
-                for name, content in output_messages(action)
-            ]
+            self.tips += action.topic == "needle/estimate"
+            content = stored(self._converter.to_ros(action.message))
+            outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
 
-    def _take_result(self, message: Any, sent_ns: int) -> Iterable[Action]:
+    def _take_result(self, message: Any, sent_ns: int) -> Actions:
         stamp = to_nanoseconds(message.stamp)
         if (end := self._ends.get(stamp)) is not None:
             self._steering.on_recorded_step(stamp, end)
-        return self._messages.inputs["device/result"].take(message, sent_ns)
+        return _hand(self._rows["device/result"], message, sent_ns)
 
-    def _take_plane(self, message: Any, sent_ns: int) -> Iterable[Action]:
-        actions = self._messages.inputs[TARGET_PLANE].take(message, sent_ns)
-        if self._messages.plane_complaint:
-            self.notes.append(f"target_plane refused: {self._messages.plane_complaint}")
+    def _take_target(self, topic: str, message: Any, sent_ns: int) -> Actions:
+        actions = list(_hand(self._rows[topic], message, sent_ns))
+        if complaint := self._controller.complaints.get(topic):
+            self.notes.append(f"{topic} refused: {complaint}")
         return actions
 
-    def _take_point(self, message: Any, sent_ns: int) -> Iterable[Action]:
-        actions = self._messages.inputs[TARGET_POINT].take(message, sent_ns)
-        if self._messages.point_complaint:
-            self.notes.append(f"target_point refused: {self._messages.point_complaint}")
-        return actions
-
-    def _take_status(self, message: Any, _: int) -> Iterable[Action]:
+    def _take_status(self, message: Any, _: int) -> Actions:
         """Start, stop and lose patience where the recorded controller did.
 
         Calls of services and the steady clock are in no bag.
@@ -121,7 +126,7 @@ class ControllerStage:
             self._recorded_trips = int(trips)
             return self._wait_too_long()
         if now in _STEERING and before not in _STEERING:
-            reply, actions = self._steering.on_start()
+            reply, actions = self._controller.start(_NEVER)
             if not reply.success:
                 self.notes.append(f"would not have started: {reply.message}")
             return actions
@@ -130,14 +135,15 @@ class ControllerStage:
             and now == SteeringState.IDLE.value
             and values.get("reason") == "stopped"
         ):
-            return self._steering.on_stop()[1]
+            return self._controller.stop(_NEVER)[1]
         return ()
 
-    def _wait_too_long(self) -> list[Action]:
+    def _wait_too_long(self) -> Actions:
         begin, self._steady = self._steady, self._steady + _LONGER_THAN_ANY_TIMEOUT
-        return [*self._steering.on_time(begin), *self._steering.on_time(self._steady)]
+        late = [*self._steering.on_time(begin), *self._steering.on_time(self._steady)]
+        return self._controller.carry_out(late, _NEVER)
 
-    def _take_parameters(self, message: Any, _: int) -> Iterable[Action]:
+    def _take_parameters(self, message: Any, _: int) -> Actions:
         if message.node != self._node:
             return ()
         known = {field.name for field in dataclasses.fields(SteeringSettings)}
@@ -156,6 +162,11 @@ class ControllerStage:
         return ()
 
 
+def _hand(row: Input, message: Any, sent_ns: int) -> Actions:
+    """Let the controller handle a recorded message."""
+    return row.handler(from_ros(row.message, message), Moment(0.0, 0, sent_ns))
+
+
 def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
     """Return where each command led that was answered: the joints sent next, by its stamp [ns].
 
@@ -172,7 +183,7 @@ def step_ends(path: Path, namespace: str) -> dict[int, JointSample]:
             answered.append(to_nanoseconds(message.stamp))
             continue
         with contextlib.suppress(UserError):
-            sample = to_joint_sample(message, sent.time)
+            sample = joint_sample(from_ros(JointState, message), sent.time)
             ends.update(dict.fromkeys(answered, sample))
             answered.clear()
     return ends

@@ -37,9 +37,9 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.optics.calibration import SIDES, calibration_from
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
-from needle_tracker.ros.conversions import to_frame
 
 HELP = """
 live_view: shows the needle to RViz, Foxglove and the like while it is steered. Each of its topics
@@ -129,7 +129,7 @@ class LiveViewNode(WholeNode):
         camera = self._cameras.get(side)
         if camera is None:
             return
-        frame = to_frame(message, side, camera.camera)
+        frame = frame_of(message, side, camera.camera)
         if frame.pixels is None:
             self._diagnostics.refuse(f"stereo/{side}/image_raw", "no image of it", frame.problem)
             return

@@ -12,12 +12,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from needle_analysis.live.live_needle import Belief, LiveNeedle, SeenTip
+from needle_common import messages
+from needle_common.convert import from_ros
 from needle_common.errors import UserError
 from needle_common.ros.base_node import DiagnosticsPublisher
 from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds, values_of
 from needle_common.ros.discovery import unpublished
 from needle_controller.model.target_plane import plane_from_pose
-from needle_tracker.ros.conversions import insertion_of, rotation_of
+from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.
 _FARTHEST = 10.0
@@ -66,7 +68,7 @@ class NeedleHearing:
         return unpublished(self._node, self._awaited)
 
     def _on_joints(self, message: JointState) -> None:
-        insertion = insertion_of(message)
+        insertion = insertion_of(from_ros(messages.JointState, message))
         if insertion is not None and _is_near(insertion):
             self.needle.take_insertion(insertion)
 
@@ -116,6 +118,6 @@ def _is_place(values: Any) -> bool:
 
 def _parts(message: PoseWithCovarianceStamped) -> tuple[Any, Any, Any]:
     """Return place, rotation (None: no orientation) and covariance of the place."""
-    p = message.pose.pose.position
-    covariance = np.array(message.pose.covariance).reshape(6, 6)[:3, :3]
-    return np.array([p.x, p.y, p.z]), rotation_of(message.pose.pose), covariance
+    pose = from_ros(messages.PoseWithCovariance, message)
+    covariance = np.array(pose.covariance).reshape(6, 6)[:3, :3]
+    return np.array(pose.position), rotation_of(pose), covariance

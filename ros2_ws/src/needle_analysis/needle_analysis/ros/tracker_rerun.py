@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,12 @@ import numpy as np
 from needle_analysis.rerun.bag_pass import Output, stored
 from needle_bags.reading.bag_images import TOPICS, plain_image
 from needle_bags.reading.bag_order import SentMessage
-from needle_tracker.answers.pair_answers import Answer
+from needle_common.component import Actions, Moment, Publish
+from needle_common.convert import Converter, from_ros
+from needle_common.message_types import rclpy_types
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.ros.tracker_messages import TrackerMessages, image_topic, output_messages
+from needle_tracker.stereo_tracker import TIP_POSE, StereoTipTracker, image_topic
 
 
 class TrackerStage:
@@ -33,38 +34,34 @@ class TrackerStage:
     """
 
     def __init__(self, calibration: StereoCalibration, parameters: StereoTrackerParameters) -> None:
-        self._messages = TrackerMessages(calibration, parameters)
+        self._tracker = StereoTipTracker(parameters, calibration)
+        self._converter = Converter(rclpy_types())
         self.pairs = 0
-        rows = {**self._messages.inputs, **self._messages.images}
-        self._takers: dict[str, Callable[[Any, float], Iterable[Answer]]] = {
-            **{topic: row.take for topic, row in rows.items()},
-            **{topic: self._taker_of(side) for topic, side in TOPICS.items()},
-        }
+        self._rows = {row.topic: row for row in self._tracker.inputs}
+        self._rows |= {topic: self._rows[image_topic(side)] for topic, side in TOPICS.items()}
 
     @property
     def topics(self) -> frozenset[str]:
         """Relative names of what it takes."""
-        return frozenset(self._takers)
+        return frozenset(self._rows)
 
     def take(self, topic: str, sent: SentMessage, message: Any) -> list[Output]:
         """Take a message of a topic, by its relative name; return what it led to."""
-        log_time = sent.log_time
-        return self._publish(self._takers[topic](message, log_time * 1e-9), log_time)
+        row, log_time = self._rows[topic], sent.log_time
+        plain = plain_image(message) if topic in TOPICS else message
+        at = Moment(log_time * 1e-9, log_time)
+        return self._outputs(row.handler(from_ros(row.message, plain), at), log_time)
 
     def finish(self, log_time: int) -> list[Output]:
         """Answer what still waits for joints at the bag's end."""
-        return self._publish(self._messages.answers.ready(np.inf), log_time)
+        answers = self._tracker.answers.ready(np.inf)
+        return self._outputs(self._tracker.publish(answers, Moment(np.inf, log_time)), log_time)
 
-    def _taker_of(self, side: str) -> Callable[[Any, float], Iterable[Answer]]:
-        take = self._messages.images[image_topic(side)].take
-        return lambda message, now: take(plain_image(message), now)
-
-    def _publish(self, answers: Iterable[Answer], log_time: int) -> list[Output]:
+    def _outputs(self, actions: Actions, log_time: int) -> list[Output]:
         outputs = []
-        for answer in answers:
-            self.pairs += 1
-            outputs += [
-                Output(topic, log_time, answer.pair.stamp, stored(message))
-                for topic, message in output_messages(answer)
-            ]
+        for action in actions:
+            if isinstance(action, Publish):
+                self.pairs += action.topic == TIP_POSE
+                content = stored(self._converter.to_ros(action.message))
+                outputs.append(Output(action.topic, log_time, action.message.stamp_ns, content))
         return outputs

@@ -20,9 +20,9 @@ from needle_bags.format.bag_copy import BagCopy
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import SentMessage, raw_as_sent
 from needle_bags.reading.bag_reader import read_run
+from needle_controller.controller_status import steering_diagnostic
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages
-from needle_controller.ros import conversions
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 BAG = Path(__file__).resolve().parents[5] / "bags" / "regression"
@@ -90,7 +90,7 @@ class LateController:
         self.say(time)
 
     def say(self, time: int) -> None:
-        diagnostic = conversions.to_diagnostic(self.stage._steering, "best")
+        diagnostic = steering_diagnostic(self.stage._steering, "best")
         if diagnostic == self.said and not self.heard.is_full:
             return
         self.said = diagnostic

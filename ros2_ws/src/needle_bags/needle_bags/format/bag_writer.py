@@ -49,6 +49,8 @@ class BagWriter:
         Bytes of messages after which another data file is begun; 0: never.
     compression : str
         `none` or `zstd`, chunk by chunk.
+    describe_itself : bool
+        Whether the data file repeats metadata.yaml, which has the bag's name.
 
     Raises
     ------
@@ -64,12 +66,14 @@ class BagWriter:
         chunk_size: int = CHUNK_SIZE,
         max_file_size: int = 0,
         compression: str = "none",
+        describe_itself: bool = True,
     ) -> None:
         refuse_existing_bag(directory)
         self.directory = directory
         self._distribution = distribution
         self._chunk_size = chunk_size
         self._max_file_size = max_file_size
+        self._describe_itself = describe_itself
         self._compression = CompressionType[compression.upper()]
         self._topics: list[BagTopic] = []
         self._files: list[DataFile] = []
@@ -151,7 +155,8 @@ class BagWriter:
         """
         information = self._information()
         with self._writing():
-            self._mcap.add_metadata(METADATA_RECORD, {METADATA_KEY: to_yaml(information)})
+            if self._describe_itself:
+                self._mcap.add_metadata(METADATA_RECORD, {METADATA_KEY: to_yaml(information)})
             self._end_file()
             write_metadata(self.directory, information)
 

@@ -15,13 +15,13 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
-from needle_bringup.ros.simulated_operator_parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.operator_sequence import (
     DISABLE,
     PREPARATION,
     OperatorSequence,
     ServiceCall,
 )
+from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress
 from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_common.diagnostics import Diagnostic, Level

@@ -12,6 +12,8 @@ from pathlib import Path
 
 INTERRUPT_GRACE = 5.0
 TERMINATE_GRACE = 3.0
+# The recorder writes out what it still holds: a slow disk may take its time.
+RECORDER_GRACE = 30.0
 POLL = 0.01
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True)

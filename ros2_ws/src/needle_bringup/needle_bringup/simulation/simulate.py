@@ -15,16 +15,17 @@ from types import ModuleType
 
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.needle_options import contradictions
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_process import RECORDER_GRACE, NodeProcess, stop, wait_for
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
     command_line_parameters,
     merge,
     nodes_of,
     refuse_reserved,
+    run_info,
     write_parameters,
 )
-from needle_bringup.simulation.simulate_options import SimulateOptions, parse
+from needle_bringup.simulation.simulate_options import SimulateOptions, command_of, parse
 from needle_common.commands.cli import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
@@ -51,8 +52,6 @@ POLL = 0.05
 QUIET_AFTER = 4.0
 # rclpy's own log files would double those in LOGS.
 ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
-# The recorder writes out what it still holds: a slow disk may take its time.
-RECORDER_GRACE = 30.0
 # Set by scripts/simulate: when the command was given, in seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
 
@@ -100,28 +99,35 @@ def simulate(options: SimulateOptions) -> int:
     KeyboardInterrupt
         After an interrupt, when everything has ended.
     """
-    settle_environment(own_graph=True)
+    if options.runs_graph:
+        settle_environment(own_graph=True)
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
     if options.params is not None:
         given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
-    executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     # A signal is looked at between steps from here on; in the report it raises wherever it comes.
     end = EndRequest(None)
     bag = _make_folder(options)
     try:
         parameters = merge(command_line_parameters(options, bag), given)
-        for line in contradictions(parameters, list(executables)):
+        for line in contradictions(parameters, nodes_of(options)):
             print(f"warning: {line}", file=sys.stderr)
-        with end, own_domain() as domain:
-            write_parameters(bag / PARAMETERS, {node: parameters[node] for node in executables})
-            _run_nodes(executables, bag, domain, end)
+        write_parameters(bag / PARAMETERS, {node: parameters[node] for node in nodes_of(options)})
+        with end:
+            if options.runs_graph:
+                _run_graph(options, bag, end)
+            else:
+                _run_components(options, parameters, bag, end)
         _check(end)
         return _report(options, bag, started_at)
     except NodeFailedError as error:
         # Bad input leaves nothing behind; what broke leaves its logs.
         if error.is_bad_input:
+            shutil.rmtree(bag, ignore_errors=True)
+        raise
+    except UserError:
+        if not (bag / METADATA).exists():
             shutil.rmtree(bag, ignore_errors=True)
         raise
     except KeyboardInterrupt:
@@ -133,6 +139,32 @@ def simulate(options: SimulateOptions) -> int:
 def _check(end: EndRequest) -> None:
     if end.wanted:
         raise KeyboardInterrupt
+
+
+def _run_components(
+    options: SimulateOptions, parameters: Parameters, bag: Path, end: EndRequest
+) -> None:
+    """Run the rig in this process until the operator ends."""
+    # The controller's compiled code takes a while to load: not where other processes do that.
+    from needle_bringup.simulation import virtual_run  # noqa: PLC0415
+
+    components = virtual_run.make_components(parameters)
+    print(f"recording into {shown(bag)}", file=sys.stderr)
+    virtual_run.run_virtually(
+        components,
+        bag,
+        seed=options.seed,
+        run_info={**run_info(options), "command": command_of(options)},
+        real_time_factor=options.real_time_factor,
+        check=lambda: _check(end),
+    )
+
+
+def _run_graph(options: SimulateOptions, bag: Path, end: EndRequest) -> None:
+    """Run the rig as ROS nodes until the operator ends."""
+    executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
+    with own_domain() as domain:
+        _run_nodes(executables, bag, domain, end)
 
 
 def _run_nodes(executables: dict[str, str], bag: Path, domain: int, end: EndRequest) -> None:

@@ -21,10 +21,14 @@ from needle_common.errors import UserError
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
 
-Starts recorder, sim_rig, stereo_tracker, plane_controller and simulated_operator (at level drive
-also drive_emulator and device_driver) as processes of their own, shows how far the needle is in,
-and leaves a folder that holds the bag (open it with rosbags, mcap, Foxglove, PlotJuggler or
-`ros2 bag`), report.html with its figures, summary.json, the parameters and the nodes' logs.
+Level tip runs sim_rig, plane_controller and simulated_operator in this process, on a virtual
+clock: the same seed gives the same bag, byte for byte. Levels camera and drive, and tip with
+--graph, start recorder, sim_rig, stereo_tracker, plane_controller and simulated_operator (at level
+drive also drive_emulator and device_driver) as ROS nodes in processes of their own.
+
+It shows how far the needle is in, and leaves a folder that holds the bag (open it with rosbags,
+mcap, Foxglove, PlotJuggler or `ros2 bag`), report.html with its figures, summary.json, the
+parameters and, of ROS nodes, their logs.
 """
 
 EPILOG = """\
@@ -69,7 +73,7 @@ INSERTIONS = ("stepwise", "continuous")
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 # Options that a repeated run has anew, and such as are written otherwise than they are named.
 _SAID_APART = (
-    *("bag", "json", "level", "controller", "seed", "target_mm"),
+    *("bag", "json", "level", "controller", "seed", "target_mm", "graph"),
     *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
 )
 
@@ -98,9 +102,15 @@ class SimulateOptions:
     play_deg: float = 0.0
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
+    graph: bool = False
     bag: Path | None = None
     params: Path | None = None
     json: Path | None = None
+
+    @property
+    def runs_graph(self) -> bool:
+        """Whether it runs as ROS nodes; those of the levels with images are no components yet."""
+        return self.graph or self.level != "tip"
 
 
 def parse(arguments: Sequence[str]) -> SimulateOptions:
@@ -146,6 +156,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
+        graph=given.graph,
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         bag=_new_bag(given.bag),
         params=_readable("--params", given.params),
@@ -178,6 +189,8 @@ def command_of(options: SimulateOptions) -> str:
         value = getattr(options, field.name)
         if field.name not in _SAID_APART and value != getattr(plain, field.name):
             words.append(f"--{field.name.replace('_', '-')}={value}")
+    if options.graph:
+        words.append("--graph")
     return shlex.join(["scripts/simulate", *words])
 
 
@@ -272,8 +285,14 @@ def _parser() -> CommandParser:
         "--real-time-factor",
         default="0",
         metavar="F",
-        help="1: as slow as the real rig; 0: in "
-        "lock step, as fast as the nodes answer, repeatable (default: 0)",
+        help="1: as slow as the real rig; 0: as fast as the computer allows, repeatable "
+        "(default: 0)",
+    )
+    add(
+        "--graph",
+        action="store_true",
+        help="each component as a ROS node in a process of its own, over DDS; levels camera and "
+        "drive always run so",
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")

@@ -30,7 +30,7 @@ def check_nothing_left(finished: SimulateRun) -> None:
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_interrupted_while_it_steers(tmp_path: Path, number: int) -> None:
     bag = tmp_path / "bag"
-    started = start(bag, "--level", "tip")
+    started = start(bag, "--level", "tip", "--graph")
     started.wait_until_said(QUARTER)
     os.kill(started.process.pid, number)
     finished = started.wait(LIMIT)
@@ -42,7 +42,7 @@ def test_interrupted_while_it_steers(tmp_path: Path, number: int) -> None:
 
 def test_interrupted_while_the_nodes_start(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    started = start(bag, "--level", "tip")
+    started = start(bag, "--level", "tip", "--graph")
     started.wait_until_said("ROS_DOMAIN_ID")
     os.kill(started.process.pid, signal.SIGTERM)
     finished = started.wait(LIMIT)
@@ -52,7 +52,7 @@ def test_interrupted_while_the_nodes_start(tmp_path: Path) -> None:
 
 
 def test_killed_outright_its_nodes_end_too(tmp_path: Path) -> None:
-    started = start(tmp_path / "bag", "--level", "tip")
+    started = start(tmp_path / "bag", "--level", "tip", "--graph")
     started.wait_until_said(QUARTER)
     started.process.kill()
     started.process.wait()
@@ -64,7 +64,7 @@ def test_killed_outright_its_nodes_end_too(tmp_path: Path) -> None:
 
 def test_a_node_that_dies_is_named_and_ends_the_run(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    started = start(bag, "--level", "tip")
+    started = start(bag, "--level", "tip", "--graph")
     started.wait_until_said(QUARTER)
     (pid,) = [pid for pid, command in started.running() if "plane_controller" in command]
     os.kill(pid, signal.SIGKILL)

@@ -21,7 +21,7 @@ from needle_bringup.simulation.simulate_options import parse
 from needle_common.errors import UserError
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_sim.needle.needle_shape import NeedleShape
-from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 
 CLASSES: dict[str, type[Any]] = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 from builtin_interfaces.msg import Time
@@ -10,7 +9,9 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from geometry_msgs.msg import Quaternion
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
+from needle_common.component import Delivery
 from needle_common.diagnostics import Diagnostic
+from needle_common.rotations import quaternion_from_rotation
 
 NANOSECONDS = 1_000_000_000
 # A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
@@ -34,6 +35,14 @@ IMAGES = _last(5, ReliabilityPolicy.RELIABLE)
 IMAGES_BEST_EFFORT = _last(2, ReliabilityPolicy.BEST_EFFORT)
 
 
+def to_qos(delivery: Delivery) -> QoSProfile:
+    """Return the QoS profile of a component's row."""
+    if delivery.latched:
+        return LATCHED
+    reliable = ReliabilityPolicy.RELIABLE
+    return _last(delivery.depth, reliable if delivery.reliable else ReliabilityPolicy.BEST_EFFORT)
+
+
 def to_nanoseconds(stamp: Time) -> int:
     """Return a message's stamp in ns since the clock's epoch, exactly."""
     return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
@@ -50,22 +59,9 @@ def to_stamp(nanoseconds: int) -> Time:
 
 
 def to_quaternion(rotation: Sequence[Sequence[float]]) -> Quaternion:
-    """Return the unit quaternion of a rotation matrix, given as three rows.
-
-    Of the four ways the one whose divisor is largest. scipy does the same, but takes a node that
-    needs no more of it a quarter of a second to import.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
-    trace = xx + yy + zz
-    _, (x, y, z, w) = max(
-        (xx, (1.0 - trace + 2.0 * xx, yx + xy, zx + xz, zy - yz)),
-        (yy, (xy + yx, 1.0 - trace + 2.0 * yy, zy + yz, xz - zx)),
-        (zz, (xz + zx, yz + zy, 1.0 - trace + 2.0 * zz, yx - xy)),
-        (trace, (zy - yz, xz - zx, yx - xy, 1.0 + trace)),
-        key=lambda way: way[0],
-    )
-    norm = math.sqrt(x * x + y * y + z * z + w * w)
-    return Quaternion(x=x / norm, y=y / norm, z=z / norm, w=w / norm)
+    """Return the unit quaternion of a rotation matrix, given as three rows, as a message."""
+    x, y, z, w = quaternion_from_rotation(rotation)
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def to_diagnostic_status(name: str, hardware_id: str, diagnostic: Diagnostic) -> DiagnosticStatus:

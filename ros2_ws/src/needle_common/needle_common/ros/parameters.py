@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import sys
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import ParameterSpec, specs
+from needle_common.settings.parameter_fields import ParameterSpec, specs, unknown_parameter
 from needle_common.settings.parameter_files import check_command_line
 
 P = TypeVar("P")
@@ -143,9 +142,7 @@ def _refuse_unknown(node: Node, known: list[str]) -> None:
     for name in node._parameter_overrides:
         if name in known or name.startswith(OF_EVERY_NODE):
             continue
-        close = difflib.get_close_matches(name, known, n=1)
-        hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
-        raise UserError(f"{node.get_fully_qualified_name()}: unknown parameter '{name}' ({hint})")
+        raise UserError(f"{node.get_fully_qualified_name()}: {unknown_parameter(name, known)}")
 
 
 def _descriptor(spec: ParameterSpec, default: Any) -> ParameterDescriptor:

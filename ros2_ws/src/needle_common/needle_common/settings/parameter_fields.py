@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
-from collections.abc import Iterator
-from typing import Any, cast
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, TypeVar, cast
 
 from needle_common.errors import UserError
 from needle_common.settings.bounds import check_bounds
 
+P = TypeVar("P")
 _METADATA_KEY = "needle_parameter"
 
 
@@ -82,6 +84,43 @@ def check_fields(parameters: Any) -> None:
                 check_bounds(name, element, spec.lower, spec.upper, spec.unit)
             elif spec.choices and element not in spec.choices:
                 raise UserError(f"{name} = {element!r} is not one of {', '.join(spec.choices)}")
+
+
+def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
+    """Return a parameter dataclass from the values of a file or a command line.
+
+    Parameters
+    ----------
+    kind : type
+        The dataclass.
+    values : mapping of str to object
+        Parameter to value; lists stand for tuples.
+    node : str
+        Whose parameters they are, for errors.
+
+    Raises
+    ------
+    UserError
+        An unknown parameter, or a value that the dataclass refuses.
+    """
+    known = {name: default for name, _, default in specs(kind)}
+    for name, value in values.items():
+        if name not in known:
+            raise UserError(f"{node}: {unknown_parameter(name, known)}")
+        if isinstance(known[name], float) and type(value) is int:
+            raise UserError(f"{node}: {name} = {value} is not of type float (write {value}.0)")
+    plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    try:
+        return kind(**plain)
+    except UserError as error:
+        raise UserError(f"{node}: {error}") from error
+
+
+def unknown_parameter(name: str, known: Collection[str]) -> str:
+    """Return what is said of a parameter that a node does not have."""
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+    return f"unknown parameter '{name}' ({hint})"
 
 
 def describe(parameters: type) -> str:

@@ -1,26 +1,26 @@
-"""plane_controller: measured tips in, one insertion step at a time out."""
+"""The `plane_controller` executable: the component `PlaneController` as a ROS node."""
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable
 from functools import partial
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.context import Context
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from needle_common.diagnostics import Diagnostic, Level
+from needle_common.component import Actions, Diagnose, Input, Log, Moment, Publish
+from needle_common.convert import Converter, from_ros, ros_type
+from needle_common.message_types import rclpy_types
 from needle_common.process.watched_time import WatchedTime
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.conversions import LATCHED, RELIABLE, to_diagnostic_status
+from needle_common.ros.conversions import LATCHED, RELIABLE, to_qos
 from needle_common.ros.discovery import (
     AnsweringNodes,
     signature,
@@ -30,15 +30,10 @@ from needle_common.ros.discovery import (
 )
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.topic_input import TopicInput
 from needle_common.ros.whole_node import WholeNode
+from needle_controller.plane_controller import COMMANDS, STATUS, TARGETS, PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.heard_messages import HeardMessages
-from needle_controller.protocol.steering_types import Action, Log, SteeringState
-from needle_controller.ros import conversions
-from needle_controller.ros.conversions import TARGET_PLANE, TARGET_POINT
-from needle_controller.ros.obstacle_messages import OBSTACLES
-from needle_controller.ros.steering_messages import OUTPUTS, SteeringMessages, output_messages
+from needle_controller.protocol.steering_types import SteeringState
 
 HELP = """
 plane_controller: steers the needle into the target plane, or to the target point, one insertion
@@ -51,14 +46,11 @@ Publishes   device/joint_trajectory, needle/estimate, needle/reduced_state, need
 Services    ~/start, ~/stop
 """
 
-# Steady time between two lines of log of one kind [s]: never every cycle.
-_LOG_PERIOD = 2.0
-_TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
 _TARGETS_SEEN = 32
 
 
 class PlaneControllerNode(WholeNode):
-    """The ROS shell of `SteeringMessages`: hears, publishes, reports.
+    """The ROS shell of `PlaneController`: hears, publishes, reports.
 
     Parameters
     ----------
@@ -83,24 +75,26 @@ class PlaneControllerNode(WholeNode):
         )
         self._settings = NodeParameters(self, SteeringSettings, self._on_parameters)
         values = self._settings.values
-        self._messages = SteeringMessages(values)
-        self._steering = self._messages.steering
-        self._heard = HeardMessages()
-        self._logged: dict[str, float] = {}
-        self._published: Diagnostic | None = None
-
+        self._component = PlaneController(values, signature(self))
+        self._types = rclpy_types()
+        self._converter = Converter(self._types)
         self._diagnostics = DiagnosticsPublisher(self)
         self._outputs = {
-            topic: self.create_publisher(kind, topic, RELIABLE) for topic, kind in OUTPUTS.items()
+            row.topic: self.create_publisher(
+                self._types.make(ros_type(row.message)), row.topic, to_qos(row.delivery)
+            )
+            for row in self._component.outputs
         }
-        self._status = self.create_publisher(DiagnosticStatus, "needle/controller_status", LATCHED)
         # A latched target reaches whoever comes late; DDS gives a latched subscription nothing of a
         # plain publisher (`ros2 topic pub`, RViz), a plain one what both send from now on.
         self._targets_seen: deque[tuple[str, int]] = deque(maxlen=_TARGETS_SEEN)
-        for topic in _TARGETS:
-            self._hear(dataclasses.replace(self._messages.inputs[topic], qos=RELIABLE))
-        sources = {row.topic: self._hear(row) for row in self._messages.inputs.values()}
-        not_awaited = {*_TARGETS}
+        for row in self._component.inputs:
+            if row.topic in TARGETS:
+                self._hear(row, RELIABLE)
+        sources = {
+            row.topic: self._hear(row, to_qos(row.delivery)) for row in self._component.inputs
+        }
+        not_awaited = {*TARGETS}
         if values.tip_covariance != "from_tip_pose":
             not_awaited.add("needle/tip_pose")
         self._sources = [heard for topic, heard in sources.items() if topic not in not_awaited]
@@ -108,15 +102,20 @@ class PlaneControllerNode(WholeNode):
         self.create_service(Trigger, "~/start", self._on_start)
         self.create_service(Trigger, "~/stop", self._on_stop)
         self._watched = WatchedTime()
-        self.create_timer(0.1, self._on_timer, clock=STEADY_CLOCK)
+        for timer in self._component.timers:
+            run = partial(self._on_timer, timer.handler)
+            self.create_timer(timer.period, run, clock=STEADY_CLOCK)
         self._life = LifeSigns(
             self,
             self._diagnostics,
             f"preset {values.controller}",
             self._waits_for,
-            alone_on=("device/joint_trajectory", "needle/controller_status"),
+            alone_on=(COMMANDS, STATUS),
         )
-        self._do([])
+        self._do(self._component.carry_out([], self._moment()))
+
+    def _moment(self, sent_ns: int = 0) -> Moment:
+        return Moment(time.monotonic(), self.get_clock().now().nanoseconds, sent_ns)
 
     def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         missing = self._missing()
@@ -124,13 +123,13 @@ class PlaneControllerNode(WholeNode):
             response.success = False
             response.message = f"waiting for {', '.join(missing)}"
             return response
-        reply, actions = self._steering.on_start()
+        reply, actions = self._component.start(self._moment())
         self._do(actions)
         response.success, response.message = reply.success, reply.message
         return response
 
     def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        reply, actions = self._steering.on_stop()
+        reply, actions = self._component.stop(self._moment())
         self._do(actions)
         response.success, response.message = reply.success, reply.message
         return response
@@ -140,99 +139,68 @@ class PlaneControllerNode(WholeNode):
 
         A device that is heard may not know yet who commands it; the first step would be lost.
         """
-        commands = self._outputs["device/joint_trajectory"]
-        no_device = unheard(self, [commands.topic_name])
+        no_device = unheard(self, [self._outputs[COMMANDS].topic_name])
         if not self._settings.values.wait_for_recorder:
             return no_device
-        mine = (*self._outputs.values(), self._status)
         return [
             *self._partners.unaware_sources(self._sources),
             *no_device,
-            *unrecorded(self, mine),
+            *unrecorded(self, self._outputs.values()),
         ]
 
     def _waits_for(self) -> list[str]:
         missing = list(dict.fromkeys(self._missing() + unpublished(self, self._sources)))
-        if missing or self._steering.state is not SteeringState.IDLE:
+        if missing or self._component.steering.state is not SteeringState.IDLE:
             return missing
         return [f"service call {self.resolve_service_name('~/start')}"]
 
-    def _hear(self, row: TopicInput[Action]) -> Subscription[Any]:
+    def _hear(self, row: Input, qos: QoSProfile) -> Subscription[Any]:
         """Subscribe to a topic."""
         return self.create_subscription(
-            row.kind,
+            self._types.make(ros_type(row.message)),
             row.topic,
-            partial(self._on_message, row.topic),
-            row.qos,
+            partial(self._on_message, row),
+            qos,
             event_callbacks=SubscriptionEventCallbacks(
                 # A plain publisher of targets is heard by the plain subscription.
-                use_default_callbacks=row.topic not in _TARGETS or row.qos != LATCHED
+                use_default_callbacks=row.topic not in TARGETS or qos != LATCHED
             ),
         )
 
-    def _on_message(self, topic: str, message: Any, info: dict[str, int]) -> None:
+    def _on_message(self, row: Input, message: Any, info: dict[str, int]) -> None:
         sent_ns = info["source_timestamp"]
-        if topic in _TARGETS:
-            if (topic, sent_ns) in self._targets_seen:
+        if row.topic in TARGETS:
+            if (row.topic, sent_ns) in self._targets_seen:
                 # Of the other subscription.
                 return
-            self._targets_seen.append((topic, sent_ns))
-        self._heard.add(topic, sent_ns)
-        self._do(self._messages.inputs[topic].take(message, sent_ns))
+            self._targets_seen.append((row.topic, sent_ns))
+        self._do(row.handler(from_ros(row.message, message), self._moment(sent_ns)))
 
     def _on_parameters(self, values: SteeringSettings) -> None:
-        self._steering.configure(values)
-        self._do([Log("info", "parameters changed")])
+        self._do(self._component.configure(values, self._moment()))
 
-    def _on_timer(self) -> None:
-        self._do(self._steering.on_time(self._watched.read(time.monotonic())))
+    def _on_timer(self, handler: Any) -> None:
+        steady = self._watched.read(time.monotonic())
+        self._do(handler(Moment(steady, self.get_clock().now().nanoseconds)))
 
-    def _do(self, actions: Iterable[Action]) -> None:
+    def _do(self, actions: Actions) -> None:
         for action in actions:
-            if isinstance(action, Log):
-                self._log(action)
-                continue
-            for topic, message in output_messages(action):
-                self._outputs[topic].publish(message)
-        self._report()
+            match action:
+                case Publish(topic, message):
+                    self._outputs[topic].publish(self._converter.to_ros(message))
+                case Diagnose(part, diagnostic):
+                    self._diagnostics.set(part, diagnostic)
+                case Log(severity, text):
+                    self._log(severity, text)
 
-    def _log(self, log: Log) -> None:
-        now = time.monotonic()
-        if log.kind:
-            if now - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
-                return
-            self._logged[log.kind] = now
+    def _log(self, severity: str, text: str) -> None:
         # Not one call through a variable: rclpy knows a line by where it is called from.
-        if log.severity == "error":
-            self.get_logger().error(log.text)
-        elif log.severity == "warning":
-            self.get_logger().warning(log.text)
+        if severity == "error":
+            self.get_logger().error(text)
+        elif severity == "warning":
+            self.get_logger().warning(text)
         else:
-            self.get_logger().info(log.text)
-
-    def _report(self) -> None:
-        history = self._steering.intake.joints
-        joints = {
-            "joint_states_refused": str(self._messages.bad_joints),
-            "joint_states_doubted": str(history.doubted),
-        }
-        complaint = self._messages.joints_complaint or history.complaint
-        self._diagnostics.set("joint_states", _health(complaint, joints))
-        self._diagnostics.set(TARGET_PLANE, _health(self._messages.plane_complaint, {}))
-        self._diagnostics.set(TARGET_POINT, _health(self._messages.point_complaint, {}))
-        self._diagnostics.set(OBSTACLES, _health(self._messages.obstacles_complaint, {}))
-        diagnostic = conversions.to_diagnostic(self._steering, self._settings.values.preset)
-        self._diagnostics.set("steering", diagnostic)
-        if diagnostic != self._published or self._heard.is_full:
-            self._published = diagnostic
-            name = signature(self)
-            values = {**diagnostic.values, "heard": self._heard.take_text()}
-            told = dataclasses.replace(diagnostic, values=values)
-            self._status.publish(to_diagnostic_status(f"{name}: steering", name, told))
-
-
-def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
-    return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
+            self.get_logger().info(text)
 
 
 def main(args: list[str] | None = None) -> int:

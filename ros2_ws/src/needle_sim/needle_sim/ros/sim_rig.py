@@ -35,9 +35,9 @@ from needle_sim.rig.lock_step import Action, LockStep
 from needle_sim.rig.pace import Pace
 from needle_sim.ros.conversions import stamp_in, to_truth
 from needle_sim.ros.drive_follower import DriveFollower
-from needle_sim.ros.parameters import SimRigParameters
 from needle_sim.ros.simulated_device import SimulatedDevice
 from needle_sim.ros.simulated_tips import SimulatedTips
+from needle_sim.sim_rig_parameters import SimRigParameters
 
 HELP = """\
 sim_rig: stands in for the rig, so that every other node runs as on the real one.

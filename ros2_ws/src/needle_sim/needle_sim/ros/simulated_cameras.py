@@ -21,7 +21,7 @@ from needle_sim.camera.scenarios import SCENARIOS
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.ros.conversions import to_camera_info, to_image
-from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.sim_rig_parameters import SimRigParameters
 
 _FRAMES = ("left_camera_optical", "right_camera_optical")
 _CENTRELINE_SPACING = 0.001

@@ -14,7 +14,7 @@ from rclpy.subscription import Subscription
 from needle_common.ros.conversions import RELIABLE
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.ros.conversions import to_tip, to_tip_pose
-from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.sim_rig_parameters import SimRigParameters
 
 
 class SimulatedTips:

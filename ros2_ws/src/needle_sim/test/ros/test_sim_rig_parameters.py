@@ -9,7 +9,7 @@ import pytest
 
 from needle_common.errors import OutOfBoundsError
 from needle_device_driver.supervisor.limits import SafetyLimits
-from needle_sim.ros.parameters import SimRigParameters
+from needle_sim.sim_rig_parameters import SimRigParameters
 
 OWN = {field.name for field in dataclasses.fields(SimRigParameters)}
 LIMITS = [field.name for field in dataclasses.fields(SafetyLimits) if field.name in OWN]

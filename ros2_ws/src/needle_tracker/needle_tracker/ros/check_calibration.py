@@ -22,13 +22,13 @@ from needle_common.process.shared_memory import remove_half_made_ports
 from needle_common.ros.conversions import IMAGES_BEST_EFFORT, to_nanoseconds
 from needle_common.ros.whole_node import WholeNode
 from needle_tracker.answers.pair_answers import Frame
+from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.calibrating.board_views import averaged_view, views_in_folders
 from needle_tracker.calibrating.calibration_check import check
 from needle_tracker.calibrating.calibration_session import Session, load_session
 from needle_tracker.calibrating.check_options import figures, parse, report
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, StereoCalibration, load_calibration
-from needle_tracker.ros.conversions import to_frame
 from needle_tracker.sources.pairing import PairMatcher
 
 
@@ -129,7 +129,7 @@ class _Capture(WholeNode):
         return self._pairs
 
     def _on_image(self, side: str, message: Image) -> None:
-        frame = to_frame(message, side, self._cameras[side])
+        frame = frame_of(message, side, self._cameras[side])
         self._problem = self._problem or frame.problem
         pair = self._matcher.add(side, to_nanoseconds(message.header.stamp), frame)
         if pair is not None and pair.left.pixels is not None and pair.right.pixels is not None:

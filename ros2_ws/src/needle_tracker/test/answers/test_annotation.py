@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from needle_tracker.answers.annotation import annotate, describe
+from needle_tracker.answers.tracker_messages import picture_message
 from needle_tracker.optics.calibration import StereoCalibration
-from needle_tracker.ros.conversions import to_image
 from needle_tracker.tracking.tracker import StereoTracker
 from needle_tracker.tracking.tracker_settings import TrackerSettings
 
@@ -50,6 +50,6 @@ def test_without_a_tip_the_reason_is_given(
 
 
 def test_the_picture_has_the_frame_of_its_first_view() -> None:
-    message = to_image(np.zeros((2, 4, 3), np.uint8), 5)
-    assert message.header.frame_id == "left_camera_optical"
-    assert message.header.stamp.nanosec == 5
+    message = picture_message(np.zeros((2, 4, 3), np.uint8), 5)
+    assert message.frame_id == "left_camera_optical"
+    assert message.stamp_ns == 5

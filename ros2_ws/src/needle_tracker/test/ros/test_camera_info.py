@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 
+from needle_tracker.answers.tracker_messages import camera_info_problem, image_geometry
 from needle_tracker.optics.calibration import Camera, StereoCalibration
-from needle_tracker.ros.conversions import camera_info_problem, image_geometry
 
 # Full sensor: width, height [px] and K.
 SENSOR = (2048, 1536)

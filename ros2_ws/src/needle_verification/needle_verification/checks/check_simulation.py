@@ -124,7 +124,7 @@ def stood_still(bench: Workbench) -> Iterator[Finding]:
     nodes = ("simulated_operator", "plane_controller", "sim_rig")
     for level in ("tip", "camera", "drive"):
         for insertion in ("stepwise", "continuous"):
-            arguments = ("--level", level, "--insertion", insertion, *SHORT)
+            arguments = ("--graph", "--level", level, "--insertion", insertion, *SHORT)
             name = f"{level}_{insertion}_12"
             usual = bench.run(name, *arguments)
             # A driver that hears nothing of its drives ends in a fault, as on hardware.
@@ -145,16 +145,15 @@ def stood_still(bench: Workbench) -> Iterator[Finding]:
 
 
 def tip_speed(bench: Workbench) -> Iterator[Finding]:
-    """Run the graph without images quickly."""
+    """Run without images quickly."""
     run = bench.run("tip_1", "--level", "tip")
-    steps, rate = run.summary.get("steps"), run.summary.get("steps_per_s")
-    spent = steps / rate if steps and rate else float("nan")
+    steps = run.summary.get("steps")
     yield Finding(
         "tip_speed",
-        "level tip: time for the 120 steps",
+        "level tip: from the command to the result of 120 steps",
         "< 10 s",
-        f"{steps} steps in {spent:.1f} s (command to result: {run.wall:.1f} s)",
-        steps == 120 and spent < 10.0,
+        f"{steps} steps in {run.wall:.1f} s",
+        steps == 120 and run.wall < 10.0,
     )
 
 
@@ -165,7 +164,7 @@ def interrupt(bench: Workbench) -> Iterator[Finding]:
     for number, (milestone, latest) in enumerate(MILESTONES):
         delay = latest * generator.random()
         kind = generator.choice((signal.SIGINT, signal.SIGTERM))
-        started = bench.start(f"interrupt_{number}", "--level", "tip")
+        started = bench.start(f"interrupt_{number}", "--level", "tip", "--graph")
         started.wait_until_said(milestone)
         time.sleep(delay)
         started.interrupt(kind)
@@ -215,7 +214,7 @@ def bad_tip(bench: Workbench) -> Iterator[Finding]:
     """NaN, a wrong frame, mm for m: all named; no command comes from them."""
     patterns = {"not_finite": "finite", "frame": "frame", "millimetres": "from the entry|jumped"}
     for kind, pattern in patterns.items():
-        run = _run_with(bench, f"bad_tip_{kind}", kind, "--level", "tip", *SHORT)
+        run = _run_with(bench, f"bad_tip_{kind}", kind, "--level", "tip", "--graph", *SHORT)
         yield _named(run, "plane_controller", kind, pattern)
         # A refused tip may cost a further exposure, and with it another noise: the run as a whole
         # may differ from one without. But each command bears the stamp of the tip behind it.

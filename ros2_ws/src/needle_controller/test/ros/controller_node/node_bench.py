@@ -137,7 +137,7 @@ class Bench:
     def start(self) -> None:
         self.device()
         self.joints()
-        steering = self.node._steering
+        steering = self.node._component.steering
         self.until(
             lambda: steering.intake.joints.latest is not None and steering._device is not None
         )

@@ -6,23 +6,23 @@ from typing import Any
 
 import numpy as np
 import pytest
-from geometry_msgs.msg import (
-    PoseWithCovarianceStamped,
-)
+from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
+from needle_common.convert import from_ros
 from needle_common.diagnostics import Level
 from needle_common.errors import UserError
+from needle_common.messages import PoseWithCovariance
 from needle_common.ros.conversions import (
     RELIABLE,
     to_nanoseconds,
     to_stamp,
 )
 from needle_controller.model.kinematics import rotation_from_angles
+from needle_controller.plane_controller import tip_covariance
 from needle_controller.protocol.joint_history import CONFIRMED_BY
-from needle_controller.ros.conversions import to_tip_covariance
 from needle_controller.ros.plane_controller import main
 
 from .node_bench import TICK, Bench
@@ -110,7 +110,7 @@ def test_joints_that_jump_say_what_to_do_and_go_on_once_they_are_back(bench: Ben
     bench.start()
     for _ in range(8):
         bench.run(bench.step())
-    deep, steering = bench.insertion, bench.node._steering
+    deep, steering = bench.insertion, bench.node._component.steering
     for place in (0.004, deep):
         bench.insertion = place
         for _ in range(CONFIRMED_BY):
@@ -163,7 +163,7 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
     bench.until(lambda: poses.get_subscription_count() > 0)
     bench.start()
     stamps = [bench.tip([0.0, 0.0, 0.0])]
-    intake = bench.node._steering.intake
+    intake = bench.node._component.steering.intake
     bench.until(lambda: bool(intake._waiting) and intake.joints.at(stamps[0]) is not None)
     assert not bench.commands
     # That of another tip says that this one's will not come.
@@ -185,7 +185,7 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
 def test_a_tip_pose_says_the_positions_covariance() -> None:
     message = PoseWithCovarianceStamped()
     message.pose.covariance = np.arange(36.0)
-    known = to_tip_covariance(message)
+    known = tip_covariance(from_ros(PoseWithCovariance, message))
     np.testing.assert_array_equal(known.matrix, [[0, 1, 2], [6, 7, 8], [12, 13, 14]])
 
 
@@ -240,7 +240,7 @@ def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
     bench._joints.publish(JointState(name=["insertion_joint"], position=[0.0]))
     bench.until(lambda: bench.health("joint_states")[0] == Level.WARN)
     assert "rotation_joint" in bench.health("joint_states")[1]
-    assert bench.node._steering.intake.joints.latest is None
+    assert bench.node._component.steering.intake.joints.latest is None
 
 
 def test_parameters_change_as_valid_wholes_only(bench: Bench) -> None:
@@ -274,7 +274,7 @@ def test_covariance_follows_the_messages_convention(bench: Bench) -> None:
     bench.start()
     bench.step()
     bench.until(lambda: bool(bench.received["needle/estimate"]))
-    estimate = bench.node._steering.control._estimator.estimate()
+    estimate = bench.node._component.steering.control._estimator.estimate()
     published = np.reshape(bench.received["needle/estimate"][-1].pose.covariance, (6, 6))
     scale = 1e-4
     rng = np.random.default_rng(1)

@@ -63,7 +63,7 @@ class Bench:
         self._infos = outside.create_publisher(CameraInfo, "stereo/left/camera_info", IMAGES)
         publishers = [self._joints, self._infos, *self._images.values()]
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        answers = self.node._outputs.values()
+        answers = [self.node._outputs[topic] for topic in ("needle/tip", "needle/tip_pose")]
         self.until(lambda: all(p.get_subscription_count() for p in answers))
 
     def close(self) -> None:

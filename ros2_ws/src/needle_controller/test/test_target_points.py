@@ -1,30 +1,25 @@
 """What a message on `target_point` does: a stamp says that the point may move."""
 
-from __future__ import annotations
-
 import numpy as np
-from builtin_interfaces.msg import Time
-from geometry_msgs.msg import Point, PointStamped
-from std_msgs.msg import Header
 
+from needle_common.component import Moment
+from needle_common.messages import Point
 from needle_controller.model.target_motion import TargetMotion
+from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.ros.steering_messages import SteeringMessages
 
 PLACE, DRIFT = np.array([0.004, 0.0, 0.09]), np.array([1e-4, 0.0, 0.0])
 
 
 def motion_after(*, stamped: bool) -> TargetMotion:
     """Return what is known of a point that was seen to drift along x for 10 s."""
-    messages = SteeringMessages(SteeringSettings())
+    controller = PlaneController(SteeringSettings())
+    (row,) = [row for row in controller.inputs if row.topic == "target_point"]
     for k in range(41):
-        seconds, nanoseconds = divmod(k * 250_000_000, 10**9)
-        stamp = Time(sec=seconds + 5, nanosec=nanoseconds) if stamped else Time()
+        stamp_ns = k * 250_000_000 + 5_000_000_000 if stamped else 0
         x, y, z = PLACE + DRIFT * 0.25 * k
-        header = Header(stamp=stamp, frame_id="rig")
-        message = PointStamped(header=header, point=Point(x=float(x), y=float(y), z=float(z)))
-        assert messages.inputs["target_point"].take(message, 0)
-    points = messages.steering.control._points
+        list(row.handler(Point(stamp_ns, "rig", (x, y, z)), Moment(0.25 * k, stamp_ns)))
+    points = controller.steering.control._points
     assert points is not None
     return points.motion
 

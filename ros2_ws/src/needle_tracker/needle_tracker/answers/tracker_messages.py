@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-import array
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from geometry_msgs.msg import Point, PointStamped, Pose, PoseWithCovarianceStamped, Quaternion
 from numpy.typing import NDArray
-from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from needle_common.ros.conversions import to_stamp
+from needle_common.messages import (
+    INSERTION_JOINT,
+    Image,
+    JointState,
+    Point,
+    Pose,
+    PoseWithCovariance,
+)
 from needle_tracker.answers.orientation import orientation, rotation_covariance
 from needle_tracker.answers.pair_answers import Frame
 from needle_tracker.optics.calibration import Camera, rotation_matrix
@@ -20,12 +25,14 @@ from needle_tracker.tracking.triangulation import SpatialTip
 
 RIG_FRAME = "rig"
 LEFT_FRAME = "left_camera_optical"
-INSERTION_JOINT = "insertion_joint"
 _QUOTED = 40  # characters of a text that is not known
 
 
-def to_frame(message: Image, side: str, camera: Camera) -> Frame:
-    """Return the image in a message, or why it is not one of this camera."""
+def frame_of(message: Any, side: str, camera: Camera) -> Frame:
+    """Return the image in a message, or why it is not one of this camera.
+
+    The message is an `Image` of ours, of rclpy or of rosbags: they name their fields alike.
+    """
     if message.encoding not in ENCODINGS:
         encoding = message.encoding[:_QUOTED]
         return Frame(None, f"{side} image is {encoding!r}, wants {WANTED}")
@@ -46,7 +53,7 @@ def to_frame(message: Image, side: str, camera: Camera) -> Frame:
     return Frame(grey_image(rows, message.width, message.encoding))
 
 
-def image_geometry(message: CameraInfo) -> tuple[int, int, NDArray[np.float64]]:
+def image_geometry(message: Any) -> tuple[int, int, NDArray[np.float64]]:
     """Return width and height [px] and camera matrix, (3, 3), of a camera_info's images.
 
     A camera_info gives `width`, `height` and `k` of the full sensor (REP 104). The images show its
@@ -60,7 +67,7 @@ def image_geometry(message: CameraInfo) -> tuple[int, int, NDArray[np.float64]]:
     return int(width), int(height), matrix
 
 
-def camera_info_problem(message: CameraInfo, side: str, camera: Camera) -> tuple[str, bool]:
+def camera_info_problem(message: Any, side: str, camera: Camera) -> tuple[str, bool]:
     """Return how a camera_info contradicts the calibration file, and whether in the images' size.
 
     The text is empty where it does not.
@@ -88,45 +95,32 @@ def camera_info_problem(message: CameraInfo, side: str, camera: Camera) -> tuple
 
 def insertion_of(message: JointState) -> float | None:
     """Return the insertion [m] in a joint state, None where it has none."""
-    names = list(message.name)
-    if INSERTION_JOINT not in names:
-        return None
-    index = names.index(INSERTION_JOINT)
-    return float(message.position[index]) if index < len(message.position) else None
+    return dict(zip(message.names, message.positions, strict=False)).get(INSERTION_JOINT)
 
 
-def to_tip(tip: SpatialTip, stamp: int) -> PointStamped:
-    """Return the message of a tip exposed at `stamp` [ns]."""
-    message = PointStamped()
-    message.header.stamp = to_stamp(stamp)
-    message.header.frame_id = RIG_FRAME
-    message.point = _point(tip)
-    return message
+def tip_message(tip: SpatialTip, stamp_ns: int) -> Point:
+    """Return a measured tip, exposed at `stamp_ns`."""
+    return Point(stamp_ns, RIG_FRAME, _position(tip))
 
 
-def to_tip_pose(tip: SpatialTip | None, stamp: int) -> PoseWithCovarianceStamped:
-    """Return the answer to a pair exposed at `stamp` [ns]; infinite covariance without a tip."""
-    message = PoseWithCovarianceStamped()
-    message.header.stamp = to_stamp(stamp)
-    message.header.frame_id = RIG_FRAME
+def tip_pose_message(tip: SpatialTip | None, stamp_ns: int) -> PoseWithCovariance:
+    """Return the answer to a pair exposed at `stamp_ns`; infinite covariance without a tip."""
     covariance = np.zeros((6, 6))
     if tip is None:
         np.fill_diagonal(covariance, np.inf)
-        message.pose.pose.orientation.w = 1.0
+        position, quaternion = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
     else:
-        message.pose.pose.position = _point(tip)
         x, y, z, w = (float(part) for part in orientation(tip.direction))
-        message.pose.pose.orientation = Quaternion(x=x, y=y, z=z, w=w)
+        position, quaternion = _position(tip), (x, y, z, w)
         covariance[:3, :3] = tip.covariance
         covariance[3:, 3:] = rotation_covariance(tip.direction, tip.direction_covariance)
-    message.pose.covariance = covariance.reshape(-1)
-    return message
+    values = tuple(covariance.ravel().tolist())
+    return PoseWithCovariance(stamp_ns, RIG_FRAME, position, quaternion, values)
 
 
-def rotation_of(pose: Pose) -> NDArray[np.float64] | None:
+def rotation_of(pose: Pose | PoseWithCovariance) -> NDArray[np.float64] | None:
     """Return the axes of a pose's frame as columns, (3, 3); None where it has no orientation."""
-    q = pose.orientation
-    quaternion = np.array([q.x, q.y, q.z, q.w])
+    quaternion = np.array(pose.orientation)
     norm = float(np.linalg.norm(quaternion))
     return rotation_matrix(quaternion / norm) if 0.5 < norm < 2.0 else None
 
@@ -138,18 +132,12 @@ def roll_sigma_of(covariance: npt.ArrayLike, axis: NDArray[np.float64]) -> float
     return math.sqrt(variance) if variance >= 0.0 else math.inf
 
 
-def to_image(pixels: NDArray[np.uint8], stamp: int) -> Image:
-    """Return the message of an RGB picture of what was exposed at `stamp` [ns], left view first."""
-    message = Image()
-    message.header.stamp = to_stamp(stamp)
-    message.header.frame_id = LEFT_FRAME
-    message.height, message.width = pixels.shape[:2]
-    message.encoding, message.step = "rgb8", 3 * pixels.shape[1]
-    message.data = array.array("B", pixels.tobytes())
-    return message
+def picture_message(pixels: NDArray[np.uint8], stamp_ns: int) -> Image:
+    """Return an RGB picture of what was exposed at `stamp_ns`, left view first."""
+    height, width = pixels.shape[:2]
+    return Image(stamp_ns, LEFT_FRAME, height, width, "rgb8", 3 * width, pixels.tobytes())
 
 
-def _point(tip: SpatialTip) -> Point:
-    # Python floats: a numpy scalar of another width would go out as garbage.
+def _position(tip: SpatialTip) -> tuple[float, float, float]:
     x, y, z = (float(part) for part in tip.position)
-    return Point(x=x, y=y, z=z)
+    return (x, y, z)

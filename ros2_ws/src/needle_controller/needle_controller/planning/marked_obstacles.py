@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import numpy as np
-from visualization_msgs.msg import Marker, MarkerArray
 
 from needle_common.errors import UserError
+from needle_common.messages import Marker, Markers
 from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.target_plane import RIG
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 
-OBSTACLES = "obstacles"
+# Of visualization_msgs/Marker.
+SPHERE, CYLINDER = 2, 3
+_DELETE, _DELETEALL = 2, 3
 _ROUND = 1e-3
 """Share by which the diameters of something round may differ."""
 
 
-def to_obstacles(message: MarkerArray) -> Obstacles:
+def obstacles_from_markers(message: Markers) -> Obstacles:
     """Return the obstacles of a message: its SPHERE and CYLINDER markers, which replace all before.
 
     A cylinder is taken as the capsule around it. Markers that delete are what RViz needs, and add
@@ -28,26 +30,25 @@ def to_obstacles(message: MarkerArray) -> Obstacles:
     """
     found = []
     for number, marker in enumerate(message.markers, start=1):
-        if marker.action in {Marker.DELETE, Marker.DELETEALL}:
+        if marker.action in {_DELETE, _DELETEALL}:
             continue
-        name = f"obstacle {number} ('{marker.ns}' {marker.id})"
-        if marker.header.frame_id != RIG:
-            raise UserError(f"{name} is given in frame '{marker.header.frame_id}', wants '{RIG}'")
-        if marker.type not in {Marker.SPHERE, Marker.CYLINDER}:
-            raise UserError(f"{name} is of type {marker.type}, wants SPHERE (2) or CYLINDER (3)")
+        name = f"obstacle {number} ('{marker.namespace}' {marker.number})"
+        if marker.frame_id != RIG:
+            raise UserError(f"{name} is given in frame '{marker.frame_id}', wants '{RIG}'")
+        if marker.kind not in {SPHERE, CYLINDER}:
+            raise UserError(f"{name} is of type {marker.kind}, wants SPHERE (2) or CYLINDER (3)")
         found.append(_obstacle(name, marker))
     return Obstacles(found)
 
 
 def _obstacle(name: str, marker: Marker) -> Obstacle:
-    p, q, scale = marker.pose.position, marker.pose.orientation, marker.scale
-    center, sizes = np.array([p.x, p.y, p.z]), np.array([scale.x, scale.y, scale.z])
+    center, sizes = np.array(marker.position), np.array(marker.scale)
     if not (np.all(np.isfinite(center)) and np.all(np.isfinite(sizes))):
         raise UserError(f"{name} is not finite: position {center} m, scale {sizes} m")
     half = np.zeros(3)
     across = sizes
-    if marker.type == Marker.CYLINDER:
-        quaternion = np.array([q.x, q.y, q.z, q.w])
+    if marker.kind == CYLINDER:
+        quaternion = np.array(marker.orientation)
         length = float(np.linalg.norm(quaternion))
         if not abs(length - 1.0) <= _ROUND:
             raise UserError(f"{name}'s quaternion has length {length:g}, wants 1")

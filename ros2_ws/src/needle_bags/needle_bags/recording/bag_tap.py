@@ -1,0 +1,113 @@
+"""A recorder that taps a virtual run: every publication into a bag, without ROS.
+
+Log times are virtual, and paths, dates and host go into metadata.yaml only: so the same seed gives
+the same bytes of MCAP.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rosbags.interfaces import QosDurability, QosReliability
+from rosbags.typesys import Stores, get_typestore
+
+from needle_bags.format.bag_metadata import USUAL_QOS
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.recording.provenance import commit, distribution, versions
+from needle_common.component import Component, Delivery, Input, Output
+from needle_common.convert import Converter, ros_type
+from needle_common.files.bag_records import RUN_RECORD
+from needle_common.files.bag_topic import BagTopic
+from needle_common.message_types import rosbags_types
+
+
+class BagTap:
+    """A bag that grows by a run's publications.
+
+    Parameters
+    ----------
+    directory : Path
+        The bag's.
+    components : iterable of Component
+        The run's, whose topics and settings the bag names.
+    others : iterable of Output
+        Topics of the runner itself.
+    run_info : mapping
+        What the bag says about how it was made.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        components: Iterable[Component],
+        others: Iterable[Output],
+        run_info: Mapping[str, Any],
+    ) -> None:
+        components = list(components)
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._converter = Converter(rosbags_types(self._store))
+        self._writer = BagWriter(directory, distribution=distribution(), describe_itself=False)
+        self._sequence: Counter[tuple[str, str]] = Counter()
+        rows: list[Input | Output] = [*others]
+        for component in components:
+            rows += [*component.outputs, *component.inputs]
+        self._numbers: dict[str, int] = {}
+        for row in rows:
+            if row.topic not in self._numbers:
+                self._numbers[row.topic] = self._writer.add_topic(self._topic(row))
+        texts = {"run_info": json.dumps(run_info), "commit": commit(), "calibration": ""}
+        self._writer.add_metadata(RUN_RECORD, texts)
+        for key, text in {**texts, "versions": json.dumps(versions())}.items():
+            self._writer.set_custom_data(key, text)
+        self._write_parameters(components)
+
+    def __call__(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+        """Write a publication."""
+        ros_message = self._converter.to_ros(message)
+        data = bytes(self._store.serialize_cdr(ros_message, ros_type(output.message)))
+        self._sequence[sender, output.topic] += 1
+        sequence = self._sequence[sender, output.topic]
+        self._writer.write(self._numbers[output.topic], data, stamp_ns, stamp_ns, sequence)
+
+    def close(self) -> None:
+        """Complete the bag."""
+        self._writer.close()
+
+    def _topic(self, row: Input | Output) -> BagTopic:
+        type_name = ros_type(row.message)
+        definition, _ = self._store.generate_msgdef(type_name, ros_version=2)
+        return BagTopic(
+            row.topic if row.topic.startswith("/") else f"/{row.topic}",
+            type_name,
+            definition,
+            self._store.hash_rihs01(type_name),
+            (_offered(row.delivery),),
+        )
+
+    def _write_parameters(self, components: Iterable[Component]) -> None:
+        document = {}
+        for component in components:
+            values = {
+                name: list(value) if isinstance(value, tuple) else value
+                for name, value in dataclasses.asdict(component.settings).items()
+            }
+            node = f"/{component.name}"
+            document[node] = {"ros__parameters": values}
+            record = {"node": node, "yaml": yaml.safe_dump({node: document[node]})}
+            self._writer.add_metadata("parameters", record)
+        self._writer.set_custom_data("parameters", yaml.safe_dump(document))
+
+
+def _offered(delivery: Delivery) -> Any:
+    reliability, durability = QosReliability, QosDurability
+    return USUAL_QOS._replace(
+        depth=delivery.depth,
+        reliability=reliability.RELIABLE if delivery.reliable else reliability.BEST_EFFORT,
+        durability=durability.TRANSIENT_LOCAL if delivery.latched else durability.VOLATILE,
+    )

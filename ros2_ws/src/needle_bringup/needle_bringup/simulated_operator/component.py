@@ -1,0 +1,156 @@
+"""simulated_operator as a component: keeps the hold in simulation, in a person's stead."""
+
+from __future__ import annotations
+
+from needle_bringup.simulated_operator.operator_sequence import (
+    DISABLE,
+    PREPARATION,
+    OperatorSequence,
+    ServiceCall,
+)
+from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_common import messages as m
+from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_common.component import (
+    BEST_EFFORT,
+    LATCHED,
+    Actions,
+    Answer,
+    Call,
+    Component,
+    Diagnose,
+    Exit,
+    Input,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Timer,
+)
+from needle_common.diagnostics import Diagnostic, Level
+
+HOLD = "device/hold"
+HOLD_LIFETIME = 0.1
+"""A message promises the hold for so long [s]."""
+_CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
+# The hold is best effort: a release worth sending is worth sending again.
+_RELEASES = 3
+
+
+class SimulatedOperator(Component):
+    """Does what `OperatorSequence` asks for and tells it what was received.
+
+    Parameters
+    ----------
+    settings : SimulatedOperatorParameters
+        The node's parameters.
+    """
+
+    name = "simulated_operator"
+
+    def __init__(self, settings: SimulatedOperatorParameters) -> None:
+        self.settings = settings
+        self._sequence = OperatorSequence(
+            0.0,
+            self.name,
+            wait_timeout=settings.wait_timeout,
+            stall_timeout=settings.stall_timeout,
+        )
+        self._pending: ServiceCall | None = None
+        self._is_finished = False
+        self.inputs = (
+            Input(_CONTROLLER, m.Status, self._on_controller, LATCHED),
+            Input(_DEVICE, m.Status, self._on_device, LATCHED),
+        )
+        self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
+        self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note which partners are there."""
+        self._sequence.see_devices(peers.publishers.get(_DEVICE, ()))
+        missing = [
+            f"service {call.service}" for call in PREPARATION if call.service not in peers.services
+        ]
+        for topic in (_CONTROLLER, _DEVICE):
+            if topic not in peers.publishers:
+                missing.append(f"publisher of {topic}")
+        if HOLD not in peers.subscribers:
+            missing.append(f"subscriber of {HOLD}")
+        self._sequence.see_missing(missing)
+        return ()
+
+    def on_answer(self, answer: Answer, at: Moment) -> Actions:
+        """Take the answer to the last call, or exit after the last of all."""
+        if self._is_finished:
+            return self._exit()
+        call = self._pending
+        if call is None or call.service != answer.service or not answer.answered:
+            return ()
+        self._sequence.take_answer(call, answer.success, answer.text, at.steady)
+        return self._advance(at)
+
+    def on_stop(self, at: Moment) -> Actions:
+        """Release, disable, and exit as interrupted."""
+        self._sequence.interrupt()
+        return self._advance(at)
+
+    def _on_controller(self, message: m.Status, at: Moment) -> Actions:
+        self._sequence.see_controller(message.values, at.steady)
+        return self._advance(at)
+
+    def _on_device(self, message: m.Status, at: Moment) -> Actions:
+        self._sequence.see_device(message.values, message.source, at.steady)
+        return self._advance(at)
+
+    def _on_timer(self, at: Moment) -> Actions:
+        if self._sequence.steering:
+            yield self._hold(at, pressed=self._sequence.hold())
+        self._sequence.check_time(at.steady)
+        yield from self._advance(at)
+
+    def _advance(self, at: Moment) -> Actions:
+        if self._is_finished:
+            return
+        if self._sequence.outcome is not None:
+            yield from self._finish(at)
+            return
+        call = self._sequence.next_call(at.steady)
+        if call is not None:
+            self._pending = call
+            yield Call(call.service, call.data)
+        yield self._report()
+
+    def _finish(self, at: Moment) -> Actions:
+        self._is_finished = True
+        if not self._sequence.touched:
+            yield from self._exit()
+            return
+        for _ in range(_RELEASES):
+            yield self._hold(at, pressed=False)
+        yield self._report()
+        yield Call(DISABLE.service, DISABLE.data)
+
+    def _exit(self) -> Actions:
+        outcome = self._sequence.outcome
+        assert outcome is not None
+        if outcome.interrupted:
+            yield Exit(EXIT_INTERRUPTED, outcome.reason)
+        elif not outcome.prepared:
+            yield Exit(EXIT_BAD_INPUT, outcome.reason)
+        else:
+            yield Exit(EXIT_DONE if outcome.done else EXIT_MISSED, outcome.reason)
+
+    def _hold(self, at: Moment, *, pressed: bool) -> Publish:
+        speed = self.settings.speed_scale if pressed else 0.0
+        state = m.HoldState(at.stamp_ns, self.name, pressed, speed, HOLD_LIFETIME)
+        return Publish(HOLD, state)
+
+    def _report(self) -> Diagnose:
+        if self._sequence.steering:
+            again = self._sequence.presses_again
+            message = "the hold is pressed" + (f" (pressed again {again} times)" if again else "")
+        elif self._sequence.outcome is not None:
+            message = "the hold is released"
+        else:
+            message = "prepares the rig"
+        return Diagnose("hold", Diagnostic(Level.OK, message))

@@ -1,0 +1,131 @@
+"""The whole rig as components in this process, on a virtual clock: the run of `simulate`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from needle_bags.recording.bag_tap import BagTap
+from needle_bringup.simulated_operator.component import SimulatedOperator
+from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.progress import Progress
+from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_common.component import Component, Exit, Output
+from needle_common.errors import UserError
+from needle_common.messages import Status
+from needle_common.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
+from needle_common.settings.parameter_fields import from_values
+from needle_common.settings.parameter_files import Parameters
+from needle_controller.plane_controller import STATUS, PlaneController
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_sim.sim_rig import SimRig
+from needle_sim.sim_rig_parameters import SimRigParameters
+
+COMPUTE = {"plane_controller": (1e-3, 3e-3)}
+"""Compute time of a handler, as measured on two shared cores [s]."""
+_SLICE = 1.0
+_WIND_UP = 5.0
+"""What the rest of the rig may take to end after the operator [s]."""
+# Parameters that only a graph of processes has.
+_OF_GRAPH = ("use_sim_time", "wait_for_recorder", "lock_step", "real_time_factor")
+
+
+def make_components(parameters: Parameters) -> list[Component]:
+    """Return the rig of level `tip`.
+
+    Raises
+    ------
+    UserError
+        A parameter that a component does not have, or that is out of its bounds.
+    """
+    return [
+        SimRig(_settings(SimRigParameters, parameters, "sim_rig")),
+        PlaneController(_settings(SteeringSettings, parameters, "plane_controller")),
+        SimulatedOperator(_settings(SimulatedOperatorParameters, parameters, "simulated_operator")),
+    ]
+
+
+def run_virtually(
+    components: list[Component],
+    bag: Path,
+    *,
+    seed: int,
+    run_info: Mapping[str, Any],
+    real_time_factor: float,
+    check: Callable[[], None],
+) -> None:
+    """Run the rig until the operator ends, and record it.
+
+    Parameters
+    ----------
+    components : list of Component
+        The rig.
+    bag : Path
+        Folder of the bag.
+    seed : int
+        Keys latencies and compute times.
+    run_info : mapping
+        What the bag says about how it was made.
+    real_time_factor : float
+        Virtual over real time; 0: as fast as possible.
+    check : callable
+        Raises KeyboardInterrupt where the run shall end.
+
+    Raises
+    ------
+    UserError
+        If the rig did not get ready or a component ended before the operator.
+    """
+    tap = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info)
+    progress = _ProgressTap(Progress(sys.stderr))
+    runner = VirtualRunner(
+        components,
+        seed,
+        compute=COMPUTE,
+        taps=(tap, progress),
+        real_time_factor=real_time_factor,
+    )
+    operator = SimulatedOperator.name
+    try:
+        while not runner.run(_SLICE):
+            check()
+        _judge(runner.exits, operator)
+    except KeyboardInterrupt:
+        runner.stop(operator)
+        runner.run(_WIND_UP)
+        raise
+    finally:
+        ended = runner.exits.get(operator)
+        progress.close(f"{operator}: {ended.text}" if ended else "")
+        tap.close()
+
+
+def _judge(exits: Mapping[str, Exit], operator: str) -> None:
+    for name, ended in exits.items():
+        if name != operator or ended.code not in (EXIT_DONE, EXIT_MISSED):
+            raise UserError(f"{name} ended with exit code {ended.code}: {ended.text}")
+
+
+def _settings(kind: type[Any], parameters: Parameters, node: str) -> Any:
+    values = {k: v for k, v in parameters.get(node, {}).items() if k not in _OF_GRAPH}
+    return from_values(kind, values, node)
+
+
+class _ProgressTap:
+    """Shows how far the needle is in, from what the controller says."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+
+    def __call__(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+        if output.topic == STATUS and isinstance(message, Status):
+            values = message.values
+            if values["state"] in ("STEERING", "WAITING_FOR_TIP", "DONE"):
+                self._progress.show(float(values["insertion_m"]), float(values["depth_m"]))
+            waits = values["state"] == "WAITING_FOR_TIP"
+            self._progress.tell_wait(values["reason"] if waits else "")
+
+    def close(self, line: str) -> None:
+        self._progress.close(line)

@@ -1,0 +1,358 @@
+"""plane_controller as a component: measured tips in, one insertion step at a time out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from needle_common import messages as m
+from needle_common.component import (
+    LATCHED,
+    RELIABLE,
+    Actions,
+    Component,
+    Delivery,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Reply,
+    Service,
+    Timer,
+)
+from needle_common.diagnostics import Diagnostic, Level
+from needle_common.errors import UserError
+from needle_common.rotations import quaternion_from_rotation
+from needle_controller.controller_status import steering_diagnostic
+from needle_controller.model.arrays import Array
+from needle_controller.model.kinematics import angle_axes
+from needle_controller.model.point_reach import point_from_message
+from needle_controller.model.target_plane import plane_from_pose
+from needle_controller.observers.estimator import Estimate
+from needle_controller.planning.marked_obstacles import obstacles_from_markers
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.continuous import make_steering
+from needle_controller.protocol.heard_messages import HeardMessages
+from needle_controller.protocol.joint_history import JointSample
+from needle_controller.protocol.steering import Steering
+from needle_controller.protocol.steering_types import (
+    Action,
+    DeviceReport,
+    PublishUpdate,
+    SendPath,
+    SendStep,
+    StartReply,
+)
+from needle_controller.protocol.steering_types import Log as SteeringLog
+from needle_controller.protocol.tip_covariance import TipCovariance
+from needle_controller.protocol.tip_gate import TipMeasurement
+
+COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
+TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
+TARGETS = (TARGET_PLANE, TARGET_POINT, OBSTACLES)
+_LAST_STAYS = {
+    TARGET_PLANE: "the last plane stays",
+    TARGET_POINT: "the last target stays",
+    OBSTACLES: "the last obstacles stay",
+}
+JOINT_STATES = Delivery(depth=200)
+"""While a tip is handled, the 50 joint states of each second wait."""
+# Time between two lines of log of one kind [s]: never every cycle.
+_LOG_PERIOD = 2.0
+
+
+class PlaneController(Component):
+    """Steers the needle into the target plane, or to the target point: the step protocol on topics.
+
+    Parameters
+    ----------
+    settings : SteeringSettings
+        The node's parameters.
+    signature : str
+        Full name of the node, by which its status names itself.
+
+    Attributes
+    ----------
+    steering : Steering
+        The step protocol.
+    complaints : dict of str to str
+        By topic what is wrong with its latest message; only topics with something wrong.
+    """
+
+    name = "plane_controller"
+
+    def __init__(self, settings: SteeringSettings, signature: str = "plane_controller") -> None:
+        self.settings = settings
+        self.steering: Steering = make_steering(settings)
+        self.complaints: dict[str, str] = {}
+        self._signature = signature
+        self._bad_joints = 0
+        self._missing: list[str] = [f"subscriber of {COMMANDS}"]
+        self._heard = HeardMessages()
+        self._logged: dict[str, float] = {}
+        self._published: Diagnostic | None = None
+        rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
+        rows = (
+            ("joint_states", m.JointState, self._on_joints, JOINT_STATES),
+            ("device/status", m.Status, self._on_device, LATCHED),
+            ("device/result", m.CommandResult, self._on_result, RELIABLE),
+            ("needle/tip", m.Point, self._on_tip, RELIABLE),
+            ("needle/tip_pose", m.PoseWithCovariance, self._on_tip_pose, RELIABLE),
+            (TARGET_PLANE, m.Pose, self._on_plane, LATCHED),
+            (TARGET_POINT, m.Point, self._on_point, LATCHED),
+            (OBSTACLES, m.Markers, self._on_obstacles, LATCHED),
+        )
+        self.inputs = tuple(
+            Input(topic, message, partial(self._receive, topic, handler), delivery)
+            for topic, message, handler, delivery in rows
+        )
+        self.outputs = (
+            Output(COMMANDS, m.Trajectory),
+            Output("needle/estimate", m.PoseWithCovariance),
+            Output("needle/reduced_state", m.Vector),
+            Output("needle/linearized_state", m.Vector),
+            Output("needle/control_input", m.Vector),
+            Output(STATUS, m.Status, LATCHED),
+        )
+        self.services = (
+            Service("plane_controller/start", self._on_start),
+            Service("plane_controller/stop", self._on_stop_request),
+        )
+        self.timers = (Timer(0.1, self._on_timer),)
+
+    def configure(self, settings: SteeringSettings, at: Moment) -> Actions:
+        """Take changed parameters."""
+        self.settings = settings
+        self.steering.configure(settings)
+        return self.carry_out([SteeringLog("info", "parameters changed")], at)
+
+    def carry_out(self, actions: Iterable[Action], at: Moment) -> Actions:
+        """Return what the protocol's actions are on the graph, and the status if it has changed."""
+        for action in actions:
+            match action:
+                case SteeringLog():
+                    yield from self._log(action, at)
+                case PublishUpdate():
+                    yield from _update(action)
+                case SendStep() | SendPath():
+                    yield Publish(COMMANDS, _trajectory(action))
+        yield from self._report()
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note whether anybody receives commands: a first step to nobody would be lost."""
+        receivers = set(peers.subscribers.get(COMMANDS, ())) - {self.name}
+        self._missing = [] if receivers else [f"subscriber of {COMMANDS}"]
+        return ()
+
+    # ---- inputs -------------------------------------------------------------------------------
+
+    def _receive(
+        self,
+        topic: str,
+        handler: Callable[[Any, Moment], Iterable[Action]],
+        message: Any,
+        at: Moment,
+    ) -> Actions:
+        self._heard.add(topic, at.sent_ns)
+        try:
+            actions = handler(message, at)
+        except UserError as error:
+            actions = self._complain(topic, error)
+        else:
+            self.complaints.pop(topic, None)
+        return self.carry_out(actions, at)
+
+    def _complain(self, topic: str, error: UserError) -> list[Action]:
+        self._bad_joints += topic == "joint_states"
+        kept = _LAST_STAYS.get(topic)
+        self.complaints[topic] = f"{error}; {kept}" if kept else str(error)
+        return [SteeringLog("warning", self.complaints[topic], topic)]
+
+    def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
+        return self.steering.on_joints(joint_sample(message, at.sent_ns))
+
+    def _on_device(self, message: m.Status, at: Moment) -> Iterable[Action]:
+        return self.steering.on_device(device_report(message))
+
+    def _on_result(self, message: m.CommandResult, at: Moment) -> Iterable[Action]:
+        return self.steering.on_result(message.stamp_ns, message.outcome, at.sent_ns)
+
+    def _on_tip(self, message: m.Point, at: Moment) -> Iterable[Action]:
+        position = np.array(message.position)
+        return self.steering.on_tip(TipMeasurement(message.stamp_ns, message.frame_id, position))
+
+    def _on_tip_pose(self, message: m.PoseWithCovariance, at: Moment) -> Iterable[Action]:
+        return self.steering.on_tip_pose(tip_covariance(message))
+
+    def _on_plane(self, message: m.Pose, at: Moment) -> Iterable[Action]:
+        plane = plane_from_pose(message.frame_id, message.position, message.orientation)
+        self.steering.settings.check_plane(plane)
+        self.steering.control.plane = plane
+        self.steering.control.target_point = None
+        return [SteeringLog("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
+
+    def _on_point(self, message: m.Point, at: Moment) -> Iterable[Action]:
+        point = point_from_message(message.frame_id, message.position)
+        self.steering.settings.check_point(point)
+        if message.stamp_ns:
+            self.steering.control.see_target_point(point, message.stamp_ns * 1e-9)
+        else:
+            # Placed by hand: nobody says when it was there.
+            self.steering.control.target_point = point
+        x, y, z = point
+        text = f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m"
+        return [SteeringLog("info", text, TARGET_POINT)]
+
+    def _on_obstacles(self, message: m.Markers, at: Moment) -> Iterable[Action]:
+        obstacles = obstacles_from_markers(message)
+        self.steering.control.obstacles = obstacles
+        return [SteeringLog("info", f"{len(obstacles)} obstacles", OBSTACLES)]
+
+    # ---- services and time --------------------------------------------------------------------
+
+    def start(self, at: Moment) -> tuple[StartReply, Actions]:
+        """Begin to steer, if all is there."""
+        reply, actions = self.steering.on_start()
+        return reply, self.carry_out(actions, at)
+
+    def stop(self, at: Moment) -> tuple[StartReply, Actions]:
+        """Send no more steps."""
+        reply, actions = self.steering.on_stop()
+        return reply, self.carry_out(actions, at)
+
+    def _on_start(self, _: bool | None, number: int, at: Moment) -> Actions:
+        if self._missing:
+            yield Reply(number, False, f"waiting for {', '.join(self._missing)}")
+            return
+        reply, actions = self.start(at)
+        yield from actions
+        yield Reply(number, reply.success, reply.message)
+
+    def _on_stop_request(self, _: bool | None, number: int, at: Moment) -> Actions:
+        reply, actions = self.stop(at)
+        yield from actions
+        yield Reply(number, reply.success, reply.message)
+
+    def _on_timer(self, at: Moment) -> Actions:
+        return self.carry_out(self.steering.on_time(at.steady), at)
+
+    # ---- what is said -------------------------------------------------------------------------
+
+    def _log(self, log: SteeringLog, at: Moment) -> Actions:
+        if log.kind:
+            if at.steady - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
+                return
+            self._logged[log.kind] = at.steady
+        yield Log(log.severity, log.text)
+
+    def _report(self) -> Actions:
+        history = self.steering.intake.joints
+        joints = {
+            "joint_states_refused": str(self._bad_joints),
+            "joint_states_doubted": str(history.doubted),
+        }
+        complaint = self.complaints.get("joint_states", "") or history.complaint
+        yield Diagnose("joint_states", _health(complaint, joints))
+        for topic in TARGETS:
+            yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
+        diagnostic = steering_diagnostic(self.steering, self.settings.preset)
+        yield Diagnose("steering", diagnostic)
+        if diagnostic != self._published or self._heard.is_full:
+            self._published = diagnostic
+            values = {**diagnostic.values, "heard": self._heard.take_text()}
+            told = dataclasses.replace(diagnostic, values=values)
+            yield Publish(STATUS, m.Status.of(self._signature, "steering", told))
+
+
+def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
+    """Return the two joints of a message, found by name, with the time of its sending [ns].
+
+    Raises
+    ------
+    UserError
+        If one of them is missing or not finite.
+    """
+    position = dict(zip(message.names, message.positions, strict=False))
+    missing = [name for name in (m.INSERTION_JOINT, m.ROTATION_JOINT) if name not in position]
+    if missing:
+        raise UserError(f"joint_states without {' and '.join(missing)}: {list(message.names)}")
+    insertion, rotation = position[m.INSERTION_JOINT], position[m.ROTATION_JOINT]
+    if not (math.isfinite(insertion) and math.isfinite(rotation)):
+        raise UserError(f"joint_states are not finite: {insertion} m, {rotation} rad")
+    return JointSample(message.stamp_ns, insertion, rotation, sent_ns)
+
+
+def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
+    """Return the covariance of a measured tip as it came, nothing checked."""
+    matrix = np.array(message.covariance).reshape(6, 6)[:3, :3]
+    return TipCovariance(message.stamp_ns, message.frame_id, matrix)
+
+
+def device_report(message: m.Status) -> DeviceReport:
+    """Return what the protocol needs of device/status."""
+    values = message.values
+    return DeviceReport(
+        state=values.get("state", ""),
+        homed=values.get("homed", "").lower() == "true",
+        hold_owner=values.get("hold_owner", ""),
+        reason=values.get("fault", "") or values.get("reason", "") or message.text,
+        insertion=_number(values.get("insertion_m", "")),
+        rotation=_number(values.get("rotation_rad", "")),
+    )
+
+
+def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
+    return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _trajectory(command: SendStep | SendPath) -> m.Trajectory:
+    """Return a step as a trajectory of one point, a path as one of several."""
+    points = tuple(
+        m.TrajectoryPoint((insertion, rotation), time)
+        for insertion, rotation, time in command.points
+    )
+    return m.Trajectory(command.stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
+
+
+def _update(action: PublishUpdate) -> Actions:
+    stamp_ns, estimate, command = action.stamp_ns, action.update.estimate, action.update.command
+    control = (command.virtual_input, command.rotation_rate, action.update.turned)
+    yield Publish("needle/estimate", _pose(estimate, stamp_ns))
+    yield Publish("needle/reduced_state", _vector(estimate.reduced, stamp_ns))
+    yield Publish("needle/linearized_state", _vector(estimate.linearized, stamp_ns))
+    yield Publish("needle/control_input", _vector(np.array(control), stamp_ns))
+
+
+def _pose(estimate: Estimate, stamp_ns: int) -> m.PoseWithCovariance:
+    """Return the estimated pose, its covariance in the message's fixed-axis convention."""
+    turn = np.eye(6)
+    turn[3:, 3:] = angle_axes(estimate.coordinates[3:])
+    covariance = turn @ estimate.covariance @ turn.T
+    x, y, z = (float(c) for c in estimate.position)
+    return m.PoseWithCovariance(
+        stamp_ns,
+        TARGET_PLANE,
+        (x, y, z),
+        quaternion_from_rotation(estimate.rotation.tolist()),
+        tuple(covariance.ravel().tolist()),
+    )
+
+
+def _vector(values: Array, stamp_ns: int) -> m.Vector:
+    x, y, z = (float(value) for value in values)
+    return m.Vector(stamp_ns, TARGET_PLANE, (x, y, z))

@@ -1,0 +1,218 @@
+"""The `device/...` interface of a motion supervisor as rows of a component.
+
+It is the same for real, emulated and simulated axes; a component adds its cycle.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+from needle_common import messages as m
+from needle_common.component import (
+    LATCHED,
+    Actions,
+    Delivery,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Service,
+)
+from needle_common.component import Reply as ServiceReply
+from needle_common.diagnostics import Diagnostic, Level
+from needle_device_driver.supervisor.command import Command, CommandPoint
+from needle_device_driver.supervisor.hold import HoldMessage
+from needle_device_driver.supervisor.reports import (
+    DeviceStatus,
+    Notice,
+    NoticeLimit,
+    Reply,
+    StepResult,
+)
+from needle_device_driver.supervisor.states import State
+from needle_device_driver.supervisor.supervisor import MotionSupervisor
+
+COMMANDS, HOLD, EMERGENCY_STOP = "device/joint_trajectory", "device/hold", "device/estop"
+STATUS, RESULT, JOINTS = "device/status", "device/result", "joint_states"
+# Every message counts, also while somebody floods the topic.
+_HOLDS = Delivery(depth=100, reliable=False)
+_EMERGENCY_STOPS = Delivery(depth=1000)
+# Positions alone change device/status so often at most [s]; joint_states has them all.
+_STATUS_PERIOD = 0.5
+_LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
+
+
+class DeviceRows:
+    """Rows that connect a motion supervisor to topics and services.
+
+    Parameters
+    ----------
+    supervisor : MotionSupervisor
+        What they speak for.
+    name : str
+        Name of the component.
+    simulated : bool or None
+        Whether no real needle can move; None until that is known.
+    refuse : callable
+        Returns why services are not ready yet, empty when they are; a stop and a disabling are
+        never refused.
+    """
+
+    def __init__(
+        self,
+        supervisor: MotionSupervisor,
+        name: str,
+        *,
+        simulated: bool | None,
+        refuse: Callable[[], str] = lambda: "",
+    ) -> None:
+        self.simulated = simulated
+        self._supervisor = supervisor
+        self._name = name
+        self._refuse = refuse
+        self._command_publishers = 1
+        self._told: DeviceStatus | None = None
+        self._told_at = 0.0
+        self._notices = NoticeLimit()
+        self.inputs = (
+            Input(COMMANDS, m.Trajectory, self._on_command),
+            Input(HOLD, m.HoldState, self._on_hold, _HOLDS),
+            Input(EMERGENCY_STOP, m.EmergencyStop, self._on_emergency_stop, _EMERGENCY_STOPS),
+        )
+        self.outputs = (
+            Output(JOINTS, m.JointState),
+            Output(RESULT, m.CommandResult),
+            Output(STATUS, m.Status, LATCHED),
+        )
+        call = supervisor
+        self.services = (
+            self._trigger("home", lambda at: call.home(at.steady)),
+            self._trigger("retract", lambda at: call.retract(at.steady)),
+            self._trigger("reset", lambda at: call.reset(at.steady)),
+            self._trigger("stop", lambda at: call.stop(), always=True),
+            self._switch("enable", lambda on, at: call.enable(on, at.steady)),
+            self._switch("confirm_needle_out", lambda on, at: call.confirm_needle_out(on)),
+        )
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note who else is a device on these topics, and how many send commands."""
+        self._command_publishers = len(peers.publishers.get(COMMANDS, ()))
+        others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
+        text = f"another device is there: {', '.join(others)} publishes {STATUS}" if others else ""
+        self._supervisor.see_others(text)
+        return self.report(at)
+
+    def report(self, at: Moment) -> Actions:
+        """Return results, notices and a changed status; call it after each cycle."""
+        for event in self._supervisor.take_events():
+            match event:
+                case StepResult(stamp_ns, outcome):
+                    yield Publish(RESULT, m.CommandResult(stamp_ns, outcome))
+                case Notice():
+                    text = self._notices.admit(event, at.steady)
+                    if text:
+                        yield Log("error" if event.fault else "warning", text)
+        status = self._supervisor.status(at.steady)
+        status = dataclasses.replace(status, simulated=self.simulated)
+        if self._is_news(status, at.steady):
+            self._told, self._told_at = status, at.steady
+            diagnostic = device_diagnostic(status)
+            yield Publish(STATUS, m.Status.of(self._name, "device", diagnostic))
+            yield Diagnose("device", diagnostic)
+
+    def joint_states(self, at: Moment) -> Actions:
+        """Return the measured joints, unless they are stale."""
+        joints = self._supervisor.joints(at.steady)
+        if joints is not None:
+            axes = (joints.insertion, joints.rotation)
+            message = m.JointState(
+                at.stamp_ns,
+                (m.INSERTION_JOINT, m.ROTATION_JOINT),
+                tuple(axis.position for axis in axes),
+                tuple(axis.velocity for axis in axes),
+            )
+            yield Publish(JOINTS, message)
+
+    def _is_news(self, status: DeviceStatus, now: float) -> bool:
+        told = self._told
+        if told is None or now - self._told_at > _STATUS_PERIOD:
+            return told != status
+        return told != dataclasses.replace(status, insertion=told.insertion, rotation=told.rotation)
+
+    def _on_command(self, message: m.Trajectory, at: Moment) -> Actions:
+        points = tuple(
+            CommandPoint(point.positions, point.others, point.time_from_start)
+            for point in message.points
+        )
+        command = Command(message.stamp_ns, message.joint_names, points)
+        self._supervisor.submit(command, at.steady, self._command_publishers)
+        return self.report(at)
+
+    def _on_hold(self, message: m.HoldState, at: Moment) -> Actions:
+        hold = HoldMessage(
+            message.source,
+            message.stamp_ns,
+            message.pressed,
+            message.speed_scale,
+            message.lifetime,
+        )
+        self._supervisor.receive_hold(hold, at.steady)
+        return self.report(at)
+
+    def _on_emergency_stop(self, message: m.EmergencyStop, at: Moment) -> Actions:
+        self._supervisor.receive_estop(message.pressed)
+        return self.report(at)
+
+    def _trigger(
+        self, name: str, call: Callable[[Moment], Reply], *, always: bool = False
+    ) -> Service:
+        def answer(_: bool | None, number: int, at: Moment) -> Actions:
+            return self._answer(number, at, lambda: call(at), always=always)
+
+        return Service(f"device/{name}", answer)
+
+    def _switch(self, name: str, call: Callable[[bool, Moment], Reply]) -> Service:
+        def answer(on: bool | None, number: int, at: Moment) -> Actions:
+            return self._answer(number, at, lambda: call(bool(on), at), always=not on)
+
+        return Service(f"device/{name}", answer, has_argument=True)
+
+    def _answer(
+        self, number: int, at: Moment, call: Callable[[], Reply], *, always: bool
+    ) -> Actions:
+        why_not = "" if always else self._refuse()
+        reply = Reply(False, why_not) if why_not else call()
+        yield from self.report(at)
+        yield ServiceReply(number, reply.success, reply.message)
+
+
+def device_diagnostic(status: DeviceStatus) -> Diagnostic:
+    """Return device/status as a line of health."""
+    message = status.fault or status.reason or status.state.value
+    return Diagnostic(
+        _LEVELS.get(status.state, Level.OK),
+        message,
+        {
+            "state": status.state.value,
+            "activity": status.activity.value,
+            "homed": "true" if status.homed else "false",
+            "hold_owner": status.hold_owner,
+            "press_again": status.press_again,
+            "speed_scale": f"{status.speed_scale:.3g}",
+            "insertion_m": "" if status.insertion is None else repr(status.insertion),
+            "rotation_rad": "" if status.rotation is None else repr(status.rotation),
+            "fault": status.fault,
+            "reason": status.reason,
+            "needle_out_confirmed": "true" if status.needle_out_confirmed else "false",
+            "watchdog_trips": str(status.watchdog_trips),
+            "commands_refused": str(status.commands_refused),
+            "needs_time": "true" if status.needs_time else "false",
+            "command_ns": str(status.command_ns),
+            "rotation_owed_rad": f"{status.rotation_owed:.2f}",
+            "simulated": "" if status.simulated is None else str(status.simulated).lower(),
+        },
+    )

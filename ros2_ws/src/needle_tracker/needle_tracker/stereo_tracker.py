@@ -1,0 +1,210 @@
+"""stereo_tracker as a component: images and joint states in, one answer for every pair out."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+
+from needle_common import messages as m
+from needle_common.component import (
+    LATCHED,
+    RELIABLE,
+    Actions,
+    Component,
+    Delivery,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Timer,
+)
+from needle_common.diagnostics import Diagnostic, Level
+from needle_tracker.answers.annotation import annotate
+from needle_tracker.answers.health import Health
+from needle_tracker.answers.pair_answers import Answer, PairAnswers
+from needle_tracker.answers.tracker_messages import (
+    camera_info_problem,
+    frame_of,
+    insertion_of,
+    picture_message,
+    roll_sigma_of,
+    rotation_of,
+    tip_message,
+    tip_pose_message,
+)
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.optics.calibration import SIDES, StereoCalibration
+from needle_tracker.tracking.refusals import TrackState
+
+TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
+ANNOTATED, CALIBRATION = "stereo_tracker/annotated_image", "stereo_tracker/calibration"
+TARGET_PLANE = "target_plane"
+JOINT_STATES = Delivery(depth=200)
+"""While a pair is measured, the 50 joint states of each second wait."""
+_IMAGES = Delivery(depth=5)
+_IMAGES_BEST_EFFORT = Delivery(depth=2, reliable=False)
+_CHECK_PERIOD = 0.05  # [s]
+
+
+class StereoTipTracker(Component):
+    """Pairs images by stamp, measures the needle's tip in each pair, and says how it goes.
+
+    Parameters
+    ----------
+    settings : StereoTrackerParameters
+        The node's parameters.
+    calibration : StereoCalibration
+        The stereo rig.
+    calibration_text : str
+        Text of its file, for whoever records.
+
+    Attributes
+    ----------
+    answers : PairAnswers
+        What answers the pairs.
+    is_annotation_wanted : bool
+        Whether anybody receives the annotated images.
+    """
+
+    name = "stereo_tracker"
+
+    def __init__(
+        self,
+        settings: StereoTrackerParameters,
+        calibration: StereoCalibration,
+        calibration_text: str = "",
+    ) -> None:
+        self.settings = settings
+        self.is_annotation_wanted = False
+        self._cameras = {"left": calibration.left, "right": calibration.right}
+        self._calibration_text = calibration_text
+        self._is_calibration_told = False
+        self.answers = PairAnswers(
+            calibration, settings.tracker_settings(calibration), settings.answering_settings()
+        )
+        self._health = Health()
+        rate = settings.annotated_rate
+        self._annotated_period = 1.0 / rate if rate > 0.0 else math.inf
+        self._annotated_at = -math.inf
+        # What every start begins with is not worth a warning in the log.
+        self._told = {"track": TrackState.SEARCHING.value, "images": "no images yet"}
+        self.inputs = (*self._source_rows(), *self._image_rows())
+        self.outputs = (
+            Output(TIP, m.Point),
+            Output(TIP_POSE, m.PoseWithCovariance),
+            Output(ANNOTATED, m.Image, _IMAGES),
+            Output(CALIBRATION, m.Text, LATCHED),
+        )
+        self.timers = (Timer(_CHECK_PERIOD, self.check),)
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note whether anybody looks at the annotated images."""
+        self.is_annotation_wanted = ANNOTATED in peers.subscribers
+        return ()
+
+    def check(self, at: Moment) -> Actions:
+        """Answer the pairs that have waited long enough for their joint state."""
+        if not self._is_calibration_told:
+            self._is_calibration_told = True
+            yield Publish(CALIBRATION, m.Text(self._calibration_text))
+        yield from self.publish(self.answers.ready(at.steady), at)
+        yield from self._report(at)
+
+    def publish(self, answers: Iterable[Answer], at: Moment) -> Actions:
+        """Return the messages of answers, in the order of sending."""
+        for answer in answers:
+            stamp_ns, tip = answer.pair.stamp, answer.measured.tip
+            if tip is not None:
+                yield Publish(TIP, tip_message(tip, stamp_ns))
+            yield Publish(TIP_POSE, tip_pose_message(answer.tip, stamp_ns))
+            yield from self._annotate(answer, at)
+            if answer.refused:
+                self._health.pair_refused(answer.refused, at.steady)
+            self._health.pair_done(answer.arrival, at.steady, answer.measured)
+            yield from self._report(at)
+
+    # ---- inputs -------------------------------------------------------------------------------
+
+    def _source_rows(self) -> list[Input]:
+        rows = [Input("joint_states", m.JointState, self._on_joints, JOINT_STATES)]
+        if self.settings.heading_from_estimate:
+            estimate = Input("needle/estimate", m.PoseWithCovariance, self._on_estimate, RELIABLE)
+            rows += [estimate, Input(TARGET_PLANE, m.Pose, self._on_plane, LATCHED)]
+        return rows
+
+    def _image_rows(self) -> list[Input]:
+        delivery = _IMAGES if self.settings.reliable_images else _IMAGES_BEST_EFFORT
+        rows = []
+        for side in SIDES:
+            on_image, on_info = partial(self._on_image, side), partial(self._on_camera_info, side)
+            rows.append(Input(image_topic(side), m.Image, on_image, delivery))
+            rows.append(Input(f"stereo/{side}/camera_info", m.CameraInfo, on_info, delivery))
+        return rows
+
+    def _on_joints(self, message: m.JointState, at: Moment) -> Actions:
+        insertion = insertion_of(message)
+        if insertion is None:
+            self._health.joints_without_insertion += 1
+            return ()
+        answers = self.answers.add_insertion(message.stamp_ns, insertion, at.steady)
+        return self.publish(answers, at)
+
+    def _on_image(self, side: str, message: m.Image, at: Moment) -> Actions:
+        self._health.image_came(side, at.steady)
+        frame = frame_of(message, side, self._cameras[side])
+        answers = self.answers.add_image(side, message.stamp_ns, frame, at.steady)
+        return self.publish(answers, at)
+
+    def _on_camera_info(self, side: str, message: m.CameraInfo, at: Moment) -> Actions:
+        problem, in_size = camera_info_problem(message, side, self._cameras[side])
+        self._health.camera_info[side] = problem
+        self.answers.add_contradiction(side, problem if in_size else "")
+        return ()
+
+    def _on_estimate(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
+        rotation = rotation_of(message)
+        if rotation is not None:
+            sigma = roll_sigma_of(message.covariance, rotation[:, 2])
+            self.answers.add_roll(message.stamp_ns, rotation, sigma)
+        return ()
+
+    def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
+        rotation = rotation_of(message)
+        if rotation is not None:
+            self.answers.add_plane(rotation)
+        return ()
+
+    # ---- what is said -------------------------------------------------------------------------
+
+    def _annotate(self, answer: Answer, at: Moment) -> Actions:
+        left, right = answer.pair.left.pixels, answer.pair.right.pixels
+        due = at.steady - self._annotated_at >= self._annotated_period
+        if self.is_annotation_wanted and due and left is not None and right is not None:
+            self._annotated_at = at.steady
+            picture = annotate(left, right, answer.measured)
+            yield Publish(ANNOTATED, picture_message(picture, answer.pair.stamp))
+
+    def _report(self, at: Moment) -> Actions:
+        answers, health = self.answers, self._health
+        health.note_pairing(at.steady, answers.matcher)
+        health.swapped = answers.swap.suspected
+        yield from self._tell("track", health.track())
+        yield from self._tell("images", health.images(at.steady, answers.matcher))
+        yield from self._tell("joints", health.joints(answers.insertions, answers.joints_silent))
+
+    def _tell(self, part: str, diagnostic: Diagnostic) -> Actions:
+        """Tell a part's health; log it where it turns bad, not each time it still is."""
+        yield Diagnose(part, diagnostic)
+        kind = diagnostic.message.partition(":")[0]
+        if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
+            yield Log("warning", f"{part}: {diagnostic.message}")
+        self._told[part] = kind
+
+
+def image_topic(side: str) -> str:
+    """Return the relative topic of a camera's images."""
+    return f"stereo/{side}/image_raw"
