@@ -40,7 +40,8 @@ def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSett
     Raises
     ------
     DriveError
-        If positions are not in counts, a unit is none of these, or speeds in rpm cannot be counted.
+        If positions are not in counts, a unit is none of these, or the drive does not tell the
+        counts in a turn, or tells two numbers of them.
     LinkError
         If the link is lost.
     """
@@ -80,13 +81,15 @@ def _counts_in(access: ObjectAccess, settings: DriveSettings, entry: od.Entry) -
     what, *wanted = _TAKEN[entry]
     turns = unit in _TURNED.values()
     turn = _counts_per_turn(access, settings) if turns else 60.0
-    if not turn:
-        wanted = wanted[:1]
+    wanted = wanted[: 1 + bool(turn)]
     if unit not in wanted or (power and entry is od.POSITION_UNIT):
         told = (f"10^{power} " if power else "") + f"{unit} (0x{entry.index:04X} = 0x{code:08X})"
-        way_out = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
-        taken = " or ".join(wanted)
-        raise DriveError(f"the drive counts {what} in {told}, wanted {taken}{way_out}")
+        hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
+        raise DriveError(f"the drive counts {what} in {told}, wanted {' or '.join(wanted)}{hint}")
+    feed = _ratio(access, od.FEED_CONSTANT) if turns and not settings.counts_per_turn else None
+    if feed and round(feed / turn, 6) != 1.0:
+        told = f"{turn:g} (0x608F, 0x6091) and {feed:g} (0x6092)"
+        raise DriveError(f"the drive tells {told} counts in a turn: *_counts_per_turn says which")
     return 10.0**power * turn / 60.0
 
 

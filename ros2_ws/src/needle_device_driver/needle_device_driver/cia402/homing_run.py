@@ -62,8 +62,7 @@ class HomingRun:
         turn = (method in INDEX_PULSE) * settings.counts_per_turn
         self._longest = _SEARCH * settings.travel + turn / settings.counts_per_unit
         self._towards, self._switch = _TOWARDS.get(method * switches, (0, 0))
-        self._way = 0
-        self._cycles = 0
+        self._way = self._cycles = 0
         self.trouble = ""
         self._stale = False
         self.step = HomingStep.PREPARING
@@ -93,10 +92,8 @@ class HomingRun:
         if self._stale:
             near = abs(at.position) <= self._settings.magnitude(self._settings.tolerance)
             here = self._settings.homing_method in HERE
-            done = here and near and self._cycles >= _INSTANT
-        else:
-            done = ended
-        if done:
+            ended = here and near and self._cycles >= _INSTANT
+        if ended:
             self.step = HomingStep.DONE
 
     def _watch_way(self, at: Feedback, way: int) -> None:

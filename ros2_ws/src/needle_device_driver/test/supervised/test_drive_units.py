@@ -170,6 +170,37 @@ def test_rpm_that_cannot_be_counted_are_refused_with_the_way_out(
 
 
 @pytest.mark.parametrize(
+    ("feed", "per_turn", "taken"),
+    [
+        ((50_000, 1), 0.0, True),
+        ((100_000, 2), 0.0, True),
+        ((50_000, 0), 0.0, True),
+        ((360, 1), 0.0, False),
+        ((1_000_000, 1), 0.0, False),
+        ((360, 1), 50_000.0, True),
+    ],
+)
+def test_a_feed_that_contradicts_the_encoder_and_the_gear_is_refused_with_the_way_out(
+    make_drive_bench: Callable[..., DriveBench],
+    feed: tuple[int, int],
+    per_turn: float,
+    taken: bool,
+) -> None:
+    # A drive scales its positions by 0x6092: its counts may be others than the encoder's.
+    bench = make_drive_bench(insertion_counts_per_turn=per_turn)
+    ratios = {(0x6091, 1): 5, (0x6091, 2): 2, (0x6092, 1): feed[0], (0x6092, 2): feed[1]}
+    tells(bench.insertion, {0x60A9: RPM, 0x60AA: RPM_S}, TURN | ratios)
+    if taken:
+        bench.configured()
+        assert holds(bench.insertion, 0x6085) == 12_000
+        return
+    assert refusal(bench) == (
+        f"insertion axis: the drive tells 50000 (0x608F, 0x6091) and {feed[0]:g} (0x6092) counts "
+        "in a turn: *_counts_per_turn says which"
+    )
+
+
+@pytest.mark.parametrize(
     ("codes", "told"),
     [
         ({0x60A9: None, 0x60AA: None}, "counts/s (0x60A9), counts/s^2 (0x60AA);"),
