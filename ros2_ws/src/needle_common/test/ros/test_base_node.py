@@ -1,7 +1,9 @@
 """A node's start and end, without a graph."""
 
+import contextlib
 import dataclasses
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -138,3 +140,86 @@ sys.exit(run_node(node, help_text="", parameters=object, args=["one"], spin=spin
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, env=environment, timeout=30.0, check=False)
     assert done.returncode == 7
+
+
+SAYS = """
+import sys
+import time
+from rclpy.node import Node
+from std_msgs.msg import String
+from needle_common.ros.base_node import run_node
+from needle_common.ros.conversions import RELIABLE
+
+class Says(Node):
+    def __init__(self):
+        super().__init__("says")
+        self.words = self.create_publisher(String, "words", RELIABLE)
+
+    def destroy_node(self):
+        print("goes", flush=True)
+        super().destroy_node()
+
+def spin(node, end):
+    while not node.words.get_subscription_count():
+        time.sleep(0.01)
+    print("is listened to", flush=True)
+    sys.stdin.readline()
+    for number in range(10):
+        node.words.publish(String(data=str(number)))
+    print("has said it", flush=True)
+    return 7
+
+sys.exit(run_node(Says, help_text="", parameters=object, args=["says"], spin=spin))
+"""
+HEARS = """
+import sys
+from rclpy.node import Node
+from std_msgs.msg import String
+from needle_common.ros.base_node import executor_of, run_node
+from needle_common.ros.conversions import RELIABLE
+
+def spin(node, end):
+    heard = []
+    node.create_subscription(String, "words", lambda word: heard.append(word.data), RELIABLE)
+    with executor_of(node) as executor:
+        while "9" not in heard:
+            executor.spin_once(timeout_sec=0.1)
+    print(*heard, flush=True)
+    return 0
+
+node = lambda: Node("hears")
+sys.exit(run_node(node, help_text="", parameters=object, args=["hears"], spin=spin))
+"""
+
+
+def test_a_node_goes_when_what_it_said_has_reached_a_subscriber_that_stood_still() -> None:
+    with own_domain() as domain, contextlib.ExitStack() as ends:
+
+        def start(code: str) -> subprocess.Popen[bytes]:
+            process = subprocess.Popen(
+                [sys.executable, "-c", code],
+                env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                # Nothing is read ahead: what is left can be waited for.
+                bufsize=0,
+            )
+            ends.enter_context(process)
+            ends.callback(process.kill)
+            return process
+
+        says, hears = start(SAYS), start(HEARS)
+        assert says.stdin is not None
+        assert says.stdout is not None
+        assert says.stdout.readline() == b"is listened to\n"
+        hears.send_signal(signal.SIGSTOP)
+        # It hears on until all of its threads stand still.
+        os.waitid(os.P_PID, hears.pid, os.WSTOPPED)
+        try:
+            says.stdin.write(b"\n")
+            assert says.stdout.readline() == b"has said it\n"
+            assert select.select([says.stdout], [], [], 1.5)[0] == []
+        finally:
+            hears.send_signal(signal.SIGCONT)
+        assert says.wait(30.0) == 7
+        assert hears.communicate(timeout=30.0)[0].split() == b"0 1 2 3 4 5 6 7 8 9".split()
