@@ -52,15 +52,11 @@ def views_in_folders(
     pairs = open_pairs(left, right)
     if pairs.unpaired:
         raise UserError(f"images without a partner ({len(pairs.unpaired)}): {pairs.unpaired[0]}")
-    for pair in tqdm(
-        pairs,
-        desc="finding the board",
-        total=len(pairs.names),
-        unit="pair",
-        delay=1.0,
-        leave=False,
-        disable=not sys.stderr.isatty(),
-    ):
+    total, hidden = len(pairs.names), not sys.stderr.isatty()
+    progress = tqdm(
+        pairs, "finding the board", total, unit="pair", delay=1.0, leave=False, disable=hidden
+    )
+    for pair in progress:
         seen = []
         for side, path, image in zip(SIDES, pair.files, (pair.left, pair.right), strict=True):
             if image is None:

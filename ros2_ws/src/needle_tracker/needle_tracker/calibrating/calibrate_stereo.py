@@ -101,18 +101,15 @@ def calibrate_stereo(arguments: Sequence[str]) -> int:
         return EXIT_MISSED
     size = square_error(result)
     problems = doubts(result, size)
-    text = "\n".join(
-        [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
-    )
+    said = [report(result, size, options.goal_mm), *(f"NOT OK: {one}" for one in problems)]
+    text = "\n".join(said)
     print(text)
     save_calibration(options.output, result.calibration, text.splitlines())
     save_figure(rig_figure(result), options.output.with_suffix(".rig.png"))
     save_figure(residual_figure(result), options.output.with_suffix(".residuals.png"))
     if options.json is not None:
-        write_json(
-            options.json,
-            figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None},
-        )
+        values = figures(result, options.goal_mm) | {"problem": "; ".join(problems) or None}
+        write_json(options.json, values)
     print(f"written: {options.output}")
     good = not problems and 1e3 * result.tip_error_p95 <= options.goal_mm
     return EXIT_DONE if good else EXIT_MISSED
@@ -251,8 +248,7 @@ def calibration_text(calibration: StereoCalibration, comments: list[str]) -> str
             f"phantom: {{surface_height: {surface.point[0]:.9f}, "
             f"refractive_index: {surface.inside:.6f}}}"
         )
-    for side in SIDES:
-        camera = calibration.left if side == "left" else calibration.right
+    for side, camera in zip(SIDES, (calibration.left, calibration.right), strict=True):
         matrix = ", ".join(f"{value:.4f}" for value in camera.camera_matrix.ravel())
         lens = ", ".join(f"{value:.9f}" for value in camera.distortion)
         translation = ", ".join(f"{value:.9f}" for value in camera.T_optical_rig[:3, 3])

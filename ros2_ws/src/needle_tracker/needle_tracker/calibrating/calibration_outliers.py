@@ -47,9 +47,11 @@ def doubts(result: RigCalibration, size: tuple[float, float]) -> list[str]:
     found = [text for view, text in misfits(result) if view.place is not None]
     if any(view.place is not None for view in result.apart):
         found.insert(0, apart_in_words(result.apart))
+    cause = "its lens has more distortion than k1, k2, k3, p1 and p2 describe"
+    if "left.fx" not in result.parameters:
+        cause = "the lens given with --lenses is for another camera, focus or image size"
     found += [
-        f"{side} camera: corners miss by up to {miss:.2f} px in a pattern of rings: its lens has "
-        "more distortion than k1, k2, k3, p1 and p2 describe"
+        f"{side} camera: corners miss by up to {miss:.2f} px in a pattern of rings: {cause}"
         for side, miss in ring_patterns(result).items()
     ]
     misfit = misfit_px(result.model, result.fit)
@@ -111,9 +113,8 @@ def ring_patterns(result: RigCalibration) -> dict[str, float]:
         The calibration.
     """
     found = {}
-    for side, camera in zip(
-        SIDES, (result.calibration.left, result.calibration.right), strict=True
-    ):
+    cameras = (result.calibration.left, result.calibration.right)
+    for side, camera in zip(SIDES, cameras, strict=True):
         outwards = result.model.pixels[side] - camera.camera_matrix[:2, 2]
         radii = np.linalg.norm(outwards, axis=-1)
         radial = np.sum(result.residuals(side) * outwards, axis=-1) / np.maximum(radii, 1.0)

@@ -17,6 +17,7 @@ from needle_tracker.optics.calibration import (
     SIDES,
     Camera,
     StereoCalibration,
+    check_camera_matrix,
     numbers,
     value_of,
 )
@@ -25,13 +26,14 @@ from needle_tracker.optics.window import Window
 
 Array = NDArray[np.float64]
 
-_RATIONAL = "rational_polynomial"  # of 4, 5, 8, 12 or 14 coefficients, as OpenCV has it
+_RATIONAL = "rational_polynomial"  # of none, 4, 5, 8, 12 or 14 coefficients, as OpenCV has it
 _EQUIDISTANT = "equidistant"  # of 4: OpenCV's fisheye
 _MODELS = {"plumb_bob": _RATIONAL, "radtan": _RATIONAL, "none": _RATIONAL, "fisheye": _EQUIDISTANT}
-_COUNTS = {_RATIONAL: (4, 5, 8, 12, 14), _EQUIDISTANT: (4,)}
+_COUNTS = {_RATIONAL: (0, 4, 5, 8, 12, 14), _EQUIDISTANT: (4,)}
+_OPENCV_KEYS = (("M", "D"), ("K", "D"), ("cameraMatrix", "distCoeffs"))  # followed by 1 and 2
 _CURE = (
-    "calibrate as plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
-    "leave out --lenses"
+    "calibrate with plumb_bob (Kalibr: pinhole-radtan; OpenCV: without CALIB_RATIONAL_MODEL), or "
+    "run without --lenses"
 )
 _LARGEST_SKEW = 1e-3  # of a rotation's singular values: files have few digits
 _LARGEST_MISS_PX = 0.05  # of plumb_bob in place of another lens model, anywhere in the image
@@ -73,8 +75,8 @@ def read_lenses(
     Returns
     -------
     StereoCalibration
-        The left camera at the origin, the right one too where nothing says how they stand.
-        plumb_bob stands for another lens model where it is that to 0.05 px all over the image.
+        The left camera at the origin; the right one too where no file gives the relative pose.
+        Another lens model is replaced by the plumb_bob that equals it to 0.05 px in all the image.
 
     Raises
     ------
@@ -82,12 +84,14 @@ def read_lenses(
         A file that cannot be read or is none of these, not two cameras, images of another size, or
         a lens that plumb_bob cannot describe.
     """
+    if len(set(paths)) < len(paths):
+        raise UserError(f"--lenses {' '.join(map(str, paths))}: a file is given twice")
     found = [_read(path) for path in paths]
     lenses = [lens for one in found for lens in one.lenses]
     if len(lenses) != len(SIDES):
         raise UserError(
-            f"--lenses {' '.join(map(str, paths))}: {len(lenses)} of two cameras: give a file for "
-            "left and one for right, or one with both"
+            f"--lenses {' '.join(map(str, paths))}: found {len(lenses)} of 2 cameras: give a file "
+            "for left and one for right, or one with both (OpenCV: M1, K1 or cameraMatrix1 ...)"
         )
     poses = [one.pose for one in found if one.pose is not None]
     rectified = [one.rectified for one in found if one.rectified is not None]
@@ -97,9 +101,10 @@ def read_lenses(
     for side, lens, window in zip(SIDES, lenses, windows, strict=True):
         if lens.size is not None and lens.size != sizes[side]:
             raise UserError(
-                f"--lenses {lens.path}: for {lens.size[0]}x{lens.size[1]}, the {side} images are "
-                f"{sizes[side][0]}x{sizes[side][1]}"
+                f"--lenses {lens.path} is for images of {lens.size[0]}x{lens.size[1]}, the {side} "
+                f"ones are {sizes[side][0]}x{sizes[side][1]}"
             )
+        check_camera_matrix(f"--lenses {lens.path}, {side} camera", lens.matrix)
         pose = poses[0] if poses and cameras else np.eye(4)
         distortion = _plumb_bob(lens, sizes[side])
         cameras.append(Camera(*sizes[side], lens.matrix, distortion, pose, window))
@@ -116,11 +121,10 @@ def _read(path: Path) -> _Found:
             content = next(iter(yaml.safe_load_all(text)))
             return _kalibr(content, path) if kind == KALIBR else _camera_info(content, path)
     except yaml.YAMLError as error:
-        reason = " ".join(str(error).split())
-        raise UserError(f"--lenses {path} is not YAML: {reason}") from error
+        raise UserError(f"--lenses {path} is not YAML: {' '.join(str(error).split())}") from error
     except UserError as error:
         raise UserError(f"--lenses {path}, {kind}: {error}") from error
-    raise UserError(f"--lenses {path}: neither ROS, Kalibr nor OpenCV wrote it")
+    raise UserError(f"--lenses {path} is neither {ROS}, {KALIBR} nor {OPENCV}")
 
 
 def _camera_info(content: Any, path: Path) -> _Found:
@@ -136,13 +140,12 @@ def _kalibr(content: Any, path: Path) -> _Found:
     for name in sorted(content)[: len(SIDES)]:
         camera = value_of(content, name, "camera_model")
         if camera != "pinhole":
-            raise UserError(f"{name}.camera_model = {camera!r}: {_CURE}")
+            raise UserError(f"{name}.camera_model {camera!r} is not supported: {_CURE}")
         fx, fy, cx, cy = numbers(content, 4, name, "intrinsics")
         matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
         model = str(value_of(content, name, "distortion_model"))
         coefficients = numbers(content, None, name, "distortion_coeffs")
         width, height = map(int, numbers(content, 2, name, "resolution"))
-        coefficients = np.zeros(4) if model == "none" else coefficients
         lenses.append(_Lens(path, matrix, model, coefficients, (width, height)))
     if len(lenses) < len(SIDES):
         return _Found(lenses)
@@ -151,7 +154,10 @@ def _kalibr(content: Any, path: Path) -> _Found:
 
 
 def _opencv(text: str, path: Path) -> _Found:
-    """Return what OpenCV's samples `stereo_calib` (two files) and `calibration` write."""
+    """Return what OpenCV's samples `stereo_calib` (two files) and `calibration` write.
+
+    Other programs name the matrices as the parameters of `stereoCalibrate`.
+    """
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         nodes = {key: storage.getNode(key) for key in storage.root().keys()}  # noqa: SIM118
@@ -163,7 +169,8 @@ def _opencv(text: str, path: Path) -> _Found:
         raise UserError("it is damaged") from error
     lenses = [
         _Lens(path, _matrix(content, key), _RATIONAL, numbers(content, None, other, "data"), None)
-        for key, other in (("M1", "D1"), ("K1", "D1"), ("M2", "D2"), ("K2", "D2"))
+        for number in "12"
+        for key, other in ((m + number, d + number) for m, d in _OPENCV_KEYS)
         if key in content
     ]
     if "camera_matrix" in content:
@@ -198,10 +205,12 @@ def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
     matrix, coefficients = lens.matrix, lens.coefficients
     model = _MODELS.get(lens.model, lens.model)
     if len(coefficients) not in _COUNTS.get(model, ()):
-        count = len(coefficients)
-        raise UserError(f"--lenses {lens.path}: {lens.model} of {count} coefficients: {_CURE}")
+        raise UserError(
+            f"--lenses {lens.path}: distortion model {lens.model} with {len(coefficients)} "
+            f"coefficients is not supported: {_CURE}"
+        )
     if model == _RATIONAL and not np.any(coefficients[5:]):
-        return np.append(coefficients, 0.0)[:5]
+        return np.append(coefficients, np.zeros(5))[:5]
     # Rays from the middle outwards, as far as they are in the image.
     turns, slopes = np.linspace(0.0, 2.0 * np.pi, 72), np.tan(np.linspace(0.0, 1.4, 141))
     ideal = np.stack([np.outer(np.cos(turns), slopes), np.outer(np.sin(turns), slopes)], axis=-1)
@@ -218,7 +227,7 @@ def _plumb_bob(lens: _Lens, size: tuple[int, int]) -> Array:
     miss = float(np.abs(distort(ideal, found) - seen).max() * matrix[0, 0])
     if miss > _LARGEST_MISS_PX:
         raise UserError(
-            f"--lenses {lens.path}: k1, k2, p1, p2 and k3 describe its {lens.model} lens to "
-            f"{miss:.2f} px only: {_CURE}"
+            f"--lenses {lens.path}: plumb_bob misses its {lens.model} lens by {miss:.2f} px, more "
+            f"than {_LARGEST_MISS_PX} px: {_CURE}"
         )
     return np.asarray(found)

@@ -207,9 +207,9 @@ def _check_relative_pose(given: Array, seen: Array) -> None:
     alike = max(turn, aside) < _LARGEST_TURN
     if not (alike and 0.9 < lengths[0] / lengths[1] < 1.1):
         raise UserError(
-            f"the given cameras are {1e3 * lengths[0]:.4g} mm apart, those of the views "
-            f"{1e3 * lengths[1]:.1f} mm"
-            + (": give metres" if alike else ", elsewhere: were left and right exchanged?")
+            f"--lenses puts the cameras {1e3 * lengths[0]:.4g} mm apart, the images put them "
+            f"{1e3 * lengths[1]:.1f} mm apart"
+            + (": is T in metres?" if alike else ", elsewhere: were left and right exchanged?")
         )
 
 

@@ -201,11 +201,7 @@ def _index(content: Any, *keys: str) -> float:
 def _camera(content: Any, side: str, window: Window) -> Camera:
     width, height = (size_of(content, side, key) for key in ("image_width", "image_height"))
     matrix = numbers(content, 9, side, "camera_matrix", "data").reshape(3, 3)
-    fx, fy = matrix[0, 0], matrix[1, 1]
-    if not (fx > 0.0 and fy > 0.0):
-        raise UserError(f"{side}.camera_matrix: focal lengths {fx:g}, {fy:g} px are not positive")
-    if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
-        raise UserError(f"{side}.camera_matrix is not [fx 0 cx; 0 fy cy; 0 0 1]")
+    check_camera_matrix(f"{side}.camera_matrix", matrix)
     model = value_of(content, side, "distortion_model")
     if model != _DISTORTION_MODEL:
         raise UserError(f"{side}.distortion_model = {model!r}, wants {_DISTORTION_MODEL!r}")
@@ -218,6 +214,14 @@ def _camera(content: Any, side: str, window: Window) -> Camera:
     transform[:3, :3] = rotation_matrix(quaternion / norm)
     transform[:3, 3] = translation
     return Camera(width, height, matrix, distortion, transform, window)
+
+
+def check_camera_matrix(name: str, matrix: NDArray[np.float64]) -> None:
+    """Refuse a camera matrix, (3, 3), with skew or without focal lengths."""
+    if not (matrix[0, 0] > 0.0 and matrix[1, 1] > 0.0):
+        raise UserError(f"{name}: focal lengths {matrix[0, 0]:g}, {matrix[1, 1]:g} px not positive")
+    if np.any(matrix[[0, 1, 2, 2], [1, 0, 0, 1]] != 0.0) or matrix[2, 2] != 1.0:
+        raise UserError(f"{name} is not [fx 0 cx; 0 fy cy; 0 0 1]")
 
 
 def rotation_matrix(quaternion: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from needle_common.errors import UserError
-from needle_tracker.calibrating.charuco import CharucoBoard, write_board
+from needle_tracker.calibrating.charuco import CharucoBoard, check_board_seen, write_board
 
 from .synthetic_rig import BOARD, board_image
 
@@ -70,3 +70,34 @@ def test_the_printed_board_has_its_true_size(tmp_path: Path) -> None:
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     with pytest.raises(UserError, match=r"\.pdf nor"):
         write_board(BOARD, tmp_path / "board.jpg")
+
+
+@pytest.mark.parametrize(
+    ("printed", "said", "cure"),
+    [
+        (CharucoBoard(rows=8, legacy=True), CharucoBoard(rows=8), "`legacy: True`"),
+        (BOARD, CharucoBoard(9, 12), "`columns: 12, rows: 9`"),
+        (CharucoBoard(9, 12), BOARD, "`columns: 9, rows: 12`"),
+        (BOARD, CharucoBoard(11, 9), "`columns: 12`"),
+        (CharucoBoard(dictionary="DICT_4X4_100"), BOARD, "`dictionary: DICT_4X4_100`"),
+        (
+            CharucoBoard(rows=8, legacy=True),
+            CharucoBoard(8, 12),
+            "`columns: 12, rows: 8, legacy: True`",
+        ),
+    ],
+)
+def test_the_board_that_the_images_show_is_named(
+    printed: CharucoBoard, said: CharucoBoard, cure: str
+) -> None:
+    image = cv2.copyMakeBorder(
+        board_image(printed, 40), 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255
+    )
+    assert not len(said.find(np.asarray(image, dtype=np.uint8))[0])
+    with pytest.raises(UserError, match=f"another one, give {cure} as its board"):
+        check_board_seen([np.asarray(image, dtype=np.uint8)], said)
+
+
+def test_without_markers_no_board_is_named() -> None:
+    with pytest.raises(UserError, match="its markers identify no other board either"):
+        check_board_seen([np.full((300, 400), 200, np.uint8)], BOARD)
