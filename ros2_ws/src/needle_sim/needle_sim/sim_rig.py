@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from needle_common import messages as m
 from needle_common.component import (
     LATCHED,
@@ -21,22 +23,17 @@ from needle_device_driver.device import DeviceRows
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.simulated_axis import SimulatedAxis
+from needle_sim.sensors import RIG, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 CYCLE = 0.02
 """Period of the axes' set-points [s]."""
-RIG = "rig"
 _IDLE_EXPOSURE_PERIOD = 1.0
 """A needle that nobody waits for is exposed so often [s]."""
-# A tip alone says nothing about the heading [rad^2].
-_UNKNOWN_ORIENTATION = 1e6
-# A variance of 0 would read as "not known" [m^2].
-_LEAST_POSITION_VARIANCE = 1e-12
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 class SimRig(Component):
-    """The simulated rig of level `tip`: ideal axes, the plant they move, and a noisy tip.
+    """The simulated rig of levels `tip` and `camera`: ideal axes, and the plant they move.
 
     Parameters
     ----------
@@ -60,7 +57,11 @@ class SimRig(Component):
         self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
         self._supervisor = MotionSupervisor(*self._axes, settings.limits)
         self._supervisor.configure(0.0)
-        self._device = DeviceRows(self._supervisor, self.name, simulated=True)
+        self._device = DeviceRows(
+            self._supervisor, self.name, simulated=True, refuse=lambda: self._ended
+        )
+        self._sensor = make_sensor(self._bench, settings)
+        self._ended = ""
         self._is_tip_wanted = False
         self._exposures = 0
         self._exposed_at = 0.0
@@ -69,14 +70,17 @@ class SimRig(Component):
         self.outputs = (
             *self._device.outputs,
             Output("sim/tip_pose", m.Pose),
-            Output("needle/tip_pose", m.PoseWithCovariance),
-            Output("needle/tip", m.Point),
+            *self._sensor.outputs,
         )
         self.services = self._device.services
         self.timers = (
             Timer(CYCLE, self._cycle),
             Timer(1.0 / settings.camera_rate, self._expose_if_due),
         )
+
+    def close(self) -> None:
+        """Complete what the cameras write."""
+        self._sensor.close()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note who else is a device here."""
@@ -95,22 +99,23 @@ class SimRig(Component):
         for axis in self._axes:
             axis.advance(CYCLE)
         self._bench.move_to(*(axis.position for axis in self._axes))
+        yield from self._end_outside_phantom()
         self._supervisor.observe(at.steady)
         yield from self._device.joint_states(at)
         yield from self._device.report(at)
 
     def _expose_if_due(self, at: Moment) -> Actions:
+        if self._ended:
+            return
         if self._is_tip_wanted or at.steady - self._exposed_at >= _IDLE_EXPOSURE_PERIOD:
             yield from self._expose(at)
 
     def _expose(self, at: Moment) -> Actions:
-        tip = self._bench.measure_tip(self._exposures)
+        number = self._exposures
         self._exposures += 1
         self._exposed_at = at.steady
-        position = (float(tip[0]), float(tip[1]), float(tip[2]))
         yield Publish("sim/tip_pose", self._truth(at.stamp_ns))
-        yield Publish("needle/tip_pose", self._tip_pose(position, at.stamp_ns))
-        yield Publish("needle/tip", m.Point(at.stamp_ns, RIG, position))
+        yield from self._sensor.expose(number, at.stamp_ns)
         values = {"exposures": str(self._exposures), "simulated_s": f"{at.steady:.2f}"}
         yield Diagnose("simulation", Diagnostic(Level.OK, "running", values))
 
@@ -120,9 +125,12 @@ class SimRig(Component):
         orientation = quaternion_from_rotation(T_rig_tip[:3, :3].tolist())
         return m.Pose(stamp_ns, RIG, (x, y, z), orientation)
 
-    def _tip_pose(self, position: m.Vector3, stamp_ns: int) -> m.PoseWithCovariance:
-        """Return a measured tip with uniform noise and no known orientation."""
-        variance = max(self.settings.tip_noise**2 / 3.0, _LEAST_POSITION_VARIANCE)
-        covariance = [0.0] * 36
-        covariance[::7] = [variance] * 3 + [_UNKNOWN_ORIENTATION] * 3
-        return m.PoseWithCovariance(stamp_ns, RIG, position, _UPRIGHT, tuple(covariance))
+    def _end_outside_phantom(self) -> Actions:
+        for axis, place, end in zip("xy", self._bench.tip, self._sensor.half_sizes, strict=False):
+            if abs(place) > end and not self._ended:
+                self._ended = (
+                    f"the tip left the phantom: {axis} = {place * 1e3:.2f} mm is beyond "
+                    f"{math.copysign(end, place) * 1e3:.2f} mm"
+                )
+                self._supervisor.fail(self._ended)
+                yield Diagnose("simulation", Diagnostic(Level.ERROR, self._ended))

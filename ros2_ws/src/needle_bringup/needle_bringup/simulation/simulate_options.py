@@ -21,10 +21,10 @@ from needle_common.errors import UserError
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
 
-Level tip runs sim_rig, plane_controller and simulated_operator in this process, on a virtual
-clock: the same seed gives the same bag, byte for byte. Levels camera and drive, and tip with
---graph, start recorder, sim_rig, stereo_tracker, plane_controller and simulated_operator (at level
-drive also drive_emulator and device_driver) as ROS nodes in processes of their own.
+Levels tip and camera run sim_rig, stereo_tracker, plane_controller and simulated_operator in this
+process, on a virtual clock: the same seed gives the same bag, byte for byte. Level drive, and the
+others with --graph, start them, recorder and, at level drive, drive_emulator and device_driver as
+ROS nodes in processes of their own.
 
 It shows how far the needle is in, and leaves a folder that holds the bag (open it with rosbags,
 mcap, Foxglove, PlotJuggler or `ros2 bag`), report.html with its figures, summary.json, the
@@ -109,8 +109,8 @@ class SimulateOptions:
 
     @property
     def runs_graph(self) -> bool:
-        """Whether it runs as ROS nodes; those of the levels with images are no components yet."""
-        return self.graph or self.level != "tip"
+        """Whether it runs as ROS nodes; the driver and its drives are no components yet."""
+        return self.graph or self.level == "drive"
 
 
 def parse(arguments: Sequence[str]) -> SimulateOptions:
@@ -291,8 +291,8 @@ def _parser() -> CommandParser:
     add(
         "--graph",
         action="store_true",
-        help="each component as a ROS node in a process of its own, over DDS; levels camera and "
-        "drive always run so",
+        help="each component as a ROS node in a process of its own, over DDS; level drive always "
+        "runs so",
     )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import random
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,12 @@ from needle_bringup.simulated_operator.component import SimulatedOperator
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import Progress
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
-from needle_common.component import Component, Exit, Output
+from needle_common.component import Action, Component, Exit, Output, Publish
 from needle_common.errors import UserError
+from needle_common.files.calibration_text import read_calibration
+from needle_common.files.installed import find_shared
 from needle_common.messages import Status
-from needle_common.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
+from needle_common.runners.virtual import DIAGNOSTICS, LOG, Compute, VirtualRunner, uniform
 from needle_common.settings.parameter_fields import from_values
 from needle_common.settings.parameter_files import Parameters
 from needle_controller.plane_controller import STATUS, PlaneController
@@ -23,8 +27,8 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 
-COMPUTE = {"plane_controller": (1e-3, 3e-3)}
-"""Compute time of a handler, as measured on two shared cores [s]."""
+_FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
+"""Time that the tracker takes for a pair, with and without a tip, on two shared cores [s]."""
 _SLICE = 1.0
 _WIND_UP = 5.0
 """What the rest of the rig may take to end after the operator [s]."""
@@ -33,18 +37,51 @@ _OF_GRAPH = ("use_sim_time", "wait_for_recorder", "lock_step", "real_time_factor
 
 
 def make_components(parameters: Parameters) -> list[Component]:
-    """Return the rig of level `tip`.
+    """Return the rig of level `tip` or `camera`.
 
     Raises
     ------
     UserError
         A parameter that a component does not have, or that is out of its bounds.
     """
+    rig = SimRig(_settings(SimRigParameters, parameters, "sim_rig"))
     return [
-        SimRig(_settings(SimRigParameters, parameters, "sim_rig")),
+        rig,
+        *([] if rig.settings.level == "tip" else [_make_tracker(parameters)]),
         PlaneController(_settings(SteeringSettings, parameters, "plane_controller")),
         SimulatedOperator(_settings(SimulatedOperatorParameters, parameters, "simulated_operator")),
     ]
+
+
+def _make_tracker(parameters: Parameters) -> Component:
+    # It brings OpenCV along: not where there are no images.
+    from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
+    from needle_tracker.optics.calibration import calibration_from  # noqa: PLC0415
+    from needle_tracker.stereo_tracker import StereoTipTracker  # noqa: PLC0415
+
+    settings = _settings(StereoTrackerParameters, parameters, "stereo_tracker")
+    path = Path(
+        settings.calibration_file or find_shared("needle_tracker", "config/calibration.yaml")
+    )
+    text = read_calibration(path)
+    return StereoTipTracker(settings, calibration_from(text, path), text)
+
+
+def _tracker_time(actions: Sequence[Action], rng: random.Random) -> float:
+    """Return the compute time of a handler of the tracker [s]: measuring a pair takes longest."""
+    seconds = rng.uniform(1e-4, 3e-4)
+    for action in actions:
+        if isinstance(action, Publish) and action.topic == "needle/tip_pose":
+            found = math.isfinite(action.message.covariance[0])
+            seconds += rng.uniform(*(_FOLLOWING if found else _SEARCH))
+    return seconds
+
+
+COMPUTE: Mapping[str, Compute] = {
+    "plane_controller": uniform(1e-3, 3e-3),
+    "stereo_tracker": _tracker_time,
+}
+"""Component to the compute time of its handlers, as measured on two shared cores."""
 
 
 def run_virtually(
@@ -100,6 +137,9 @@ def run_virtually(
         ended = runner.exits.get(operator)
         progress.close(f"{operator}: {ended.text}" if ended else "")
         tap.close()
+        for component in components:
+            if isinstance(component, SimRig):
+                component.close()
 
 
 def _judge(exits: Mapping[str, Exit], operator: str) -> None:

@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     return finish
 
 
-@pytest.mark.parametrize("level", ["tip", "tip --graph", "camera", "drive"])
+@pytest.mark.parametrize("level", ["tip", "tip --graph", "camera", "camera --graph", "drive"])
 def test_it_steers_records_and_reports(run: Run, level: str) -> None:
     level, *mode = level.split()
     finished = run("_".join([level, *mode]), "--level", level, *mode, *SHORT)

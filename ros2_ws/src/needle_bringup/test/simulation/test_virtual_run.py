@@ -1,8 +1,9 @@
-"""The rig of level `tip` in this process: it repeats byte for byte, and bears what a graph does."""
+"""The rig in this process: it repeats byte for byte, and bears what a graph does."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,10 @@ from needle_bringup.simulation.virtual_run import COMPUTE, make_components, run_
 from needle_common.component import Output
 from needle_common.runners.faults import Fault, delay, drop, duplicate
 from needle_common.runners.virtual import VirtualRunner
+from needle_sim.sim_rig import SimRig
 
 SHORT = ("--level", "tip", "--depth-mm", "10")
+CAMERA = ("--level", "camera", "--depth-mm", "3")
 CONTINUOUS = ("--level", "tip", "--depth-mm", "10", "--insertion", "continuous")
 COMMANDS, HOLD, RESULTS = "device/joint_trajectory", "device/hold", "device/result"
 
@@ -36,7 +39,9 @@ def mcap_of(folder: Path, *arguments: str) -> bytes:
     return file.read_bytes()
 
 
-@pytest.mark.parametrize("arguments", [SHORT, CONTINUOUS], ids=["stepwise", "continuous"])
+@pytest.mark.parametrize(
+    "arguments", [SHORT, CONTINUOUS, CAMERA], ids=["stepwise", "continuous", "camera"]
+)
 def test_one_seed_is_one_run_and_another_another(
     tmp_path: Path, arguments: tuple[str, ...]
 ) -> None:
@@ -67,8 +72,10 @@ class Rig:
         self.sent: dict[str, list[Any]] = {}
         options = parse(arguments)
         parameters = command_line_parameters(options, Path("none"))
+        components = make_components(parameters)
+        (self.sim_rig,) = [c for c in components if isinstance(c, SimRig)]
         self.runner = VirtualRunner(
-            make_components(parameters), seed, compute=COMPUTE, faults=faults, taps=(self._tap,)
+            components, seed, compute=COMPUTE, faults=faults, taps=(self._tap,)
         )
 
     def _tap(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
@@ -133,6 +140,27 @@ def test_it_gets_there_in_spite_of_messages_lost_late_and_twice(fault: Fault) ->
         assert rig.runner.now < 90.0
     assert rig.runner.exits["simulated_operator"].code == 0, rig.runner.exits
     assert rig.depth == pytest.approx(0.01, abs=1e-5)
+
+
+def test_pairs_are_exposed_only_when_a_tip_is_awaited() -> None:
+    rig = Rig(*CAMERA)
+    while not rig.runner.run(1.0):
+        assert rig.runner.now < 30.0
+    assert rig.depth == pytest.approx(0.003, abs=1e-5)
+    assert len(rig.sent["stereo/left/image_raw"]) == len(rig.sent["needle/tip_pose"]) == 4
+
+
+def test_a_tip_that_leaves_the_phantom_ends_the_run() -> None:
+    rig = Rig("--level", "tip", "--controller", "open_loop")
+    rig.sim_rig._sensor.half_sizes = (1e-3, math.inf)
+    while not rig.runner.run(1.0):
+        assert rig.runner.now < 60.0
+    ended = rig.runner.exits["simulated_operator"]
+    assert ended.code == 1
+    assert "the tip left the phantom: x = 1." in ended.text
+    x = rig.sent["sim/tip_pose"][-1].position[0]
+    assert 0.8e-3 < x < 1.1e-3
+    assert rig.sent["device/status"][-1].values["state"] == "FAULT"
 
 
 def test_a_silent_controller_moves_nothing() -> None:

@@ -57,8 +57,15 @@ ANSWER_TIMEOUT = 5.0
 _DIAGNOSTICS_PERIOD = 1.0
 _NEWEST = Delivery(depth=1, reliable=False)
 
+Compute = Callable[[Sequence[Action], random.Random], float]
+"""Compute time of a handler [s], from its actions and a random stream."""
 Tap = Callable[[int, str, Any, Output], None]
 """Told of each publication before any fault: stamp [ns], sender, message, output."""
+
+
+def uniform(shortest: float, longest: float) -> Compute:
+    """Return a compute time that is the same for all handlers, between two bounds [s]."""
+    return lambda actions, rng: rng.uniform(shortest, longest)
 
 
 @dataclass(eq=False)
@@ -66,7 +73,7 @@ class _Process:
     """A component with its queue: handlers run one after the other, each for its compute time."""
 
     component: Component
-    compute: tuple[float, float]
+    compute: Compute
     outputs: Mapping[str, Output]
     busy: bool = False
     frozen_until: float = 0.0
@@ -91,8 +98,8 @@ class VirtualRunner:
         Each is a process of its own.
     seed : int
         Keys every latency and compute time.
-    compute : mapping of str to pair of float
-        Component to the range of a handler's compute time [s]; `COMPUTE` where not given.
+    compute : mapping of str to Compute
+        Component to the compute times of its handlers; `COMPUTE` where not given.
     faults : sequence of Fault
         Applied to each delivery, in order.
     taps : sequence of Tap
@@ -113,7 +120,7 @@ class VirtualRunner:
         components: Iterable[Component],
         seed: int = 0,
         *,
-        compute: Mapping[str, tuple[float, float]] | None = None,
+        compute: Mapping[str, Compute] | None = None,
         faults: Sequence[Fault] = (),
         taps: Sequence[Tap] = (),
         real_time_factor: float = 0.0,
@@ -129,7 +136,7 @@ class VirtualRunner:
         self._processes = [
             _Process(
                 component,
-                (compute or {}).get(component.name, COMPUTE),
+                (compute or {}).get(component.name, uniform(*COMPUTE)),
                 {output.topic: output for output in component.outputs},
             )
             for component in components
@@ -222,7 +229,7 @@ class VirtualRunner:
         process.busy = True
         source, work = process.queue.popleft()
         actions = self._handle(process, work)
-        busy = self._draw(f"{process.name}/{source}", process.compute)
+        busy = process.compute(actions, self._stream(f"{process.name}/{source}"))
         self._at(self.now + busy, partial(self._finish, process, actions))
 
     def _handle(self, process: _Process, work: Callable[[], Actions]) -> list[Action]:
