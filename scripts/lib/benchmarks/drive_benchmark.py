@@ -84,10 +84,10 @@ class Driver:
         self._cycle = DriveCycle(self._link, self._axes)
         self._link.open()
         for axis in self._axes:
-            axis.configure()
+            self._link.run(axis.configure())
             axis.power(True)
         while not all(axis.poll(0.0).powered for axis in self._axes):
-            self._cycle.exchange(PERIOD / 2)
+            self._link.run(self._cycle.exchange(PERIOD / 2))
             time.sleep(PERIOD)
         self._starts = [axis.poll(0.0).position for axis in self._axes]
         self._units = [values.drive(axis.name).counts_per_unit for axis in self._axes]
@@ -98,12 +98,12 @@ class Driver:
             self._axes, self._starts, COUNTS_PER_CYCLE, self._units, strict=True
         ):
             axis.start_move(start + (number + 1) * counts / unit, counts / unit / PERIOD)
-        self._cycle.exchange(PERIOD / 2)
+        self._link.run(self._cycle.exchange(PERIOD / 2))
 
     def close(self) -> None:
         """Switch off."""
         for axis in self._axes:
-            axis.close()
+            self._link.run(axis.close())
         self._link.close()
 
 

@@ -9,6 +9,7 @@ from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.link.can_link import CanLink, LinkError
 from needle_device_driver.link.objects import SYNC
+from needle_device_driver.procedure import Procedure, Wait
 
 # How long a pause for answers that are late lasts, in cycles without any, and each of them [s].
 _PAUSE = 2
@@ -55,12 +56,12 @@ class DriveCycle:
         """Tell whether a drive is on its way to where it was ordered, apart from set-points."""
         return any(axis.needs_cycles for axis in self._axes)
 
-    def probe(self) -> str:
+    def probe(self) -> Procedure[str]:
         """Open the link and ask every drive who it is; return why that is not possible."""
         try:
             self._link.open()
             for axis in self._axes:
-                axis.probe()
+                yield from axis.probe()
         except (AxisError, LinkError) as error:
             return str(error)
         return ""
@@ -74,7 +75,7 @@ class DriveCycle:
             except LinkError:
                 return
 
-    def hear_first(self, now: float) -> None:
+    def hear_first(self, now: float) -> Procedure[None]:
         """After a hold-up of this process, hear every drive anew before it is judged.
 
         Parameters
@@ -85,17 +86,16 @@ class DriveCycle:
         before, self._looked_at = self._looked_at, now
         if now - before <= _HELD_UP:
             return
-        with self._link.arrival:
-            self._link.arrival.wait_for(
-                lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
-            )
+        yield Wait(
+            lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
+        )
 
     def collect(self) -> None:
         """Take the answers that came too late for the cycle before."""
         for axis in self._axes:
             axis.update()
 
-    def exchange(self, wait: float) -> None:
+    def exchange(self, wait: float) -> Procedure[None]:
         """Run one cycle.
 
         Parameters
@@ -108,7 +108,7 @@ class DriveCycle:
         try:
             self._link.beat()
             for axis in self._axes:
-                axis.transmit()
+                yield from axis.transmit()
             if self._must_pause():
                 wait = min(wait, _PAUSE_WAIT)
             else:
@@ -117,9 +117,8 @@ class DriveCycle:
                 self._link.send(SYNC)
         except LinkError:
             return
-        with self._link.arrival:
-            self._link.arrival.wait_for(lambda: bool(self._link.lost) or self._answered(), wait)
-            self.unanswered += not self._answered()
+        yield Wait(lambda: bool(self._link.lost) or self._answered(), wait)
+        self.unanswered += not self._answered()
         for axis in self._axes:
             axis.update()
 

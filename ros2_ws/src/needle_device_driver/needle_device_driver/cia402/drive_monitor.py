@@ -18,6 +18,7 @@ from needle_device_driver.link.objects import (
     STATUS,
     STATUS_WITHOUT_INPUTS,
 )
+from needle_device_driver.procedure import Procedure, Wait
 
 _ANSWER = (STATUS.function_code, POSITION.function_code)
 # One answer may be lost; with more missing, what comes may be an answer to a SYNC of long ago.
@@ -195,10 +196,10 @@ class DriveMonitor:
             self._fresh_time = self._link.clock()
             self._taken = self._all_syncs, self._fresh_time
 
-    def await_operational(self, before: int, timeout: float) -> bool:
+    def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
         """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
+        yield Wait(lambda: self._heartbeats > before, timeout)
         with self._lock:
-            self._lock.wait_for(lambda: self._heartbeats > before, timeout)
             return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
     def _awaited(self) -> bool:

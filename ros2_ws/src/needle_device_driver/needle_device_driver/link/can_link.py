@@ -7,16 +7,22 @@ import dataclasses
 import os
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import can
-import canopen
 
 from needle_common.errors import UserError
-from needle_device_driver.link.objects import HEARTBEAT, MASTER_NODE_ID, NMT, NMT_OPERATIONAL, SYNC
-from needle_device_driver.link.sdo_client import PatientSdoClient
+from needle_device_driver.link.objects import (
+    HEARTBEAT,
+    MASTER_NODE_ID,
+    NMT,
+    NMT_OPERATIONAL,
+    SDO_ANSWER,
+    SYNC,
+)
+from needle_device_driver.link.sdo_client import SdoClient
 from needle_device_driver.link.slcan_bus import SlcanBus
 from needle_device_driver.link.socketcand_bus import SocketcandBus
+from needle_device_driver.procedure import Procedure, T, run
 
 LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 _RECEIVE_WAIT = 0.05
@@ -129,17 +135,6 @@ def _plainly(error: Exception) -> str:
     return str(error).partition("\n")[0]
 
 
-class _Network(canopen.Network):
-    """canopen's network, sending through the link that watches over the adapter."""
-
-    def __init__(self, link: CanLink) -> None:
-        super().__init__()
-        self._link = link
-
-    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        self._link.send(can_id, bytes(data))
-
-
 class CanLink:
     """One CAN bus, to be opened, lost and opened again.
 
@@ -180,10 +175,9 @@ class CanLink:
         self.error_frames = 0
         self._open_bus = open_bus
         self._bus: can.BusABC | None = None
-        self._network: canopen.Network | None = None
         self._thread: threading.Thread | None = None
         self._callbacks: dict[int, list[Callback]] = {}
-        self._sdo: dict[int, PatientSdoClient] = {}
+        self._sdo: dict[int, SdoClient] = {}
         self._heard_at = 0.0
 
     @property
@@ -219,14 +213,13 @@ class CanLink:
             return
         self.close()
         bus = self._open_bus(self.settings)
-        # canopen's network does not outlive a lost adapter: each opening has a new one.
-        self._network = _Network(self)
+        # What an adapter that was lost still had to say is no answer now.
         self._sdo = {}
         self._bus = bus
         self.lost = self.other_master = ""
         self._heard_at = self.clock()
         self.openings += 1
-        self._begin_to_receive(bus, self._network)
+        self._begin_to_receive(bus)
 
     def close(self) -> None:
         """Let go of the adapter. May be called twice."""
@@ -273,7 +266,7 @@ class CanLink:
         """
         self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
 
-    def sdo(self, node_id: int) -> PatientSdoClient:
+    def sdo(self, node_id: int) -> SdoClient:
         """Return the SDO client of a node, on the present opening of the adapter.
 
         Raises
@@ -281,18 +274,19 @@ class CanLink:
         LinkError
             If the link is closed or lost.
         """
-        if self._network is None or not self.is_open:
+        if not self.is_open:
             raise LinkError(self.lost or f"{self.settings} is not open")
         if node_id not in self._sdo:
-            client = PatientSdoClient(node_id, self.beat, _HEARTBEAT_PERIOD, self._wait_for)
-            client.network = self._network
-            self._network.subscribe(client.tx_cobid, client.on_response)
-            self._sdo[node_id] = client
+            self._sdo[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
         return self._sdo[node_id]
 
-    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+    def run(self, procedure: Procedure[T]) -> T:
+        """Run a procedure to its end; frames are received meanwhile."""
+        return run(procedure, self._wait_for)
+
+    def _begin_to_receive(self, bus: can.BusABC) -> None:
         self._thread = threading.Thread(
-            target=self._receive, args=(bus, network), name="can-receive", daemon=True
+            target=self._receive, args=(bus,), name="can-receive", daemon=True
         )
         self._thread.start()
 
@@ -317,7 +311,7 @@ class CanLink:
                 self.lost = f"link {self.settings} is lost: {_plainly(error)}"
             self.arrival.notify_all()
 
-    def _receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+    def _receive(self, bus: can.BusABC) -> None:
         while self._bus is bus and not self.lost:
             try:
                 message = bus.recv(_RECEIVE_WAIT)
@@ -327,9 +321,9 @@ class CanLink:
                     self._lose(error)
                 return
             if message is not None:
-                self._dispatch(message, network)
+                self._dispatch(message)
 
-    def _dispatch(self, message: can.Message, network: canopen.Network) -> None:
+    def _dispatch(self, message: can.Message) -> None:
         if message.is_error_frame:
             self.error_frames += 1
             return
@@ -341,10 +335,12 @@ class CanLink:
             self.other_master = (
                 f"another master is on the bus: it sends {_OF_MASTERS[message.arbitration_id]}"
             )
-        data = bytearray(message.data)
+        data = bytes(message.data)
         for callback in self._callbacks.get(message.arbitration_id, ()):
-            callback(bytes(data), now)
-        network.notify(message.arbitration_id, data, now)
+            callback(data, now)
+        client = self._sdo.get(message.arbitration_id - SDO_ANSWER)
+        if client is not None:
+            client.receive(data)
         with self.arrival:
             self.arrival.notify_all()
 

@@ -110,6 +110,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             path_delay=values.path_delay,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
+            run=self._link.run,
         )
         self._active = False
         self._autostart = values.autostart
@@ -178,7 +179,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._sim_time:
             # Simulated time may stand still; watchdogs do not.
             self._drives.beat()
-            self._drives.hear_first(time.monotonic())
+            self._link.run(self._drives.hear_first(time.monotonic()))
             self._supervisor.observe(time.monotonic())
             self._device.report()
             return
@@ -217,7 +218,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._supervisor.note_time(ros_ns, now)
         self._drives.collect()
         self._supervisor.drive(PERIOD, now)
-        self._drives.exchange(wait)
+        self._link.run(self._drives.exchange(wait))
         observed = time.monotonic()
         self._supervisor.observe(observed)
         self._device.report()
@@ -256,7 +257,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._retry_at = now + _RETRY
         if self._device.others:
             raise UserError(f"{self.get_fully_qualified_name()}: {self._device.others}")
-        why_not = self._drives.probe()
+        why_not = self._link.run(self._drives.probe())
         if not why_not and self._supervisor.state is not State.UNCONFIGURED:
             reply = self._supervisor.reset(now)
             why_not = "" if reply.success else reply.message
@@ -278,7 +279,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._supervisor.state is not State.UNCONFIGURED:
             # A fault from before the configuration; an emergency stop that is pressed stays.
             self._supervisor.reset(time.monotonic())
-        why_not = self._drives.probe()
+        why_not = self._link.run(self._drives.probe())
         simulated = not why_not and self._is_simulated()
         if self._settings.lock_step and not (why_not or simulated):
             why_not = "lock_step: a drive does not say that it is emulated; a real motor would turn"
@@ -306,7 +307,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         """Return whether this is part of a simulation: its time, and drives without motors."""
         nodes = [self._settings.drive(name).node_id for name in ("insertion", "rotation")]
         try:
-            return self._sim_time and are_emulated(self._link, nodes)
+            return self._sim_time and self._link.run(are_emulated(self._link, nodes))
         except LinkError:
             return False
 
@@ -366,9 +367,8 @@ class DeviceDriverNode(WholeLifecycleNode):
 
 def main() -> int:
     """Run device_driver; returns its exit code."""
-    # What canopen and python-can have to say comes as faults of the axes.
-    for name in ("canopen", "can"):
-        logging.getLogger(name).addHandler(logging.NullHandler())
+    # What python-can has to say comes as faults of the axes.
+    logging.getLogger("can").addHandler(logging.NullHandler())
 
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DeviceDriverNode)

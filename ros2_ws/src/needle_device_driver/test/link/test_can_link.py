@@ -169,7 +169,7 @@ def test_slcan_that_refuses_is_named_where_nobody_answers(
     wait_for(link, lambda: len(frames) == 1)
     assert link.refused == 2
     with pytest.raises(DriveError, match=r"does not answer.*the adapter refuses"):
-        ObjectAccess(link, 1).read(DEVICE_TYPE)
+        link.run(ObjectAccess(link, 1).read(DEVICE_TYPE))
 
 
 def test_slcan_a_flood_of_frames_is_taken_whole(adapter: Adapter, make_link: Make) -> None:

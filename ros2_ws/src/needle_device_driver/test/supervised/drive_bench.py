@@ -69,6 +69,7 @@ class DriveBench:
             self.settings.limits,
             feedback_delay=1,
             switching=lambda: self.drives.needs_cycles,
+            run=self.link.run,
         )
         self.ros_ns = 1_000_000_000
         self.stamps = itertools.count(1)
@@ -118,7 +119,7 @@ class DriveBench:
             self.drives.collect()
             self.supervisor.drive(PERIOD, self.now)
             # What is answered at once is here when the frame is sent.
-            self.drives.exchange(0.0)
+            self.link.run(self.drives.exchange(0.0))
             self.supervisor.observe(self.clock())
 
     def hold(self, pressed: bool = True, *, scale: float = 1.0) -> None:

@@ -1,0 +1,77 @@
+"""Procedures: what takes several frames, as generators that say what they wait for.
+
+A generator does not wait itself: whoever runs it does, and may do everything else meanwhile.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass
+from typing import Any, Protocol, TypeVar
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Wait:
+    """Condition on which a procedure goes on, and its time-out.
+
+    Attributes
+    ----------
+    until : callable
+        It goes on as soon as this returns true.
+    seconds : float
+        It goes on after this time at the latest [s].
+    """
+
+    until: Callable[[], bool]
+    seconds: float
+
+
+Procedure = Generator[Wait, None, T]
+
+
+class Runner(Protocol):
+    """Runs a procedure to its end and returns what it returns."""
+
+    def __call__(self, procedure: Procedure[T]) -> T:
+        """Run one."""
+
+
+def run(procedure: Procedure[T], wait: Callable[[Callable[[], bool], float], Any]) -> T:
+    """Run a procedure to its end.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        What is run.
+    wait : callable
+        Waits until what it is given returns true, at most so long [s].
+
+    Returns
+    -------
+    object
+        What the procedure returns.
+    """
+    while True:
+        try:
+            step = next(procedure)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+        wait(step.until, step.seconds)
+
+
+def run_at_once(procedure: Procedure[T]) -> T:
+    """Run a procedure that waits for nothing, such as an ideal axis has.
+
+    Raises
+    ------
+    RuntimeError
+        If it does wait.
+    """
+    return run(procedure, _refuse_to_wait)
+
+
+def _refuse_to_wait(_until: Callable[[], bool], _seconds: float) -> None:
+    raise RuntimeError("the procedure waits, and nothing here can")
