@@ -35,12 +35,13 @@ from canopen.profiles.p402 import BaseNode402
 
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink, LinkSettings
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.link_settings import LinkSettings
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.bus.pty_port import PtyPort
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 PERIOD = 0.02
 CYCLES = 250

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any, Protocol, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 T = TypeVar("T")
+_ROUNDING = 1e-9
+"""Of sums of times [s]."""
 
 
 @dataclass(frozen=True)
@@ -75,3 +77,39 @@ def run_at_once(procedure: Procedure[T]) -> T:
 
 def _refuse_to_wait(_until: Callable[[], bool], _seconds: float) -> None:
     raise RuntimeError("the procedure waits, and nothing here can")
+
+
+class Running(Generic[T]):
+    """A procedure under way between events.
+
+    Parameters
+    ----------
+    procedure : Procedure
+        What is run.
+
+    Attributes
+    ----------
+    result : list
+        What the procedure returned; empty until it has ended.
+    """
+
+    def __init__(self, procedure: Procedure[T]) -> None:
+        self.result: list[T] = []
+        self._procedure = procedure
+        self._wait: Wait | None = None
+        self._deadline = 0.0
+
+    def advance(self, now: float) -> bool:
+        """Go on as far as possible at steady time `now` [s]; return whether it has ended."""
+        while self._wait is None or self._wait.until() or now >= self._deadline:
+            try:
+                self._wait = next(self._procedure)
+            except StopIteration as end:
+                self.result.append(end.value)
+                return True
+            self._deadline = now + self._wait.seconds - _ROUNDING
+        return False
+
+    def cancel(self) -> None:
+        """End it where it is; it sends nothing more."""
+        self._procedure.close()

@@ -29,7 +29,7 @@ from needle_device_driver.cia402.drive_upkeep import (
 )
 from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
@@ -51,7 +51,7 @@ class Cia402Axis(Axis):
         What errors call it.
     settings : DriveSettings
         The drive.
-    link : CanLink
+    link : FrameLink
         The bus, shared by all axes.
     period : float
         Of the SYNC [s].
@@ -69,7 +69,7 @@ class Cia402Axis(Axis):
     """
 
     def __init__(
-        self, name: str, settings: DriveSettings, link: CanLink, *, period: float, watchdog: float
+        self, name: str, settings: DriveSettings, link: FrameLink, *, period: float, watchdog: float
     ) -> None:
         self.name = name
         # As given, and with the units that the drive tells.

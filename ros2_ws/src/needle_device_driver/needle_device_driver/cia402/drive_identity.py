@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.sdo_aborts import SdoAbortedError, SdoSilenceError
 from needle_device_driver.procedure import Procedure
 
@@ -13,14 +13,14 @@ _DEVICE_NAME = 0x1008
 _EMULATED = b"Emulated "
 
 
-def are_emulated(link: CanLink, nodes: Iterable[int]) -> Procedure[bool]:
+def are_emulated(link: FrameLink, nodes: Iterable[int]) -> Procedure[bool]:
     """Return whether each of these drives says that it is an emulation.
 
     A drive that does not say so is taken for real, also one that says nothing.
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     nodes : iterable of int
         The drives' node ids.
@@ -37,7 +37,7 @@ def are_emulated(link: CanLink, nodes: Iterable[int]) -> Procedure[bool]:
     return True
 
 
-def _device_name(link: CanLink, node: int) -> Procedure[bytes]:
+def _device_name(link: FrameLink, node: int) -> Procedure[bytes]:
     link.beat()
     try:
         return (yield from link.sdo(node).upload(_DEVICE_NAME, 0))

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import (
     EMCY,
     HEARTBEAT,
@@ -73,13 +73,13 @@ class DriveMonitor:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus.
     node_id : int
         Whose frames.
     """
 
-    def __init__(self, link: CanLink, node_id: int) -> None:
+    def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
         self._lock = link.arrival
         self._number = 0

@@ -15,7 +15,7 @@ from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
 from needle_device_driver.cia402.drive_units import read_units
 from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
 from needle_device_driver.procedure import Procedure
 
@@ -37,13 +37,13 @@ _NO_FOLLOWING_ERROR = (
 
 
 def set_up(
-    link: CanLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
+    link: FrameLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
 ) -> Procedure[tuple[DriveSettings, tuple[str, ...]]]:
     """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     monitor : DriveMonitor
         The drive's; a start that it hears of once the drive has answered voids the set-up.
@@ -131,7 +131,7 @@ def _write_limits(access: ObjectAccess, lower: int, upper: int) -> Procedure[Non
 
 
 def _set_up_motion(
-    link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
+    link: FrameLink, access: ObjectAccess, settings: DriveSettings, period: float
 ) -> Procedure[list[str]]:
     yield from _switch_off(link, access, settings)
     yield from _check_modes(link, access, settings.node_id)
@@ -183,7 +183,7 @@ def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
             raise
 
 
-def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> Procedure[None]:
+def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[None]:
     """Refuse a drive that lacks a mode; the drive is off.
 
     Without 0x6502 each mode is tried. Cyclic synchronous position is also tried where 0x6502 does
@@ -198,7 +198,7 @@ def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> Procedure[No
         yield from _try_mode(link, access, node, Mode.CYCLIC_SYNCHRONOUS_POSITION)
 
 
-def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> Procedure[None]:
+def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> Procedure[None]:
     """Refuse a drive that does not take a mode, or does not show it."""
     yield from access.write(od.MODE_OF_OPERATION, mode)
     until = link.clock() + _MODE_WAIT
@@ -228,7 +228,7 @@ def _set(
     return ""
 
 
-def _switch_off(link: CanLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
+def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
     """Switch off what another program left on: a powered drive takes no settings."""
     if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
         return

@@ -6,8 +6,8 @@ from needle_device_driver.cia402.cia402 import FAULTS, DriveCommand, Mode, drive
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink
 from needle_device_driver.link.emergency import describe_error
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.procedure import Procedure
 
@@ -18,7 +18,7 @@ _FAULT_RESET_WAIT = 1.0
 
 
 def await_operational(
-    link: CanLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
+    link: FrameLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
 ) -> Procedure[bool]:
     """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
     until = link.clock() + timeout
@@ -32,7 +32,7 @@ def await_operational(
 
 
 def await_start(
-    link: CanLink, monitor: DriveMonitor, settings: DriveSettings, period: float
+    link: FrameLink, monitor: DriveMonitor, settings: DriveSettings, period: float
 ) -> Procedure[None]:
     """Wait until a drive that was set up exchanges process data.
 
@@ -48,7 +48,7 @@ def await_start(
         raise DriveError(f"node {settings.node_id} {what}")
 
 
-def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> Procedure[None]:
+def arm_watchdog(link: FrameLink, settings: DriveSettings, watchdog: float) -> Procedure[None]:
     """Let the drive stop without the computer's heartbeat for `watchdog` [s]; raises as `set_up`.
 
     It is the last step of a set-up: from here on the loop must send its heartbeat.
@@ -59,13 +59,13 @@ def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> Pro
         )
 
 
-def disarm_watchdog(link: CanLink, settings: DriveSettings) -> Procedure[None]:
+def disarm_watchdog(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     """Let the drive go without the computer, which takes its leave; raises as `set_up`."""
     if settings.actuated:
         yield from ObjectAccess(link, settings.node_id).write(od.CONSUMER_HEARTBEAT, 0)
 
 
-def reset_fault(link: CanLink, settings: DriveSettings) -> Procedure[None]:
+def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     """Acknowledge a drive's fault and wait until it is gone; moves nothing.
 
     The drive is operational: its controlword is the process data's, and many drives no longer take
@@ -73,7 +73,7 @@ def reset_fault(link: CanLink, settings: DriveSettings) -> Procedure[None]:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     settings : DriveSettings
         The drive.

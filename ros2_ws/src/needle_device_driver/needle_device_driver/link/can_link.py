@@ -3,100 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import threading
 from collections.abc import Callable
 
 import can
 
-from needle_common.errors import UserError
-from needle_device_driver.link.objects import (
-    HEARTBEAT,
-    MASTER_NODE_ID,
-    NMT,
-    NMT_OPERATIONAL,
-    SDO_ANSWER,
-    SYNC,
-)
-from needle_device_driver.link.sdo_client import SdoClient
+from needle_device_driver.link.frame_link import FrameLink, LinkError
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 from needle_device_driver.link.socketcand_bus import SocketcandBus
 from needle_device_driver.procedure import Procedure, T, run
 
-LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 _RECEIVE_WAIT = 0.05
 _JOIN_WAIT = 1.0
 # An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
 _SILENCE = 0.4
-_HEARTBEAT_PERIOD = 0.02
-
-# What only a master sends, whom an adapter does not let hear itself.
-_OF_MASTERS = {
-    NMT: "NMT commands",
-    SYNC: "SYNC",
-    HEARTBEAT + MASTER_NODE_ID: f"the heartbeat of node {MASTER_NODE_ID}, the computer's own",
-}
-
-Callback = Callable[[bytes, float], None]
-
-
-class LinkError(Exception):
-    """The link cannot be opened or is lost; the text says which and why."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LinkSettings:
-    """Kind of the adapter, and where it is.
-
-    Attributes
-    ----------
-    kind : str
-        `slcan` (serial adapter or pseudo-terminal), `socketcan` (Linux interface), `socketcand`
-        (a remote one over TCP) or `virtual` (inside this process: tests).
-    channel : str
-        Device file or interface name.
-    bitrate : int
-        Of the CAN bus [bit/s]; slcan only, the others are set up outside.
-    tty_baudrate : int
-        Of the serial port [bit/s]; slcan only.
-    host : str
-        socketcand only.
-    port : int
-        socketcand only.
-    write_timeout : float
-        How long a frame may wait for room [s]; slcan and socketcand only.
-    """
-
-    kind: str
-    channel: str
-    bitrate: int = 500_000
-    tty_baudrate: int = 115_200
-    host: str = "localhost"
-    port: int = 29536
-    write_timeout: float = 0.05
-
-    def __post_init__(self) -> None:
-        """Refuse what names no link.
-
-        Raises
-        ------
-        UserError
-            A kind that does not exist, no channel, or a bitrate that slcan does not have.
-        """
-        if self.kind not in LINKS:
-            raise UserError(f"link = {self.kind!r} is not one of {', '.join(LINKS)}")
-        if not self.channel:
-            raise UserError(f"channel is empty: name the {self.kind} device or interface")
-        if self.kind == "slcan" and self.bitrate not in SlcanBus._BITRATES:
-            known = ", ".join(str(rate) for rate in sorted(SlcanBus._BITRATES))
-            raise UserError(f"bitrate = {self.bitrate} bit/s: slcan has {known}")
-
-    def __str__(self) -> str:
-        """Return what messages call the link."""
-        if self.kind == "socketcand":
-            return f"socketcand {self.host}:{self.port} {self.channel}"
-        return f"{self.kind} {self.channel}"
 
 
 def open_bus(settings: LinkSettings) -> can.BusABC:
@@ -135,11 +57,11 @@ def _plainly(error: Exception) -> str:
     return str(error).partition("\n")[0]
 
 
-class CanLink:
-    """One CAN bus, to be opened, lost and opened again.
+class CanLink(FrameLink):
+    """A CAN bus behind an adapter.
 
-    Frames are received in a thread of their own, so that their arrival has its true time; all
-    sending is the caller's, in the control loop: a loop that hangs sends nothing.
+    Frames are received in a thread of their own, so that their arrival has its true time; a loop
+    that hangs sends nothing.
 
     Parameters
     ----------
@@ -149,13 +71,6 @@ class CanLink:
         Steady time [s].
     open_bus : callable
         Opens the adapter.
-
-    Attributes
-    ----------
-    lost : str
-        How the link was lost; empty: it is not.
-    other_master : str
-        What another master was heard to send; empty: nobody's.
     """
 
     def __init__(
@@ -164,20 +79,10 @@ class CanLink:
         clock: Callable[[], float],
         open_bus: Callable[[LinkSettings], can.BusABC] = open_bus,
     ) -> None:
-        self.settings = settings
-        self.clock = clock
-        self.arrival = threading.Condition()
-        self.lost = ""
-        self.other_master = ""
-        self.openings = 0
-        self.frames_sent = 0
-        self.frames_received = 0
-        self.error_frames = 0
+        super().__init__(settings, clock)
         self._open_bus = open_bus
         self._bus: can.BusABC | None = None
         self._thread: threading.Thread | None = None
-        self._callbacks: dict[int, list[Callback]] = {}
-        self._sdo: dict[int, SdoClient] = {}
         self._heard_at = 0.0
 
     @property
@@ -213,12 +118,9 @@ class CanLink:
             return
         self.close()
         bus = self._open_bus(self.settings)
-        # What an adapter that was lost still had to say is no answer now.
-        self._sdo = {}
+        self._note_opening()
         self._bus = bus
-        self.lost = self.other_master = ""
         self._heard_at = self.clock()
-        self.openings += 1
         self._begin_to_receive(bus)
 
     def close(self) -> None:
@@ -232,10 +134,6 @@ class CanLink:
             with contextlib.suppress(can.CanError, OSError):
                 bus.shutdown()
             _close_port(bus)
-
-    def subscribe(self, cob_id: int, callback: Callback) -> None:
-        """Call `callback(data, time)` in the receiving thread for each frame with this COB-ID."""
-        self._callbacks.setdefault(cob_id, []).append(callback)
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         """Send one frame.
@@ -255,30 +153,6 @@ class CanLink:
             self._lose(error)
             raise LinkError(self.lost) from error
         self.frames_sent += 1
-
-    def beat(self) -> None:
-        """Tell the drives' watchdogs that the control loop runs; only the loop itself may.
-
-        Raises
-        ------
-        LinkError
-            If the link is closed or lost.
-        """
-        self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
-
-    def sdo(self, node_id: int) -> SdoClient:
-        """Return the SDO client of a node, on the present opening of the adapter.
-
-        Raises
-        ------
-        LinkError
-            If the link is closed or lost.
-        """
-        if not self.is_open:
-            raise LinkError(self.lost or f"{self.settings} is not open")
-        if node_id not in self._sdo:
-            self._sdo[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
-        return self._sdo[node_id]
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; frames are received meanwhile."""
@@ -329,20 +203,8 @@ class CanLink:
             return
         if message.is_remote_frame or message.is_extended_id:
             return
-        now = self._heard_at = self.clock()
-        self.frames_received += 1
-        if message.arbitration_id in _OF_MASTERS:
-            self.other_master = (
-                f"another master is on the bus: it sends {_OF_MASTERS[message.arbitration_id]}"
-            )
-        data = bytes(message.data)
-        for callback in self._callbacks.get(message.arbitration_id, ()):
-            callback(data, now)
-        client = self._sdo.get(message.arbitration_id - SDO_ANSWER)
-        if client is not None:
-            client.receive(data)
-        with self.arrival:
-            self.arrival.notify_all()
+        self._heard_at = self.clock()
+        self._take(message.arbitration_id, bytes(message.data), self._heard_at)
 
 
 def _close_port(bus: can.BusABC) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
 from needle_device_driver.link.sdo_aborts import (
     NO_SUCH_OBJECT,
@@ -48,13 +48,13 @@ class ObjectAccess:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     node_id : int
         Which node.
     """
 
-    def __init__(self, link: CanLink, node_id: int) -> None:
+    def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
         self._node_id = node_id
 

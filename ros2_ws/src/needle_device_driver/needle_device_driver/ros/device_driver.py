@@ -17,7 +17,6 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import EndRequest
 from needle_common.process.reach import DISCOVERY, is_open
@@ -38,9 +37,11 @@ from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import LinkSettings
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.ros.device_interface import DeviceInterface
-from needle_device_driver.ros.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
@@ -60,7 +61,7 @@ It is a lifecycle node: `autostart` (default) configures and activates it, waiti
 Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
 """
 
-PARAMETERS = "needle_device_driver.ros.parameters:DeviceDriverParameters"
+PARAMETERS = "needle_device_driver.parameters:DeviceDriverParameters"
 PERIOD_NS = 20_000_000
 PERIOD = PERIOD_NS / NANOSECONDS
 # On a running clock the next cycle must come; a simulated one waits for this one's answers.
@@ -122,7 +123,6 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
-        self._told_unanswered = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
             self,
@@ -226,27 +226,13 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._device.publish_joint_states(ros_ns, observed)
 
     def _tell_health(self) -> None:
-        link = self._link
         values = {
-            "link": str(link.settings),
-            "frames_sent": str(link.frames_sent),
-            "frames_received": str(link.frames_received),
-            "bus_errors": str(link.errors),
             "late_cycles": str(self._schedule.late),
             # since the last word on it
             "longest_cycle_s": f"{self._schedule.take_longest():.4f}",
-            "unanswered_syncs": str(self._drives.unanswered),
         }
-        level, message = Level.OK, "connected"
-        if link.lost:
-            level, message = Level.ERROR, link.lost
-        elif not link.is_open:
-            level, message = Level.WARN, f"waiting for {self._waiting_for}"
-        elif self._drives.unanswered > self._told_unanswered:
-            count = self._drives.unanswered - self._told_unanswered
-            level, message = Level.WARN, f"{count} SYNCs were not answered in their cycle"
-        self._told_unanswered = self._drives.unanswered
-        self._diagnostics.set("can", Diagnostic(level, message, values))
+        health = self._drives.health(f"waiting for {self._waiting_for}", values)
+        self._diagnostics.set("can", health)
 
     # ---- lifecycle ----------------------------------------------------------------------------
 

@@ -15,9 +15,12 @@ import pytest
 
 from needle_common.errors import UserError
 from needle_device_driver.link import socketcand_bus
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings, open_bus
+from needle_device_driver.link.can_link import CanLink, open_bus
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import SLCAN_BITRATES, LinkSettings
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.link.objects import DEVICE_TYPE
+from needle_device_driver.link.slcan_bus import SlcanBus
 
 
 class Adapter:
@@ -88,6 +91,10 @@ def received(link: CanLink, cob_id: int) -> list[bytes]:
 
     link.subscribe(cob_id, take)
     return frames
+
+
+def test_slcan_bitrates_are_those_that_the_adapter_takes() -> None:
+    assert set(SLCAN_BITRATES) == set(SlcanBus._BITRATES)
 
 
 def test_slcan_opens_with_the_bitrate_and_sends_frames(adapter: Adapter, make_link: Make) -> None:

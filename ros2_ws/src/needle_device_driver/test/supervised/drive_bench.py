@@ -11,8 +11,9 @@ from typing import Any
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink, LinkError
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State

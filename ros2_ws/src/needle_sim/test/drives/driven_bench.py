@@ -11,19 +11,19 @@ from typing import Any
 
 import can
 
+from needle_common.can_frame import CanFrame
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.link.can_link import CanLink
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
-from needle_sim.bus.can_frame import CanFrame
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 PERIOD, TICK, FRAME = 0.02, 0.001, 0.0002
 UNITS = (0x608F, 0x60A8, 0x60A9, 0x60AA)

@@ -9,7 +9,7 @@ import pytest
 
 from needle_device_driver.cia402 import drive_setup
 from needle_device_driver.cia402.pdo_setup import silence_unused
-from needle_device_driver.link.can_link import LinkError
+from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
 from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule

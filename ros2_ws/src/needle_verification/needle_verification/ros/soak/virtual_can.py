@@ -9,8 +9,10 @@ from typing import Any
 
 import can
 
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
-from needle_sim.bus.can_frame import CanFrame
+from needle_common.can_frame import CanFrame
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_verification.soak.link_faults import LinkFaults, Way
 from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
