@@ -73,7 +73,7 @@ INSERTIONS = ("stepwise", "continuous")
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 # Options that a repeated run has anew, and such as are written otherwise than they are named.
 _SAID_APART = (
-    *("bag", "json", "level", "controller", "seed", "target_mm", "graph"),
+    *("bag", "json", "level", "controller", "seed", "target_mm", "graph", "component"),
     *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
 )
 
@@ -103,6 +103,7 @@ class SimulateOptions:
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
     graph: bool = False
+    component: tuple[str, ...] = ()
     bag: Path | None = None
     params: Path | None = None
     json: Path | None = None
@@ -157,6 +158,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
         graph=given.graph,
+        component=_components(given),
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         bag=_new_bag(given.bag),
         params=_readable("--params", given.params),
@@ -191,6 +193,7 @@ def command_of(options: SimulateOptions) -> str:
             words.append(f"--{field.name.replace('_', '-')}={value}")
     if options.graph:
         words.append("--graph")
+    words += [f"--component={name}" for name in options.component]
     return shlex.join(["scripts/simulate", *words])
 
 
@@ -294,6 +297,13 @@ def _parser() -> CommandParser:
         help="each component as a ROS node in a process of its own, over DDS; level drive always "
         "runs so",
     )
+    add(
+        "--component",
+        action="append",
+        default=[],
+        metavar="MODULE:NAME",
+        help="a component of your own beside the rig's (docs/own_component.md); may be repeated",
+    )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")
     add(
@@ -304,6 +314,15 @@ def _parser() -> CommandParser:
     )
     add("--json", metavar="FILE", help="write the result there too, as one flat JSON object")
     return parser
+
+
+def _components(given: Any) -> tuple[str, ...]:
+    for name in given.component:
+        if given.graph or given.level == "drive":
+            raise UserError(f"--component {name}: goes with levels tip and camera, without --graph")
+        if not all(name.partition(":")):
+            raise UserError(f"--component {name!r} is not MODULE:NAME, such as my_probe:Probe")
+    return tuple(given.component)
 
 
 def _target(text: str) -> tuple[float, float, float]:
