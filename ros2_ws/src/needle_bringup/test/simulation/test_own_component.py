@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import random
+import sys
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,8 @@ class Other:
 @pytest.fixture
 def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     """Return the name of a module in the current folder."""
-    name = f"probe_{random.randrange(10**9)}"
+    name = "probe_of_a_user"
+    monkeypatch.delitem(sys.modules, name, raising=False)
     (tmp_path / f"{name}.py").write_text(PROBE)
     monkeypatch.chdir(tmp_path)
     return name
