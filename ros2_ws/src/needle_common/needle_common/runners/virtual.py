@@ -236,7 +236,10 @@ class VirtualRunner:
         """Return the actions of a handler; one that raises is reported and ends nothing."""
         actions: list[Action] = []
         try:
-            actions.extend(work())
+            for action in work():
+                if isinstance(action, Publish) and action.topic not in process.outputs:
+                    raise ValueError(f"{action.topic} is not among its outputs")
+                actions.append(action)
         except Exception as error:  # noqa: BLE001
             process.failures += 1
             text = f"internal error: {type(error).__name__}: {error}"
