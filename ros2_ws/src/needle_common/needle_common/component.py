@@ -242,13 +242,13 @@ class Component:
     name : str
         The node's name.
     settings : object
-        Its settings dataclass: the parameters of the node.
+        Its settings dataclass, the parameters of the node; None without any.
     inputs, outputs, services, timers, ports : sequences of rows
         What it receives, sends, offers, does by itself and is wired to; none by default.
     """
 
     name: str
-    settings: Any
+    settings: Any = None
     inputs: Sequence[Input] = ()
     outputs: Sequence[Output] = ()
     services: Sequence[Service] = ()

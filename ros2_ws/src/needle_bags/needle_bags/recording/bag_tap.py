@@ -93,6 +93,8 @@ class BagTap:
     def _write_parameters(self, components: Iterable[Component]) -> None:
         document = {}
         for component in components:
+            if component.settings is None:
+                continue
             values = {
                 name: list(value) if isinstance(value, tuple) else value
                 for name, value in dataclasses.asdict(component.settings).items()

@@ -16,6 +16,7 @@ from types import ModuleType
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.needle_options import contradictions
 from needle_bringup.simulation.node_process import RECORDER_GRACE, NodeProcess, stop, wait_for
+from needle_bringup.simulation.own_component import own_component
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
     command_line_parameters,
@@ -149,6 +150,7 @@ def _run_components(
     from needle_bringup.simulation import virtual_run  # noqa: PLC0415
 
     components = virtual_run.make_components(parameters)
+    components += [own_component(name) for name in options.component]
     print(f"recording into {shown(bag)}", file=sys.stderr)
     virtual_run.run_virtually(
         components,

@@ -72,7 +72,7 @@ INSERTIONS = ("stepwise", "continuous")
 DEPTH_MM, LARGEST_DEPTH_MM = "120", 150.0
 # Options that a repeated run has anew, and such as are written otherwise than they are named.
 _SAID_APART = (
-    *("bag", "json", "level", "controller", "seed", "target_mm", "graph"),
+    *("bag", "json", "level", "controller", "seed", "target_mm", "graph", "component"),
     *("initial_x_mm", "initial_pitch_deg", "initial_roll_deg"),
 )
 
@@ -102,6 +102,7 @@ class SimulateOptions:
     lag_mm: float = 0.0
     real_time_factor: float = 0.0
     graph: bool = False
+    component: tuple[str, ...] = ()
     bag: Path | None = None
     params: Path | None = None
     json: Path | None = None
@@ -151,6 +152,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
         real_time_factor=factor,
         graph=given.graph,
+        component=_components(given),
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
         bag=_new_bag(given.bag),
         params=_readable("--params", given.params),
@@ -185,6 +187,7 @@ def command_of(options: SimulateOptions) -> str:
             words.append(f"--{field.name.replace('_', '-')}={value}")
     if options.graph:
         words.append("--graph")
+    words += [f"--component={name}" for name in options.component]
     return shlex.join(["scripts/simulate", *words])
 
 
@@ -287,6 +290,13 @@ def _parser() -> CommandParser:
         action="store_true",
         help="each component as a ROS node in a process of its own, over DDS",
     )
+    add(
+        "--component",
+        action="append",
+        default=[],
+        metavar="MODULE:NAME",
+        help="a component of your own beside the rig's (docs/own_component.md); may be repeated",
+    )
     add("--bag", metavar="DIR", help="new folder for the run (default: time-stamped, in bags/)")
     add("--params", metavar="FILE", help="ROS parameter file on top of the rig's configuration")
     add(
@@ -297,6 +307,15 @@ def _parser() -> CommandParser:
     )
     add("--json", metavar="FILE", help="write the result there too, as one flat JSON object")
     return parser
+
+
+def _components(given: Any) -> tuple[str, ...]:
+    for name in given.component:
+        if given.graph:
+            raise UserError(f"--component {name}: goes without --graph")
+        if not all(name.partition(":")):
+            raise UserError(f"--component {name!r} is not MODULE:NAME, such as my_probe:Probe")
+    return tuple(given.component)
 
 
 def _target(text: str) -> tuple[float, float, float]:

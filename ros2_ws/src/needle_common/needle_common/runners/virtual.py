@@ -241,7 +241,10 @@ class VirtualRunner:
         """Return the actions of a handler; one that raises is reported and ends nothing."""
         actions: list[Action] = []
         try:
-            actions.extend(work())
+            for action in work():
+                if isinstance(action, Publish) and action.topic not in process.outputs:
+                    raise ValueError(f"{action.topic} is not among its outputs")
+                actions.append(action)
         except Exception as error:  # noqa: BLE001
             process.failures += 1
             text = f"internal error: {type(error).__name__}: {error}"
@@ -329,8 +332,7 @@ class VirtualRunner:
                         self._at(when, partial(self._arrive, receiver, row, arrived))
 
     def _arrive(self, receiver: _Process, row: Port, batch: tuple[Any, ...]) -> None:
-        work = lambda: row.handler(batch, self._moment())  # noqa: E731
-        self._offer(receiver, row.name, RELIABLE, work)
+        self._offer(receiver, row.name, RELIABLE, lambda: row.handler(batch, self._moment()))
 
     def _discover(self, process: _Process, other: _Process) -> None:
         """Let one component know another: from now on its messages get there."""
@@ -347,10 +349,8 @@ class VirtualRunner:
     def _diagnose(self, process: _Process, part: str, diagnostic: Diagnostic) -> None:
         before = process.health.get(part)
         process.health[part] = diagnostic
-        if before is None or (before.level, before.message) != (
-            diagnostic.level,
-            diagnostic.message,
-        ):
+        now = diagnostic.level, diagnostic.message
+        if before is None or (before.level, before.message) != now:
             self._publish_health(process, (part,))
 
     def _tell_health(self, process: _Process) -> None:

@@ -240,6 +240,12 @@ def test_a_handler_that_raises_is_reported_and_ends_nothing() -> None:
     assert {4, 5, 6} <= set(receiver.numbers)
 
 
+def test_what_is_no_output_is_not_sent() -> None:
+    _, told = run([Once([Publish("others", EmergencyStop(True))])])
+    (line,) = [message for *_, topic, message in told if topic == "/rosout"]
+    assert line.text == "internal error: ValueError: others is not among its outputs"
+
+
 def test_health_is_told_on_change_and_once_a_second() -> None:
     well = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "1"}))
     counted = Diagnose("part", Diagnostic(Level.OK, "well", {"count": "2"}))
