@@ -35,12 +35,13 @@ from canopen.profiles.p402 import BaseNode402
 
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink, LinkSettings
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.link_settings import LinkSettings
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.bus.pty_port import PtyPort
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 PERIOD = 0.02
 CYCLES = 250
@@ -84,10 +85,10 @@ class Driver:
         self._cycle = DriveCycle(self._link, self._axes)
         self._link.open()
         for axis in self._axes:
-            axis.configure()
+            self._link.run(axis.configure())
             axis.power(True)
         while not all(axis.poll(0.0).powered for axis in self._axes):
-            self._cycle.exchange(PERIOD / 2)
+            self._link.run(self._cycle.exchange(PERIOD / 2))
             time.sleep(PERIOD)
         self._starts = [axis.poll(0.0).position for axis in self._axes]
         self._units = [values.drive(axis.name).counts_per_unit for axis in self._axes]
@@ -98,12 +99,12 @@ class Driver:
             self._axes, self._starts, COUNTS_PER_CYCLE, self._units, strict=True
         ):
             axis.start_move(start + (number + 1) * counts / unit, counts / unit / PERIOD)
-        self._cycle.exchange(PERIOD / 2)
+        self._link.run(self._cycle.exchange(PERIOD / 2))
 
     def close(self) -> None:
         """Switch off."""
         for axis in self._axes:
-            axis.close()
+            self._link.run(axis.close())
         self._link.close()
 
 

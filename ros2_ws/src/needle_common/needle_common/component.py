@@ -89,6 +89,14 @@ class Reply:
 
 
 @dataclass(frozen=True)
+class Send:
+    """Send a batch, in its order, through one of the component's ports."""
+
+    port: str
+    batch: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
 class Log:
     """Log a line; `severity` is info, warning or error."""
 
@@ -112,7 +120,7 @@ class Exit:
     text: str = ""
 
 
-Action = Publish | Call | Reply | Log | Diagnose | Exit
+Action = Publish | Send | Call | Reply | Log | Diagnose | Exit
 Actions = Iterable[Action]
 
 
@@ -136,6 +144,17 @@ class Output:
     topic: str
     message: type[Any]
     delivery: Delivery = RELIABLE
+
+
+@dataclass(frozen=True)
+class Port:
+    """An edge to the world other than topics, such as a CAN bus; the handler gets whole batches.
+
+    Ports of one name are wired together: what goes out of one arrives at the others, in order.
+    """
+
+    name: str
+    handler: Callable[[Sequence[Any], Moment], Actions]
 
 
 @dataclass(frozen=True)
@@ -198,6 +217,22 @@ class Peers:
     subscribers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     services: frozenset[str] = frozenset()
 
+    @staticmethod
+    def of(components: Iterable[Component]) -> Peers:
+        """Return what is known to one that knows these, its own rows included."""
+        publishers: dict[str, tuple[str, ...]] = {}
+        subscribers: dict[str, tuple[str, ...]] = {}
+        services: list[str] = []
+        for component in components:
+            services += [service.name for service in component.services]
+            for output in component.outputs:
+                names = publishers.get(output.topic, ())
+                publishers[output.topic] = (*names, component.name)
+            for row in component.inputs:
+                names = subscribers.get(row.topic, ())
+                subscribers[row.topic] = (*names, component.name)
+        return Peers(publishers, subscribers, frozenset(services))
+
 
 class Component:
     """Base of every component: a name, settings and rows.
@@ -208,8 +243,8 @@ class Component:
         The node's name.
     settings : object
         Its settings dataclass, the parameters of the node; None without any.
-    inputs, outputs, services, timers : sequences of rows
-        What it receives, sends, offers and does by itself; none by default.
+    inputs, outputs, services, timers, ports : sequences of rows
+        What it receives, sends, offers, does by itself and is wired to; none by default.
     """
 
     name: str
@@ -218,6 +253,7 @@ class Component:
     outputs: Sequence[Output] = ()
     services: Sequence[Service] = ()
     timers: Sequence[Timer] = ()
+    ports: Sequence[Port] = ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
         """Handle the outcome of a call."""

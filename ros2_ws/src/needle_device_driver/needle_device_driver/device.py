@@ -24,6 +24,7 @@ from needle_common.component import (
 )
 from needle_common.component import Reply as ServiceReply
 from needle_common.diagnostics import Diagnostic, Level
+from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import (
@@ -43,7 +44,17 @@ _HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
 # Positions alone change device/status so often at most [s]; joint_states has them all.
 _STATUS_PERIOD = 0.5
+_STOPPED = (State.FAULT, State.ESTOPPED)
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Order:
+    """An order under way, what follows it, and whether the device was stopped when it began."""
+
+    running: Running[Reply]
+    then: Callable[[Reply, Moment], Actions]
+    was_stopped: bool
 
 
 class DeviceRows:
@@ -78,6 +89,7 @@ class DeviceRows:
         self._told: DeviceStatus | None = None
         self._told_at = 0.0
         self._notices = NoticeLimit()
+        self._order: _Order | None = None
         self.inputs = (
             Input(COMMANDS, m.Trajectory, self._on_command),
             Input(HOLD, m.HoldState, self._on_hold, _HOLDS),
@@ -90,13 +102,47 @@ class DeviceRows:
         )
         call = supervisor
         self.services = (
-            self._trigger("home", lambda at: call.home(at.steady)),
+            self._trigger("home", lambda at: call.homing(at.steady)),
             self._trigger("retract", lambda at: call.retract(at.steady)),
-            self._trigger("reset", lambda at: call.reset(at.steady)),
+            self._trigger("reset", lambda at: call.resetting(at.steady)),
             self._trigger("stop", lambda at: call.stop(), always=True),
             self._switch("enable", lambda on, at: call.enable(on, at.steady)),
             self._switch("confirm_needle_out", lambda on, at: call.confirm_needle_out(on)),
         )
+
+    @property
+    def is_busy(self) -> bool:
+        """Tell whether an order takes its time."""
+        return self._order is not None
+
+    def begin(
+        self, order: Procedure[Reply], then: Callable[[Reply, Moment], Actions], at: Moment
+    ) -> Actions:
+        """Begin an order that may take its time; `then` gets its reply.
+
+        A stop, an emergency stop and a fault call it off, and so does disabling.
+        """
+        self._order = _Order(Running(order), then, self._supervisor.state in _STOPPED)
+        yield from self.advance(at)
+
+    def advance(self, at: Moment) -> Actions:
+        """Go on with the order under way; call it after all that may have changed something."""
+        order = self._order
+        if order is None:
+            return
+        if self._supervisor.state in _STOPPED and not order.was_stopped:
+            yield from self.call_off("stopped", at)
+        elif order.running.advance(at.steady):
+            self._order = None
+            yield from self.report(at)
+            yield from order.then(order.running.result[0], at)
+
+    def call_off(self, why: str, at: Moment) -> Actions:
+        """End the order under way where it is; its reply says why."""
+        order, self._order = self._order, None
+        if order is not None:
+            order.running.cancel()
+            yield from order.then(Reply(False, f"called off: {why}"), at)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note who else is a device on these topics, and how many send commands."""
@@ -164,11 +210,17 @@ class DeviceRows:
         return self.report(at)
 
     def _on_emergency_stop(self, message: m.EmergencyStop, at: Moment) -> Actions:
+        if message.pressed:
+            yield from self.call_off("emergency stop", at)
         self._supervisor.receive_estop(message.pressed)
-        return self.report(at)
+        yield from self.report(at)
 
     def _trigger(
-        self, name: str, call: Callable[[Moment], Reply], *, always: bool = False
+        self,
+        name: str,
+        call: Callable[[Moment], Reply | Procedure[Reply]],
+        *,
+        always: bool = False,
     ) -> Service:
         def answer(_: bool | None, number: int, at: Moment) -> Actions:
             return self._answer(number, at, lambda: call(at), always=always)
@@ -182,12 +234,29 @@ class DeviceRows:
         return Service(f"device/{name}", answer, has_argument=True)
 
     def _answer(
-        self, number: int, at: Moment, call: Callable[[], Reply], *, always: bool
+        self,
+        number: int,
+        at: Moment,
+        call: Callable[[], Reply | Procedure[Reply]],
+        *,
+        always: bool,
     ) -> Actions:
-        why_not = "" if always else self._refuse()
-        reply = Reply(False, why_not) if why_not else call()
-        yield from self.report(at)
-        yield ServiceReply(number, reply.success, reply.message)
+        def answer(reply: Reply, _: Moment) -> Actions:
+            yield ServiceReply(number, reply.success, reply.message)
+
+        if always:
+            yield from self.call_off("stopped on request", at)
+        why_not = "" if always else self._refuse() or self._under_way
+        outcome = Reply(False, why_not) if why_not else call()
+        if isinstance(outcome, Reply):
+            yield from self.report(at)
+            yield from answer(outcome, at)
+        else:
+            yield from self.begin(outcome, answer, at)
+
+    @property
+    def _under_way(self) -> str:
+        return "another order is under way" if self.is_busy else ""
 
 
 def device_diagnostic(status: DeviceStatus) -> Diagnostic:

@@ -19,21 +19,17 @@ from needle_common.component import (
 )
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.rotations import quaternion_from_rotation
-from needle_device_driver.device import DeviceRows
-from needle_device_driver.supervisor.supervisor import MotionSupervisor
+from needle_sim.devices import CYCLE, make_device
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.rig.simulated_axis import SimulatedAxis
 from needle_sim.sensors import RIG, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
-CYCLE = 0.02
-"""Period of the axes' set-points [s]."""
 _IDLE_EXPOSURE_PERIOD = 1.0
 """A needle that nobody waits for is exposed so often [s]."""
 
 
 class SimRig(Component):
-    """The simulated rig of levels `tip` and `camera`: ideal axes, and the plant they move.
+    """The simulated rig: the needle, what moves it, and what sees it.
 
     Parameters
     ----------
@@ -54,11 +50,8 @@ class SimRig(Component):
             tip_noise=settings.tip_noise,
             seed=settings.seed,
         )
-        self._axes = (SimulatedAxis("insertion"), SimulatedAxis("rotation"))
-        self._supervisor = MotionSupervisor(*self._axes, settings.limits)
-        self._supervisor.configure(0.0)
-        self._device = DeviceRows(
-            self._supervisor, self.name, simulated=True, refuse=lambda: self._ended
+        self._device = make_device(
+            self._bench, self.name, level=settings.level, limits=settings.limits
         )
         self._sensor = make_sensor(self._bench, settings)
         self._ended = ""
@@ -94,14 +87,8 @@ class SimRig(Component):
         return ()
 
     def _cycle(self, at: Moment) -> Actions:
-        self._supervisor.note_time(at.stamp_ns, at.steady)
-        self._supervisor.drive(CYCLE, at.steady)
-        for axis in self._axes:
-            axis.advance(CYCLE)
-        self._bench.move_to(*(axis.position for axis in self._axes))
+        yield from self._device.move(at)
         yield from self._end_outside_phantom()
-        self._supervisor.observe(at.steady)
-        yield from self._device.joint_states(at)
         yield from self._device.report(at)
 
     def _expose_if_due(self, at: Moment) -> Actions:
@@ -132,5 +119,5 @@ class SimRig(Component):
                     f"the tip left the phantom: {axis} = {place * 1e3:.2f} mm is beyond "
                     f"{math.copysign(end, place) * 1e3:.2f} mm"
                 )
-                self._supervisor.fail(self._ended)
+                yield from self._device.fail(self._ended)
                 yield Diagnose("simulation", Diagnostic(Level.ERROR, self._ended))

@@ -100,7 +100,7 @@ def simulate(options: SimulateOptions) -> int:
     KeyboardInterrupt
         After an interrupt, when everything has ended.
     """
-    if options.runs_graph:
+    if options.graph:
         settle_environment(own_graph=True)
     started_at = float(os.environ.get(STARTED_AT) or time.time())
     given: Parameters = {}
@@ -116,7 +116,7 @@ def simulate(options: SimulateOptions) -> int:
             print(f"warning: {line}", file=sys.stderr)
         write_parameters(bag / PARAMETERS, {node: parameters[node] for node in nodes_of(options)})
         with end:
-            if options.runs_graph:
+            if options.graph:
                 _run_graph(options, bag, end)
             else:
                 _run_components(options, parameters, bag, end)

@@ -21,10 +21,9 @@ from needle_common.errors import UserError
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.
 
-Levels tip and camera run sim_rig, stereo_tracker, plane_controller and simulated_operator in this
-process, on a virtual clock: the same seed gives the same bag, byte for byte. Level drive, and the
-others with --graph, start them, recorder and, at level drive, drive_emulator and device_driver as
-ROS nodes in processes of their own.
+sim_rig, stereo_tracker, plane_controller, simulated_operator and, at level drive, drive_emulator
+and device_driver run in this process, on a virtual clock: the same seed gives the same bag, byte
+for byte. With --graph they and recorder are ROS nodes in processes of their own.
 
 It shows how far the needle is in, and leaves a folder that holds the bag (open it with rosbags,
 mcap, Foxglove, PlotJuggler or `ros2 bag`), report.html with its figures, summary.json, the
@@ -107,11 +106,6 @@ class SimulateOptions:
     bag: Path | None = None
     params: Path | None = None
     json: Path | None = None
-
-    @property
-    def runs_graph(self) -> bool:
-        """Whether it runs as ROS nodes; the driver and its drives are no components yet."""
-        return self.graph or self.level == "drive"
 
 
 def parse(arguments: Sequence[str]) -> SimulateOptions:
@@ -294,8 +288,7 @@ def _parser() -> CommandParser:
     add(
         "--graph",
         action="store_true",
-        help="each component as a ROS node in a process of its own, over DDS; level drive always "
-        "runs so",
+        help="each component as a ROS node in a process of its own, over DDS",
     )
     add(
         "--component",

@@ -13,6 +13,7 @@ from needle_bags.recording.bag_tap import BagTap
 from needle_bringup.simulated_operator.component import SimulatedOperator
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import Progress
+from needle_common.can_frame import CAN
 from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_common.component import Action, Component, Exit, Output, Publish
 from needle_common.errors import UserError
@@ -32,12 +33,13 @@ _FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
 _SLICE = 1.0
 _WIND_UP = 5.0
 """What the rest of the rig may take to end after the operator [s]."""
-# Parameters that only a graph of processes has.
+# Parameters of a graph of processes; drives and driver there wait for each other in lock step.
 _OF_GRAPH = ("use_sim_time", "wait_for_recorder", "lock_step", "real_time_factor")
+_OF_GRAPHS_DRIVES = ("motion_clock", "pty", "watchdog", "reply_age_limit", "autostart")
 
 
 def make_components(parameters: Parameters) -> list[Component]:
-    """Return the rig of level `tip` or `camera`.
+    """Return the rig of a level.
 
     Raises
     ------
@@ -47,6 +49,7 @@ def make_components(parameters: Parameters) -> list[Component]:
     rig = SimRig(_settings(SimRigParameters, parameters, "sim_rig"))
     return [
         rig,
+        *(_make_drives(parameters) if rig.settings.level == "drive" else []),
         *([] if rig.settings.level == "tip" else [_make_tracker(parameters)]),
         PlaneController(_settings(SteeringSettings, parameters, "plane_controller")),
         SimulatedOperator(_settings(SimulatedOperatorParameters, parameters, "simulated_operator")),
@@ -65,6 +68,25 @@ def _make_tracker(parameters: Parameters) -> Component:
     )
     text = read_calibration(path)
     return StereoTipTracker(settings, calibration_from(text, path), text)
+
+
+def _make_drives(parameters: Parameters) -> list[Component]:
+    # Not where nothing is driven: both bring code along.
+    from needle_device_driver.device_driver import DeviceDriver  # noqa: PLC0415
+    from needle_device_driver.parameters import DeviceDriverParameters  # noqa: PLC0415
+    from needle_sim.drive_emulator import DriveEmulator  # noqa: PLC0415
+    from needle_sim.drive_emulator_parameters import DriveEmulatorParameters  # noqa: PLC0415
+
+    def settings(kind: type[Any], node: str, **own: str) -> Any:
+        given = parameters.get(node, {}).items()
+        values = {k: v for k, v in given if k not in _OF_GRAPHS_DRIVES}
+        return _settings(kind, {node: {**values, **own}}, node)
+
+    driver = settings(DeviceDriverParameters, "device_driver", link="virtual", channel=CAN)
+    return [
+        DriveEmulator(settings(DriveEmulatorParameters, "drive_emulator")),
+        DeviceDriver(driver),
+    ]
 
 
 def _tracker_time(actions: Sequence[Action], rng: random.Random) -> float:

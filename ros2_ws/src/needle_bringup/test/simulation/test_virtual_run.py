@@ -20,6 +20,7 @@ from needle_sim.sim_rig import SimRig
 
 SHORT = ("--level", "tip", "--depth-mm", "10")
 CAMERA = ("--level", "camera", "--depth-mm", "3")
+DRIVE = ("--level", "drive", "--depth-mm", "3")
 CONTINUOUS = ("--level", "tip", "--depth-mm", "10", "--insertion", "continuous")
 COMMANDS, HOLD, RESULTS = "device/joint_trajectory", "device/hold", "device/result"
 
@@ -40,7 +41,9 @@ def mcap_of(folder: Path, *arguments: str) -> bytes:
 
 
 @pytest.mark.parametrize(
-    "arguments", [SHORT, CONTINUOUS, CAMERA], ids=["stepwise", "continuous", "camera"]
+    "arguments",
+    [SHORT, CONTINUOUS, CAMERA, DRIVE],
+    ids=["stepwise", "continuous", "camera", "drive"],
 )
 def test_one_seed_is_one_run_and_another_another(
     tmp_path: Path, arguments: tuple[str, ...]
@@ -167,3 +170,32 @@ def test_a_silent_controller_moves_nothing() -> None:
     rig = Rig(*SHORT, faults=(drop(COMMANDS, 1.0),))
     rig.runner.run(20.0)
     assert rig.depth == 0.0
+
+
+def test_at_level_drive_the_needle_goes_where_the_motors_go() -> None:
+    rig = Rig(*DRIVE)
+    while not rig.runner.run(1.0):
+        assert rig.runner.now < 30.0
+    assert rig.runner.exits["simulated_operator"].code == 0
+    assert rig.outcomes() == {"succeeded"}
+    assert rig.sent["device/status"][-1].values["simulated"] == "true"
+    motors = [at.positions[0] for at in rig.sent["sim/drive_positions"]]
+    assert max(motors) == pytest.approx(0.003, abs=1e-5)
+    assert rig.sim_rig._bench.insertion == motors[-1]
+    assert len(rig.sent["stereo/left/image_raw"]) <= 6
+
+
+@pytest.mark.parametrize("insertion", ["stepwise", "continuous"])
+def test_at_level_drive_a_driver_that_stands_still_stops_the_needle(insertion: str) -> None:
+    rig = Rig(*DRIVE, "--insertion", insertion)
+    rig.until_depth(0.0015)
+    rig.runner.freeze("device_driver", 1.0)
+    rig.runner.run(0.1)
+    stopped = rig.sim_rig._bench.insertion
+    # 2 mm/s until the set-points end
+    assert stopped < 0.0015 + 0.0002
+    rig.runner.run(0.8)
+    assert rig.sim_rig._bench.insertion == stopped
+    while not rig.runner.run(1.0):
+        assert rig.runner.now < 30.0
+    assert "heartbeat was missed" in rig.runner.exits["simulated_operator"].text

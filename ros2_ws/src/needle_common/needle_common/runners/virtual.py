@@ -33,8 +33,10 @@ from needle_common.component import (
     Moment,
     Output,
     Peers,
+    Port,
     Publish,
     Reply,
+    Send,
     Service,
     Timer,
 )
@@ -48,6 +50,8 @@ DIAGNOSTICS = Output("/diagnostics", Diagnostics)
 LOG = Output("/rosout", LogLine)
 LATENCY = (0.3e-3, 1.5e-3)
 """Delay of a delivery, as between processes on one computer [s]."""
+PORT_LATENCY = (0.15e-3, 0.6e-3)
+"""Delay of a batch between ports, adapter included [s]."""
 COMPUTE = (0.1e-3, 0.3e-3)
 """Compute time of a handler where none is given [s]."""
 DISCOVERY = (0.02, 0.2)
@@ -132,6 +136,7 @@ class VirtualRunner:
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._serial = itertools.count(1)
         self._streams: dict[str, random.Random] = {}
+        self._wired_until: dict[Link, float] = {}
         self._calls: dict[int, tuple[_Process, str]] = {}
         self._processes = [
             _Process(
@@ -262,6 +267,8 @@ class VirtualRunner:
         match action:
             case Publish(topic, message):
                 self._publish(process, process.outputs[topic], message)
+            case Send(port, batch):
+                self._send_through(process, port, batch)
             case Call():
                 self._call(process, action)
             case Reply():
@@ -292,45 +299,50 @@ class VirtualRunner:
             if row.topic != topic:
                 continue
             link = Link(sender.name, topic, receiver.name)
-            rng = self._stream(str(link))
-            arrivals: list[tuple[float, Any]] = [(rng.uniform(*LATENCY), message)]
-            for fault in self._faults:
-                arrivals = [
-                    (late + extra, changed)
-                    for late, sent in arrivals
-                    for extra, changed in fault(link, sent, self.now, rng)
-                ]
-            for late, arrived in arrivals:
+            for late, arrived in self._arrivals(link, message, LATENCY):
                 event = partial(self._deliver, receiver, row, arrived, sent_ns)
                 self._at(self.now + late, event)
+
+    def _arrivals(
+        self, link: Link, message: Any, latency: tuple[float, float]
+    ) -> list[tuple[float, Any]]:
+        rng = self._stream(str(link))
+        arrivals: list[tuple[float, Any]] = [(rng.uniform(*latency), message)]
+        for fault in self._faults:
+            arrivals = [
+                (late + extra, changed)
+                for late, sent in arrivals
+                for extra, changed in fault(link, sent, self.now, rng)
+            ]
+        return arrivals
 
     def _deliver(self, receiver: _Process, row: Input, message: Any, sent_ns: int) -> None:
         work = lambda: row.handler(message, self._moment(sent_ns))  # noqa: E731
         self._offer(receiver, row.topic, row.delivery, work)
+
+    def _send_through(self, sender: _Process, port: str, batch: tuple[Any, ...]) -> None:
+        for receiver in self._processes:
+            for row in receiver.component.ports if receiver is not sender else ():
+                if row.name == port:
+                    link = Link(sender.name, port, receiver.name)
+                    for late, arrived in self._arrivals(link, batch, PORT_LATENCY):
+                        # A wire keeps the order.
+                        when = max(self.now + late, self._wired_until.get(link, 0.0))
+                        self._wired_until[link] = when
+                        self._at(when, partial(self._arrive, receiver, row, arrived))
+
+    def _arrive(self, receiver: _Process, row: Port, batch: tuple[Any, ...]) -> None:
+        work = lambda: row.handler(batch, self._moment())  # noqa: E731
+        self._offer(receiver, row.name, RELIABLE, work)
 
     def _discover(self, process: _Process, other: _Process) -> None:
         """Let one component know another: from now on its messages get there."""
         process.known.append(other)
         for topic, message in process.latched.items():
             self._send(process, other, topic, message)
-        peers = self._peers(process)
+        peers = Peers.of(p.component for p in (process, *process.known))
         self._offer(
             process, "peers", RELIABLE, lambda: process.component.on_peers(peers, self._moment())
-        )
-
-    def _peers(self, process: _Process) -> Peers:
-        known = [p.component for p in (process, *process.known)]
-        publishers: dict[str, list[str]] = {}
-        subscribers: dict[str, list[str]] = {}
-        for component in known:
-            for output in component.outputs:
-                publishers.setdefault(output.topic, []).append(component.name)
-            for row in component.inputs:
-                subscribers.setdefault(row.topic, []).append(component.name)
-        return Peers(
-            {topic: tuple(names) for topic, names in publishers.items()},
-            {topic: tuple(names) for topic, names in subscribers.items()},
-            frozenset(service.name for component in known for service in component.services),
         )
 
     # ---- health ---------------------------------------------------------------------------------

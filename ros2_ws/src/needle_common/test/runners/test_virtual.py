@@ -23,8 +23,10 @@ from needle_common.component import (
     Moment,
     Output,
     Peers,
+    Port,
     Publish,
     Reply,
+    Send,
     Service,
     Timer,
 )
@@ -268,3 +270,41 @@ def test_a_component_that_is_asked_to_end_exits() -> None:
     assert runner.exits == {"sender": Exit(0)}
     with pytest.raises(ValueError, match="no component 'nobody': sender"):
         runner.stop("nobody")
+
+
+class Wired(Component):
+    """Sends two batches in each of its ticks, and keeps what arrives, with the time."""
+
+    def __init__(self, name: str, *, sends: bool = False) -> None:
+        self.name = name
+        self.count = 0
+        self.arrived: list[tuple[float, int]] = []
+        self.ports = (Port("wire", self._take),)
+        self.timers = (Timer(0.0005, self._send),) if sends else ()
+
+    def _send(self, at: Moment) -> Actions:
+        for _ in range(2):
+            self.count += 2
+            yield Send("wire", (self.count - 1, self.count))
+
+    def _take(self, batch: Sequence[int], at: Moment) -> Actions:
+        self.arrived += [(at.steady, number) for number in batch]
+        return ()
+
+
+def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -> None:
+    one, other, third = Wired("one", sends=True), Wired("other"), Wired("third")
+    third.ports = (Port("another wire", third._take),)
+    VirtualRunner([one, other, third]).run(0.1)
+    numbers = [number for _, number in other.arrived]
+    # Wires are there at once, while discovery takes a while.
+    assert numbers == list(range(1, len(numbers) + 1))
+    assert one.count - 12 < len(numbers) <= one.count
+    assert other.arrived[0][0] < 0.003
+    assert one.arrived == third.arrived == []
+
+
+def test_faults_apply_to_what_goes_through_a_port() -> None:
+    one, other = Wired("one", sends=True), Wired("other")
+    VirtualRunner([one, other], faults=(drop("wire", 0.5),)).run(0.1)
+    assert 0.3 * one.count < len(other.arrived) < 0.7 * one.count

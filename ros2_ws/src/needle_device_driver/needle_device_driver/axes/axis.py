@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 
 
@@ -88,7 +89,9 @@ class AxisSnapshot:
 class Axis(abc.ABC):
     """One axis. Positions in m or rad, speeds in m/s or rad/s, never negative.
 
-    No order that moves waits until it is carried out; `poll` tells. Any may raise `AxisError`.
+    No order that moves waits until it is carried out; `poll` tells. `configure`, `home`, `reset`
+    and `close` are procedures: they take several frames, and do nothing before they are run. Any
+    may raise `AxisError`.
 
     Attributes
     ----------
@@ -99,7 +102,7 @@ class Axis(abc.ABC):
     actuated = True
 
     @abc.abstractmethod
-    def configure(self) -> None:
+    def configure(self) -> Procedure[None]:
         """Set the axis up; moves nothing."""
 
     @abc.abstractmethod
@@ -107,7 +110,7 @@ class Axis(abc.ABC):
         """Switch the axis on, its target being where it comes to rest, or off; moves nothing."""
 
     @abc.abstractmethod
-    def home(self, speed: float) -> None:
+    def home(self, speed: float) -> Procedure[None]:
         """Start to look for the home switch, at most at `speed`; position 0 is there.
 
         The axis is not homed from the order on until the switch is found.
@@ -122,7 +125,7 @@ class Axis(abc.ABC):
         """Stop as fast as the axis can and forget the target; `power` makes it ready again."""
 
     @abc.abstractmethod
-    def reset(self) -> None:
+    def reset(self) -> Procedure[None]:
         """Acknowledge a fault and wait for the axis' answer; moves nothing."""
 
     @abc.abstractmethod
@@ -130,5 +133,5 @@ class Axis(abc.ABC):
         """Return the newest reply; `now` is the steady time [s]. Sends and waits for nothing."""
 
     @abc.abstractmethod
-    def close(self) -> None:
+    def close(self) -> Procedure[None]:
         """Stop, switch off and let go of the link. May be called twice."""

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 
 
@@ -105,9 +106,23 @@ class AxisPair:
                 order(axis)
             except AxisError as error:
                 errors.append(error)
-        if errors:
-            raise AxisError("; ".join(map(str, errors)), errors[0].rule)
+        _raise_all(errors)
+
+    def each_in_turn(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[None]:
+        """Let both axes carry out an order, one after the other; raises as `each`."""
+        errors: list[AxisError] = []
+        for axis in (self.insertion, self.rotation):
+            try:
+                yield from order(axis)
+            except AxisError as error:
+                errors.append(error)
+        _raise_all(errors)
 
     def poll(self, now: float) -> PairSnapshot:
         """Return the newest replies; `now` is the steady time [s]."""
         return PairSnapshot(self.insertion.poll(now), self.rotation.poll(now))
+
+
+def _raise_all(errors: list[AxisError]) -> None:
+    if errors:
+        raise AxisError("; ".join(map(str, errors)), errors[0].rule)

@@ -29,8 +29,9 @@ from needle_device_driver.cia402.drive_upkeep import (
 )
 from needle_device_driver.cia402.homing_run import HomingRun, HomingStep
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.procedure import Procedure, Wait
 from needle_device_driver.rules import Rule
 
 # In cycles without an answer: a drive that is switched off at the end is given up.
@@ -50,7 +51,7 @@ class Cia402Axis(Axis):
         What errors call it.
     settings : DriveSettings
         The drive.
-    link : CanLink
+    link : FrameLink
         The bus, shared by all axes.
     period : float
         Of the SYNC [s].
@@ -68,7 +69,7 @@ class Cia402Axis(Axis):
     """
 
     def __init__(
-        self, name: str, settings: DriveSettings, link: CanLink, *, period: float, watchdog: float
+        self, name: str, settings: DriveSettings, link: FrameLink, *, period: float, watchdog: float
     ) -> None:
         self.name = name
         # As given, and with the units that the drive tells.
@@ -87,7 +88,7 @@ class Cia402Axis(Axis):
         self._opening = self._origin = self._zero = 0
         self._velocity = 0.0
 
-    def probe(self) -> None:
+    def probe(self) -> Procedure[None]:
         """Ask the drive whether it is there, from whatever state its node was left in.
 
         Raises
@@ -99,15 +100,15 @@ class Cia402Axis(Axis):
         with self._as_axis_error():
             # A stopped node answers to nothing else.
             self._link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
-            ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
+            yield from ObjectAccess(self._link, node).read(od.DEVICE_TYPE)
 
     # ---- orders -------------------------------------------------------------------------------
 
-    def configure(self) -> None:
+    def configure(self) -> Procedure[None]:
         """Open the link and set the drive up; moves nothing."""
         with self._as_axis_error():
             self._link.open()
-            self._set_up(survived=False)
+            yield from self._set_up(survived=False)
         self._configured = True
 
     def power(self, on: bool) -> None:
@@ -123,7 +124,7 @@ class Cia402Axis(Axis):
             self._machine.mode = Mode.CYCLIC_SYNCHRONOUS_POSITION
         self._machine.want(Goal.ON if on else Goal.OFF)
 
-    def home(self, speed: float) -> None:
+    def home(self, speed: float) -> Procedure[None]:
         """Begin to home; an axis that a hand moves takes where it is as 0."""
         self._refuse_fault()
         if not self.actuated:
@@ -132,8 +133,8 @@ class Cia402Axis(Axis):
             return
         self._homed = self._limits_due = False
         with self._as_axis_error():
-            write_limits(self._access, self._settings, homed=False)
-            write_homing(self._access, self._settings, speed)
+            yield from write_limits(self._access, self._settings, homed=False)
+            yield from write_homing(self._access, self._settings, speed)
         self._machine.mode = Mode.HOMING
         switches = NO_INPUTS not in self.missing_optional_objects
         self._homing = HomingRun(self._settings, speed, switches=switches)
@@ -173,20 +174,20 @@ class Cia402Axis(Axis):
         with self._as_axis_error():
             self._send_order()
 
-    def reset(self) -> None:
+    def reset(self) -> Procedure[None]:
         """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
         self._machine.want(Goal.OFF)
         self._homing = None
         with self._as_axis_error():
             self._link.open()
             self._link.other_master = ""
-            operational = await_operational(self._link, self.monitor, self._period)
+            operational = yield from await_operational(self._link, self.monitor, self._period)
             survived = operational and not self.monitor.rebooted
             if not survived or self._opening != self._link.openings:
-                self._set_up(survived=survived)
+                yield from self._set_up(survived=survived)
             self.monitor.emergency = None
-            reset_fault(self._link, self._settings)
-            self._refresh()
+            yield from reset_fault(self._link, self._settings)
+            yield from self._refresh()
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest reply."""
@@ -213,7 +214,7 @@ class Cia402Axis(Axis):
             origin=self._origin,
         )
 
-    def close(self) -> None:
+    def close(self) -> Procedure[None]:
         """Stop, switch off and release the drive's watchdog; the link is its owner's to close.
 
         Raises
@@ -227,9 +228,9 @@ class Cia402Axis(Axis):
         try:
             with self._as_axis_error():
                 self._machine.want(Goal.OFF)
-                if not self._switch_off_now():
+                if not (yield from self._switch_off_now()):
                     raise DriveError("does not say that it is off; its watchdog will switch it off")
-                disarm_watchdog(self._link, self._settings)
+                yield from disarm_watchdog(self._link, self._settings)
         finally:
             self._configured = False
 
@@ -242,7 +243,7 @@ class Cia402Axis(Axis):
             return False
         return self._machine.switching or self._homing is not None or self._limits_due
 
-    def transmit(self) -> None:
+    def transmit(self) -> Procedure[None]:
         """Send this cycle's command and set-point.
 
         Raises
@@ -254,7 +255,7 @@ class Cia402Axis(Axis):
             return
         if self._limits_due and self._machine.state not in POWERED:
             # Before the SYNC: a drive may take its time, and is then judged by a fresh answer.
-            self._write_limits()
+            yield from self._write_limits()
         self._send_order()
         self._link.send(
             od.SET_POINT.function_code + self._settings.node_id,
@@ -291,9 +292,9 @@ class Cia402Axis(Axis):
             od.COMMAND.function_code + self._settings.node_id, od.COMMAND.pack(word, mode)
         )
 
-    def _write_limits(self) -> None:
+    def _write_limits(self) -> Procedure[None]:
         try:
-            write_limits(self._access, self._settings, homed=True)
+            yield from write_limits(self._access, self._settings, homed=True)
         except LinkError:
             # The link's loss has its own name.
             return
@@ -342,41 +343,41 @@ class Cia402Axis(Axis):
 
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 
-    def _set_up(self, *, survived: bool) -> None:
+    def _set_up(self, *, survived: bool) -> Procedure[None]:
         if not survived:
             self._homed = False
             self._origin += 1
         self.monitor.begin_set_up()
-        self._settings, self.missing_optional_objects = set_up(
+        self._settings, self.missing_optional_objects = yield from set_up(
             self._link, self.monitor, self._given, period=self._period, homed=self._homed
         )
         self._limits_due = False
-        await_start(self._link, self.monitor, self._settings, self._period)
-        arm_watchdog(self._link, self._settings, self._watchdog)
+        yield from await_start(self._link, self.monitor, self._settings, self._period)
+        yield from arm_watchdog(self._link, self._settings, self._watchdog)
         if self.monitor.rebooted:
             # What it was told before is gone.
             raise DriveError(f"node {self._settings.node_id} started anew while it was set up")
         self.monitor.end_set_up()
         self._opening = self._link.openings
-        self._refresh()
+        yield from self._refresh()
 
-    def _refresh(self) -> None:
+    def _refresh(self) -> Procedure[None]:
         """Ask for what the next SYNC would bring, and forget what was before."""
         access = self._access
         self.monitor.take(
-            access.read(od.STATUSWORD),
-            access.read(od.MODE_DISPLAY),
+            (yield from access.read(od.STATUSWORD)),
+            (yield from access.read(od.MODE_DISPLAY)),
             self._machine.at.inputs,
-            access.read(od.POSITION_ACTUAL),
+            (yield from access.read(od.POSITION_ACTUAL)),
         )
         self._machine.begin_anew(self.monitor.feedback)
         self._speed.forget()
         self._velocity = 0.0
         if self._machine.state in FAULTS:
             # A fault from before has sent its message to nobody.
-            self.monitor.emergency = access.ask(od.ERROR_CODE) or None
+            self.monitor.emergency = (yield from access.ask(od.ERROR_CODE)) or None
 
-    def _switch_off_now(self) -> bool:
+    def _switch_off_now(self) -> Procedure[bool]:
         """Run cycles of its own until the drive is off: nobody else will. Return whether it is."""
         if not self.actuated:
             return True
@@ -386,10 +387,10 @@ class Cia402Axis(Axis):
             self._send_order()
             self.monitor.expect_answer()
             self._link.send(od.SYNC)
-            with self._link.arrival:
-                answered = self._link.arrival.wait_for(self.monitor.answered, self._period)
-                # Not as fast as the bus goes: a drive has this cycle's length.
-                self._link.arrival.wait_for(lambda: bool(self._link.lost), self._period / 2.0)
+            yield Wait(self.monitor.answered, self._period)
+            answered = self.monitor.answered()
+            # Not as fast as the bus goes: a drive has this cycle's length.
+            yield Wait(lambda: bool(self._link.lost), self._period / 2.0)
             self.update()
             silent = 0 if answered else silent + 1
             if silent > _SILENT:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
+from needle_common.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
-from needle_device_driver.link.can_link import CanLink, LinkError
+from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.link.objects import SYNC
+from needle_device_driver.procedure import Procedure, Wait
 
 # How long a pause for answers that are late lasts, in cycles without any, and each of them [s].
 _PAUSE = 2
@@ -22,7 +24,7 @@ class DriveCycle:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus.
     axes : sequence of Cia402Axis
         All its drives.
@@ -33,13 +35,14 @@ class DriveCycle:
         How many SYNCs a drive did not answer in their cycle.
     """
 
-    def __init__(self, link: CanLink, axes: Sequence[Cia402Axis]) -> None:
+    def __init__(self, link: FrameLink, axes: Sequence[Cia402Axis]) -> None:
         self._link = link
         self._axes = tuple(axes)
         self.unanswered = 0
         self._outstanding = 0
         self._paused = 0
         self._looked_at = math.inf
+        self._told_unanswered = 0
 
     @property
     def missing_optional_objects(self) -> tuple[str, ...]:
@@ -55,12 +58,41 @@ class DriveCycle:
         """Tell whether a drive is on its way to where it was ordered, apart from set-points."""
         return any(axis.needs_cycles for axis in self._axes)
 
-    def probe(self) -> str:
+    def health(self, waiting: str, more: Mapping[str, str] | None = None) -> Diagnostic:
+        """Return the health of the bus since the last call.
+
+        Parameters
+        ----------
+        waiting : str
+            What is said while the link is closed.
+        more : mapping, optional
+            Further values.
+        """
+        link = self._link
+        values = {
+            "link": str(link.settings),
+            "frames_sent": str(link.frames_sent),
+            "frames_received": str(link.frames_received),
+            "bus_errors": str(link.errors),
+            **(more or {}),
+            "unanswered_syncs": str(self.unanswered),
+        }
+        count, self._told_unanswered = self.unanswered - self._told_unanswered, self.unanswered
+        level, message = Level.OK, "connected"
+        if link.lost:
+            level, message = Level.ERROR, link.lost
+        elif not link.is_open:
+            level, message = Level.WARN, waiting
+        elif count:
+            level, message = Level.WARN, f"{count} SYNCs were not answered in their cycle"
+        return Diagnostic(level, message, values)
+
+    def probe(self) -> Procedure[str]:
         """Open the link and ask every drive who it is; return why that is not possible."""
         try:
             self._link.open()
             for axis in self._axes:
-                axis.probe()
+                yield from axis.probe()
         except (AxisError, LinkError) as error:
             return str(error)
         return ""
@@ -74,7 +106,7 @@ class DriveCycle:
             except LinkError:
                 return
 
-    def hear_first(self, now: float) -> None:
+    def hear_first(self, now: float) -> Procedure[None]:
         """After a hold-up of this process, hear every drive anew before it is judged.
 
         Parameters
@@ -85,17 +117,16 @@ class DriveCycle:
         before, self._looked_at = self._looked_at, now
         if now - before <= _HELD_UP:
             return
-        with self._link.arrival:
-            self._link.arrival.wait_for(
-                lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
-            )
+        yield Wait(
+            lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
+        )
 
     def collect(self) -> None:
         """Take the answers that came too late for the cycle before."""
         for axis in self._axes:
             axis.update()
 
-    def exchange(self, wait: float) -> None:
+    def exchange(self, wait: float) -> Procedure[None]:
         """Run one cycle.
 
         Parameters
@@ -108,7 +139,7 @@ class DriveCycle:
         try:
             self._link.beat()
             for axis in self._axes:
-                axis.transmit()
+                yield from axis.transmit()
             if self._must_pause():
                 wait = min(wait, _PAUSE_WAIT)
             else:
@@ -117,9 +148,8 @@ class DriveCycle:
                 self._link.send(SYNC)
         except LinkError:
             return
-        with self._link.arrival:
-            self._link.arrival.wait_for(lambda: bool(self._link.lost) or self._answered(), wait)
-            self.unanswered += not self._answered()
+        yield Wait(lambda: bool(self._link.lost) or self._answered(), wait)
+        self.unanswered += not self._answered()
         for axis in self._axes:
             axis.update()
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import (
     EMCY,
     HEARTBEAT,
@@ -18,6 +18,7 @@ from needle_device_driver.link.objects import (
     STATUS,
     STATUS_WITHOUT_INPUTS,
 )
+from needle_device_driver.procedure import Procedure, Wait
 
 _ANSWER = (STATUS.function_code, POSITION.function_code)
 # One answer may be lost; with more missing, what comes may be an answer to a SYNC of long ago.
@@ -72,13 +73,13 @@ class DriveMonitor:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus.
     node_id : int
         Whose frames.
     """
 
-    def __init__(self, link: CanLink, node_id: int) -> None:
+    def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
         self._lock = link.arrival
         self._number = 0
@@ -195,10 +196,10 @@ class DriveMonitor:
             self._fresh_time = self._link.clock()
             self._taken = self._all_syncs, self._fresh_time
 
-    def await_operational(self, before: int, timeout: float) -> bool:
+    def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
         """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
+        yield Wait(lambda: self._heartbeats > before, timeout)
         with self._lock:
-            self._lock.wait_for(lambda: self._heartbeats > before, timeout)
             return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
     def _awaited(self) -> bool:

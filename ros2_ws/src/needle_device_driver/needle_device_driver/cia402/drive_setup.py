@@ -15,8 +15,9 @@ from needle_device_driver.cia402.drive_settings import HERE, DriveSettings
 from needle_device_driver.cia402.drive_units import read_units
 from needle_device_driver.cia402.pdo_setup import map_pdo, silence_unused
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveError, DriveRefusalError, ObjectAccess
+from needle_device_driver.procedure import Procedure
 
 # Milliseconds between a drive's heartbeats: well inside the reply age limit.
 PRODUCER_HEARTBEAT_MS = 30
@@ -36,13 +37,13 @@ _NO_FOLLOWING_ERROR = (
 
 
 def set_up(
-    link: CanLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
-) -> tuple[DriveSettings, tuple[str, ...]]:
+    link: FrameLink, monitor: DriveMonitor, settings: DriveSettings, *, period: float, homed: bool
+) -> Procedure[tuple[DriveSettings, tuple[str, ...]]]:
     """Set a drive up from whatever state it is in; moves nothing, switches a powered one off.
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     monitor : DriveMonitor
         The drive's; a start that it hears of once the drive has answered voids the set-up.
@@ -70,40 +71,42 @@ def set_up(
     node = settings.node_id
     access = ObjectAccess(link, node)
     link.send(od.NMT, bytes([od.NMT_PRE_OPERATIONAL, node]))
-    profile = access.read(od.DEVICE_TYPE) & 0xFFFF
+    profile = (yield from access.read(od.DEVICE_TYPE)) & 0xFFFF
     monitor.forget_start()
     if profile != od.CIA402:
         raise DriveError(f"node {node} is of device profile {profile}, wanted {od.CIA402}")
     # Not while this set-up keeps the loop from its heartbeat.
-    access.write(od.CONSUMER_HEARTBEAT, 0)
-    settings, assumed = read_units(access, settings)
+    yield from access.write(od.CONSUMER_HEARTBEAT, 0)
+    settings, assumed = yield from read_units(access, settings)
     missing = [assumed] if assumed else []
     if settings.actuated:
-        missing += _set_up_motion(link, access, settings, period)
-        write_limits(access, settings, homed=homed)
-        map_pdo(access, node, od.COMMAND)
-        map_pdo(access, node, od.SET_POINT)
-    missing += _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, NO_INPUTS)
+        missing += yield from _set_up_motion(link, access, settings, period)
+        yield from write_limits(access, settings, homed=homed)
+        yield from map_pdo(access, node, od.COMMAND)
+        yield from map_pdo(access, node, od.SET_POINT)
+    missing += yield from _map_full(access, node, od.STATUS, od.STATUS_WITHOUT_INPUTS, NO_INPUTS)
     if settings.actuated:
-        missing += _map_full(access, node, od.POSITION, od.POSITION_ALONE, _NO_FOLLOWING_ERROR)
+        missing += yield from _map_full(
+            access, node, od.POSITION, od.POSITION_ALONE, _NO_FOLLOWING_ERROR
+        )
     else:
-        map_pdo(access, node, od.POSITION_ALONE)
-    silence_unused(access)
-    access.offer(od.CYCLE_PERIOD, round(period * 1e6))
-    _write_heartbeat(access)
+        yield from map_pdo(access, node, od.POSITION_ALONE)
+    yield from silence_unused(access)
+    yield from access.offer(od.CYCLE_PERIOD, round(period * 1e6))
+    yield from _write_heartbeat(access)
     link.send(od.NMT, bytes([od.NMT_START, node]))
     return settings, tuple(missing)
 
 
-def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> None:
+def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) -> Procedure[None]:
     """Set the drive's software limits: none while un-homed, for they count from home."""
     if homed:
-        _write_limits(access, *settings.limits_counts)
+        yield from _write_limits(access, *settings.limits_counts)
         return
     refusals = []
     for lower, upper in od.NO_LIMITS:
         try:
-            _write_limits(access, lower, upper)
+            yield from _write_limits(access, lower, upper)
         except DriveRefusalError as error:
             refusals.append(error)
         else:
@@ -111,30 +114,32 @@ def write_limits(access: ObjectAccess, settings: DriveSettings, *, homed: bool) 
     raise refusals[0]
 
 
-def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> None:
+def write_homing(access: ObjectAccess, settings: DriveSettings, speed: float) -> Procedure[None]:
     """Set the speeds of a homing; `speed` in unit/s, at least one of the drive's own units."""
     if speed * settings.counts_per_unit < settings.speed_unit:
         raise DriveError(f"homing at {speed:g}/s is less than one of the drive's units of speed")
-    access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
+    yield from access.write(od.HOMING_SPEED_SWITCH, settings.magnitude(speed, settings.speed_unit))
     # Slow on the edge that counts.
-    access.write(od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0, settings.speed_unit))
+    yield from access.write(
+        od.HOMING_SPEED_ZERO, settings.magnitude(speed / 4.0, settings.speed_unit)
+    )
 
 
-def _write_limits(access: ObjectAccess, lower: int, upper: int) -> None:
-    access.write_checked(od.LOWER_LIMIT, lower, variable=True)
-    access.write_checked(od.UPPER_LIMIT, upper, variable=True)
+def _write_limits(access: ObjectAccess, lower: int, upper: int) -> Procedure[None]:
+    yield from access.write_checked(od.LOWER_LIMIT, lower, variable=True)
+    yield from access.write_checked(od.UPPER_LIMIT, upper, variable=True)
 
 
 def _set_up_motion(
-    link: CanLink, access: ObjectAccess, settings: DriveSettings, period: float
-) -> list[str]:
-    _switch_off(link, access, settings)
-    _check_modes(link, access, settings.node_id)
+    link: FrameLink, access: ObjectAccess, settings: DriveSettings, period: float
+) -> Procedure[list[str]]:
+    yield from _switch_off(link, access, settings)
+    yield from _check_modes(link, access, settings.node_id)
     # Quick stop on its ramp, and stay: no set-point from before moves the axis afterwards.
-    access.write_checked(od.QUICK_STOP_OPTION, 6)
+    yield from access.write_checked(od.QUICK_STOP_OPTION, 6)
     # The node keeps its state: whether it exchanges process data tells a reboot.
-    access.offer(od.ERROR_BEHAVIOUR, 1)
-    _write_homing_method(access, settings.homing_method)
+    yield from access.offer(od.ERROR_BEHAVIOUR, 1)
+    yield from _write_homing_method(access, settings.homing_method)
     window = settings.magnitude(settings.following_error)
     speed = settings.magnitude(settings.speed, settings.speed_unit)
     ramp = settings.magnitude(settings.acceleration, settings.ramp_unit)
@@ -162,40 +167,42 @@ def _set_up_motion(
     if settings.max_torque > 0.0:
         torque = round(settings.max_torque * 1e3)
         wanted.append((od.MAX_TORQUE, torque, (torque // 2 + 1, 2 * torque)))
-    missing = (_set(access, entry, value, taken) for entry, value, taken in wanted)
+    missing = []
+    for entry, value, taken in wanted:
+        missing.append((yield from _set(access, entry, value, taken)))
     return [text for text in missing if text]
 
 
-def _write_heartbeat(access: ObjectAccess) -> None:
+def _write_heartbeat(access: ObjectAccess) -> Procedure[None]:
     try:
-        access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
+        yield from access.write(od.PRODUCER_HEARTBEAT, PRODUCER_HEARTBEAT_MS)
     except DriveRefusalError as error:
         if error.object_is_missing:
             raise
-        if not 0 < access.read(od.PRODUCER_HEARTBEAT) <= _SLOWEST_HEARTBEAT_MS:
+        if not 0 < (yield from access.read(od.PRODUCER_HEARTBEAT)) <= _SLOWEST_HEARTBEAT_MS:
             raise
 
 
-def _check_modes(link: CanLink, access: ObjectAccess, node: int) -> None:
+def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[None]:
     """Refuse a drive that lacks a mode; the drive is off.
 
     Without 0x6502 each mode is tried. Cyclic synchronous position is also tried where 0x6502 does
     not list it: an EPOS4 supports it all the same.
     """
-    listed = access.ask(od.SUPPORTED_MODES)
+    listed = yield from access.ask(od.SUPPORTED_MODES)
     if listed is not None and not listed & SUPPORTS_HOMING:
         raise DriveError(f"node {node} has no homing mode (0x6502 = 0x{listed:08X})")
     if listed is None:
-        _try_mode(link, access, node, Mode.HOMING)
+        yield from _try_mode(link, access, node, Mode.HOMING)
     if listed is None or not listed & SUPPORTS_CYCLIC_POSITION:
-        _try_mode(link, access, node, Mode.CYCLIC_SYNCHRONOUS_POSITION)
+        yield from _try_mode(link, access, node, Mode.CYCLIC_SYNCHRONOUS_POSITION)
 
 
-def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> None:
+def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> Procedure[None]:
     """Refuse a drive that does not take a mode, or does not show it."""
-    access.write(od.MODE_OF_OPERATION, mode)
+    yield from access.write(od.MODE_OF_OPERATION, mode)
     until = link.clock() + _MODE_WAIT
-    while (shown := access.read(od.MODE_DISPLAY)) != mode:
+    while (shown := (yield from access.read(od.MODE_DISPLAY))) != mode:
         if link.clock() > until:
             raise DriveError(
                 f"node {node} has no {mode.name.lower().replace('_', ' ')} mode "
@@ -203,13 +210,15 @@ def _try_mode(link: CanLink, access: ObjectAccess, node: int, mode: Mode) -> Non
             )
 
 
-def _set(access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, int] | None) -> str:
+def _set(
+    access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, int] | None
+) -> Procedure[str]:
     """Write an entry; return what the drive lacks. It may refuse an entry that no rule needs."""
     try:
         if taken is None:
-            access.write(entry, value)
+            yield from access.write(entry, value)
         else:
-            access.write_checked(entry, value, taken=taken)
+            yield from access.write_checked(entry, value, taken=taken)
     except DriveRefusalError as error:
         if error.object_is_missing:
             return _LEFT_OUT.format(entry)
@@ -219,39 +228,39 @@ def _set(access: ObjectAccess, entry: od.Entry, value: int, taken: tuple[int, in
     return ""
 
 
-def _switch_off(link: CanLink, access: ObjectAccess, settings: DriveSettings) -> None:
+def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) -> Procedure[None]:
     """Switch off what another program left on: a powered drive takes no settings."""
-    if drive_state(access.read(od.STATUSWORD)) not in POWERED:
+    if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
         return
-    access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
+    yield from access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
     until = link.clock() + _SWITCH_OFF_WAIT
-    while drive_state(access.read(od.STATUSWORD)) in POWERED:
+    while drive_state((yield from access.read(od.STATUSWORD))) in POWERED:
         if link.clock() > until:
             raise DriveError(f"node {settings.node_id} does not switch off")
 
 
-def _write_homing_method(access: ObjectAccess, method: int) -> None:
+def _write_homing_method(access: ObjectAccess, method: int) -> Procedure[None]:
     try:
-        access.write(od.HOMING_METHOD, method)
+        yield from access.write(od.HOMING_METHOD, method)
     except DriveRefusalError:
         if method not in HERE:
             raise
         # Two numbers for "where it stands": 35 is the older edition's.
         for other in HERE:
             if other != method:
-                access.write(od.HOMING_METHOD, other)
+                yield from access.write(od.HOMING_METHOD, other)
 
 
 def _map_full(
     access: ObjectAccess, node: int, full: od.Pdo, without: od.Pdo, missing: str
-) -> list[str]:
+) -> Procedure[list[str]]:
     """Map a PDO with its last entry where the drive can; return what it lacks."""
     try:
-        if access.ask(full.entries[-1]) is not None:
-            map_pdo(access, node, full)
+        if (yield from access.ask(full.entries[-1])) is not None:
+            yield from map_pdo(access, node, full)
             return []
     except DriveRefusalError:
         # Either the entry cannot be mapped, or the next attempt tells what else it is.
         pass
-    map_pdo(access, node, without)
+    yield from map_pdo(access, node, without)
     return [missing]

@@ -7,6 +7,7 @@ import dataclasses
 from needle_device_driver.cia402.drive_settings import INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.procedure import Procedure
 
 # Codes of numerators and denominators. A quantity without dimension is in counts.
 _NUMERATORS = {0x00: "counts", 0x01: "m", 0x10: "rad", 0x41: "deg", 0xB4: "turns", 0xB5: "counts"}
@@ -20,7 +21,9 @@ _TAKEN = {
 }
 
 
-def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSettings, str]:
+def read_units(
+    access: ObjectAccess, settings: DriveSettings
+) -> Procedure[tuple[DriveSettings, str]]:
     """Return the settings of a drive with the units that it tells in 0x60A9 and 0x60AA.
 
     Parameters
@@ -45,12 +48,13 @@ def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSett
     LinkError
         If the link is lost.
     """
-    _counts_in(access, settings, od.POSITION_UNIT)
+    yield from _counts_in(access, settings, od.POSITION_UNIT)
     if not settings.actuated:
         return settings, ""
-    speed = _counts_in(access, settings, od.SPEED_UNIT)
-    ramp = _counts_in(access, settings, od.RAMP_UNIT)
-    if speed is None and (factor := _ratio(access, od.SPEED_FACTOR)) not in (None, 1.0):
+    speed = yield from _counts_in(access, settings, od.SPEED_UNIT)
+    ramp = yield from _counts_in(access, settings, od.RAMP_UNIT)
+    factor = (yield from _ratio(access, od.SPEED_FACTOR)) if speed is None else None
+    if factor not in (None, 1.0):
         raise DriveError(f"the drive scales speeds by {factor:g} (0x6096), wanted counts/s")
     ramps = "counts/s^2" if speed is None else "the unit of its speeds per second"
     untold = ["counts/s (0x60A9)"] * (speed is None) + [f"{ramps} (0x60AA)"] * (ramp is None)
@@ -60,16 +64,20 @@ def read_units(access: ObjectAccess, settings: DriveSettings) -> tuple[DriveSett
     )
     speed = speed or 1.0
     # The bound of a homing to an index pulse includes one turn.
-    turn = _counts_per_turn(access, settings) if settings.homing_method in INDEX_PULSE else 0.0
+    turn = 0.0
+    if settings.homing_method in INDEX_PULSE:
+        turn = yield from _counts_per_turn(access, settings)
     settings = dataclasses.replace(
         settings, counts_per_turn=turn, speed_unit=speed, ramp_unit=ramp or speed
     )
     return settings, assumed if untold else ""
 
 
-def _counts_in(access: ObjectAccess, settings: DriveSettings, entry: od.Entry) -> float | None:
+def _counts_in(
+    access: ObjectAccess, settings: DriveSettings, entry: od.Entry
+) -> Procedure[float | None]:
     """Return the counts, per second or its square, in one unit; None: the drive does not tell."""
-    code = access.ask(entry)
+    code = yield from access.ask(entry)
     if not code:
         return None
     # The upper byte is a power of ten, with a sign.
@@ -80,26 +88,31 @@ def _counts_in(access: ObjectAccess, settings: DriveSettings, entry: od.Entry) -
     )
     what, *wanted = _TAKEN[entry]
     turns = unit in _TURNED.values()
-    turn = _counts_per_turn(access, settings) if turns else 60.0
+    turn = (yield from _counts_per_turn(access, settings)) if turns else 60.0
     wanted = wanted[: 1 + bool(turn)]
     if unit not in wanted or (power and entry is od.POSITION_UNIT):
         told = (f"10^{power} " if power else "") + f"{unit} (0x{entry.index:04X} = 0x{code:08X})"
         hint = "; *_counts_per_turn converts rpm without 0x608F" if turns else ""
         raise DriveError(f"the drive counts {what} in {told}, wanted {' or '.join(wanted)}{hint}")
-    feed = _ratio(access, od.FEED_CONSTANT) if turns and not settings.counts_per_turn else None
+    feed = None
+    if turns and not settings.counts_per_turn:
+        feed = yield from _ratio(access, od.FEED_CONSTANT)
     if feed and round(feed / turn, 6) != 1.0:
         told = f"{turn:g} (0x608F, 0x6091) and {feed:g} (0x6092)"
         raise DriveError(f"the drive tells {told} counts in a turn: *_counts_per_turn says which")
     return 10.0**power * turn / 60.0
 
 
-def _counts_per_turn(access: ObjectAccess, settings: DriveSettings) -> float:
+def _counts_per_turn(access: ObjectAccess, settings: DriveSettings) -> Procedure[float]:
     """Return the counts in a turn of the drive's shaft; 0: not known."""
-    return settings.counts_per_turn or (
-        (_ratio(access, od.ENCODER_RESOLUTION) or 0.0) * (_ratio(access, od.GEAR_RATIO) or 1.0)
-    )
+    if settings.counts_per_turn:
+        return settings.counts_per_turn
+    resolution = yield from _ratio(access, od.ENCODER_RESOLUTION)
+    gear = yield from _ratio(access, od.GEAR_RATIO)
+    return (resolution or 0.0) * (gear or 1.0)
 
 
-def _ratio(access: ObjectAccess, entries: tuple[od.Entry, od.Entry]) -> float | None:
-    above, below = map(access.ask, entries)
+def _ratio(access: ObjectAccess, entries: tuple[od.Entry, od.Entry]) -> Procedure[float | None]:
+    above = yield from access.ask(entries[0])
+    below = yield from access.ask(entries[1])
     return above / below if above and below else None

@@ -6,9 +6,10 @@ from needle_device_driver.cia402.cia402 import FAULTS, DriveCommand, Mode, drive
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
-from needle_device_driver.link.can_link import CanLink
 from needle_device_driver.link.emergency import describe_error
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
+from needle_device_driver.procedure import Procedure
 
 # In seconds.
 _HEARTBEAT_WAIT = 0.3
@@ -17,22 +18,22 @@ _FAULT_RESET_WAIT = 1.0
 
 
 def await_operational(
-    link: CanLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
-) -> bool:
+    link: FrameLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
+) -> Procedure[bool]:
     """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
     until = link.clock() + timeout
     while link.clock() < until:
         # It may come at once.
         before = monitor.heartbeats
         link.beat()
-        if monitor.await_operational(before, period):
+        if (yield from monitor.await_operational(before, period)):
             return True
     return False
 
 
 def await_start(
-    link: CanLink, monitor: DriveMonitor, settings: DriveSettings, period: float
-) -> None:
+    link: FrameLink, monitor: DriveMonitor, settings: DriveSettings, period: float
+) -> Procedure[None]:
     """Wait until a drive that was set up exchanges process data.
 
     Raises
@@ -42,29 +43,29 @@ def await_start(
     LinkError
         If the link is lost.
     """
-    if not await_operational(link, monitor, period, _START_WAIT):
+    if not (yield from await_operational(link, monitor, period, _START_WAIT)):
         what = "did not become operational" if monitor.heartbeats else "sends no heartbeat (0x1017)"
         raise DriveError(f"node {settings.node_id} {what}")
 
 
-def arm_watchdog(link: CanLink, settings: DriveSettings, watchdog: float) -> None:
+def arm_watchdog(link: FrameLink, settings: DriveSettings, watchdog: float) -> Procedure[None]:
     """Let the drive stop without the computer's heartbeat for `watchdog` [s]; raises as `set_up`.
 
     It is the last step of a set-up: from here on the loop must send its heartbeat.
     """
     if settings.actuated:
-        ObjectAccess(link, settings.node_id).write_checked(
+        yield from ObjectAccess(link, settings.node_id).write_checked(
             od.CONSUMER_HEARTBEAT, od.MASTER_NODE_ID << 16 | round(watchdog * 1e3)
         )
 
 
-def disarm_watchdog(link: CanLink, settings: DriveSettings) -> None:
+def disarm_watchdog(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     """Let the drive go without the computer, which takes its leave; raises as `set_up`."""
     if settings.actuated:
-        ObjectAccess(link, settings.node_id).write(od.CONSUMER_HEARTBEAT, 0)
+        yield from ObjectAccess(link, settings.node_id).write(od.CONSUMER_HEARTBEAT, 0)
 
 
-def reset_fault(link: CanLink, settings: DriveSettings) -> None:
+def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     """Acknowledge a drive's fault and wait until it is gone; moves nothing.
 
     The drive is operational: its controlword is the process data's, and many drives no longer take
@@ -72,7 +73,7 @@ def reset_fault(link: CanLink, settings: DriveSettings) -> None:
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     settings : DriveSettings
         The drive.
@@ -86,22 +87,22 @@ def reset_fault(link: CanLink, settings: DriveSettings) -> None:
     """
     access = ObjectAccess(link, settings.node_id)
 
-    def order(command: DriveCommand) -> None:
+    def order(command: DriveCommand) -> Procedure[None]:
         if settings.actuated:
             data = od.COMMAND.pack(command, Mode.CYCLIC_SYNCHRONOUS_POSITION)
             link.send(od.COMMAND.function_code + settings.node_id, data)
         else:
-            access.write(od.CONTROLWORD, command)
+            yield from access.write(od.CONTROLWORD, command)
 
-    if drive_state(access.read(od.STATUSWORD)) not in FAULTS:
+    if drive_state((yield from access.read(od.STATUSWORD))) not in FAULTS:
         return
     # The rising edge counts.
-    order(DriveCommand.DISABLE_VOLTAGE)
-    order(DriveCommand.FAULT_RESET)
+    yield from order(DriveCommand.DISABLE_VOLTAGE)
+    yield from order(DriveCommand.FAULT_RESET)
     until = link.clock() + _FAULT_RESET_WAIT
-    while drive_state(access.read(od.STATUSWORD)) in FAULTS:
+    while drive_state((yield from access.read(od.STATUSWORD))) in FAULTS:
         if link.clock() > until:
-            code = access.ask(od.ERROR_CODE)
+            code = yield from access.ask(od.ERROR_CODE)
             why = "" if code is None else f": {describe_error(code)}"
             raise DriveError(f"the drive does not leave its fault{why}")
-    order(DriveCommand.DISABLE_VOLTAGE)
+    yield from order(DriveCommand.DISABLE_VOLTAGE)

@@ -3,94 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import os
 import threading
 from collections.abc import Callable
-from typing import Any
 
 import can
-import canopen
 
-from needle_common.errors import UserError
-from needle_device_driver.link.objects import HEARTBEAT, MASTER_NODE_ID, NMT, NMT_OPERATIONAL, SYNC
-from needle_device_driver.link.sdo_client import PatientSdoClient
+from needle_device_driver.link.frame_link import FrameLink, LinkError
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 from needle_device_driver.link.socketcand_bus import SocketcandBus
+from needle_device_driver.procedure import Procedure, T, run
 
-LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 _RECEIVE_WAIT = 0.05
 _JOIN_WAIT = 1.0
 # An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
 _SILENCE = 0.4
-_HEARTBEAT_PERIOD = 0.02
-
-# What only a master sends, whom an adapter does not let hear itself.
-_OF_MASTERS = {
-    NMT: "NMT commands",
-    SYNC: "SYNC",
-    HEARTBEAT + MASTER_NODE_ID: f"the heartbeat of node {MASTER_NODE_ID}, the computer's own",
-}
-
-Callback = Callable[[bytes, float], None]
-
-
-class LinkError(Exception):
-    """The link cannot be opened or is lost; the text says which and why."""
-
-
-@dataclasses.dataclass(frozen=True)
-class LinkSettings:
-    """Kind of the adapter, and where it is.
-
-    Attributes
-    ----------
-    kind : str
-        `slcan` (serial adapter or pseudo-terminal), `socketcan` (Linux interface), `socketcand`
-        (a remote one over TCP) or `virtual` (inside this process: tests).
-    channel : str
-        Device file or interface name.
-    bitrate : int
-        Of the CAN bus [bit/s]; slcan only, the others are set up outside.
-    tty_baudrate : int
-        Of the serial port [bit/s]; slcan only.
-    host : str
-        socketcand only.
-    port : int
-        socketcand only.
-    write_timeout : float
-        How long a frame may wait for room [s]; slcan and socketcand only.
-    """
-
-    kind: str
-    channel: str
-    bitrate: int = 500_000
-    tty_baudrate: int = 115_200
-    host: str = "localhost"
-    port: int = 29536
-    write_timeout: float = 0.05
-
-    def __post_init__(self) -> None:
-        """Refuse what names no link.
-
-        Raises
-        ------
-        UserError
-            A kind that does not exist, no channel, or a bitrate that slcan does not have.
-        """
-        if self.kind not in LINKS:
-            raise UserError(f"link = {self.kind!r} is not one of {', '.join(LINKS)}")
-        if not self.channel:
-            raise UserError(f"channel is empty: name the {self.kind} device or interface")
-        if self.kind == "slcan" and self.bitrate not in SlcanBus._BITRATES:
-            known = ", ".join(str(rate) for rate in sorted(SlcanBus._BITRATES))
-            raise UserError(f"bitrate = {self.bitrate} bit/s: slcan has {known}")
-
-    def __str__(self) -> str:
-        """Return what messages call the link."""
-        if self.kind == "socketcand":
-            return f"socketcand {self.host}:{self.port} {self.channel}"
-        return f"{self.kind} {self.channel}"
 
 
 def open_bus(settings: LinkSettings) -> can.BusABC:
@@ -129,22 +57,11 @@ def _plainly(error: Exception) -> str:
     return str(error).partition("\n")[0]
 
 
-class _Network(canopen.Network):
-    """canopen's network, sending through the link that watches over the adapter."""
+class CanLink(FrameLink):
+    """A CAN bus behind an adapter.
 
-    def __init__(self, link: CanLink) -> None:
-        super().__init__()
-        self._link = link
-
-    def send_message(self, can_id: int, data: Any, remote: bool = False) -> None:
-        self._link.send(can_id, bytes(data))
-
-
-class CanLink:
-    """One CAN bus, to be opened, lost and opened again.
-
-    Frames are received in a thread of their own, so that their arrival has its true time; all
-    sending is the caller's, in the control loop: a loop that hangs sends nothing.
+    Frames are received in a thread of their own, so that their arrival has its true time; a loop
+    that hangs sends nothing.
 
     Parameters
     ----------
@@ -154,13 +71,6 @@ class CanLink:
         Steady time [s].
     open_bus : callable
         Opens the adapter.
-
-    Attributes
-    ----------
-    lost : str
-        How the link was lost; empty: it is not.
-    other_master : str
-        What another master was heard to send; empty: nobody's.
     """
 
     def __init__(
@@ -169,21 +79,10 @@ class CanLink:
         clock: Callable[[], float],
         open_bus: Callable[[LinkSettings], can.BusABC] = open_bus,
     ) -> None:
-        self.settings = settings
-        self.clock = clock
-        self.arrival = threading.Condition()
-        self.lost = ""
-        self.other_master = ""
-        self.openings = 0
-        self.frames_sent = 0
-        self.frames_received = 0
-        self.error_frames = 0
+        super().__init__(settings, clock)
         self._open_bus = open_bus
         self._bus: can.BusABC | None = None
-        self._network: canopen.Network | None = None
         self._thread: threading.Thread | None = None
-        self._callbacks: dict[int, list[Callback]] = {}
-        self._sdo: dict[int, PatientSdoClient] = {}
         self._heard_at = 0.0
 
     @property
@@ -219,14 +118,10 @@ class CanLink:
             return
         self.close()
         bus = self._open_bus(self.settings)
-        # canopen's network does not outlive a lost adapter: each opening has a new one.
-        self._network = _Network(self)
-        self._sdo = {}
+        self._note_opening()
         self._bus = bus
-        self.lost = self.other_master = ""
         self._heard_at = self.clock()
-        self.openings += 1
-        self._begin_to_receive(bus, self._network)
+        self._begin_to_receive(bus)
 
     def close(self) -> None:
         """Let go of the adapter. May be called twice."""
@@ -239,10 +134,6 @@ class CanLink:
             with contextlib.suppress(can.CanError, OSError):
                 bus.shutdown()
             _close_port(bus)
-
-    def subscribe(self, cob_id: int, callback: Callback) -> None:
-        """Call `callback(data, time)` in the receiving thread for each frame with this COB-ID."""
-        self._callbacks.setdefault(cob_id, []).append(callback)
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         """Send one frame.
@@ -263,36 +154,13 @@ class CanLink:
             raise LinkError(self.lost) from error
         self.frames_sent += 1
 
-    def beat(self) -> None:
-        """Tell the drives' watchdogs that the control loop runs; only the loop itself may.
+    def run(self, procedure: Procedure[T]) -> T:
+        """Run a procedure to its end; frames are received meanwhile."""
+        return run(procedure, self._wait_for)
 
-        Raises
-        ------
-        LinkError
-            If the link is closed or lost.
-        """
-        self.send(HEARTBEAT + MASTER_NODE_ID, bytes([NMT_OPERATIONAL]))
-
-    def sdo(self, node_id: int) -> PatientSdoClient:
-        """Return the SDO client of a node, on the present opening of the adapter.
-
-        Raises
-        ------
-        LinkError
-            If the link is closed or lost.
-        """
-        if self._network is None or not self.is_open:
-            raise LinkError(self.lost or f"{self.settings} is not open")
-        if node_id not in self._sdo:
-            client = PatientSdoClient(node_id, self.beat, _HEARTBEAT_PERIOD, self._wait_for)
-            client.network = self._network
-            self._network.subscribe(client.tx_cobid, client.on_response)
-            self._sdo[node_id] = client
-        return self._sdo[node_id]
-
-    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+    def _begin_to_receive(self, bus: can.BusABC) -> None:
         self._thread = threading.Thread(
-            target=self._receive, args=(bus, network), name="can-receive", daemon=True
+            target=self._receive, args=(bus,), name="can-receive", daemon=True
         )
         self._thread.start()
 
@@ -317,7 +185,7 @@ class CanLink:
                 self.lost = f"link {self.settings} is lost: {_plainly(error)}"
             self.arrival.notify_all()
 
-    def _receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+    def _receive(self, bus: can.BusABC) -> None:
         while self._bus is bus and not self.lost:
             try:
                 message = bus.recv(_RECEIVE_WAIT)
@@ -327,26 +195,16 @@ class CanLink:
                     self._lose(error)
                 return
             if message is not None:
-                self._dispatch(message, network)
+                self._dispatch(message)
 
-    def _dispatch(self, message: can.Message, network: canopen.Network) -> None:
+    def _dispatch(self, message: can.Message) -> None:
         if message.is_error_frame:
             self.error_frames += 1
             return
         if message.is_remote_frame or message.is_extended_id:
             return
-        now = self._heard_at = self.clock()
-        self.frames_received += 1
-        if message.arbitration_id in _OF_MASTERS:
-            self.other_master = (
-                f"another master is on the bus: it sends {_OF_MASTERS[message.arbitration_id]}"
-            )
-        data = bytearray(message.data)
-        for callback in self._callbacks.get(message.arbitration_id, ()):
-            callback(bytes(data), now)
-        network.notify(message.arbitration_id, data, now)
-        with self.arrival:
-            self.arrival.notify_all()
+        self._heard_at = self.clock()
+        self._take(message.arbitration_id, bytes(message.data), self._heard_at)
 
 
 def _close_port(bus: can.BusABC) -> None:

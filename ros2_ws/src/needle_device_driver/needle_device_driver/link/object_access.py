@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import contextlib
 
-import canopen
-
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.objects import Entry
-
-_NO_SUCH_OBJECT = (0x0602_0000, 0x0609_0011)
-_OTHER_LENGTH = (0x0607_0010, 0x0607_0012, 0x0607_0013)
+from needle_device_driver.link.sdo_aborts import (
+    NO_SUCH_OBJECT,
+    OTHER_LENGTH,
+    SdoAbortedError,
+    SdoSilenceError,
+)
+from needle_device_driver.procedure import Procedure
 
 
 class DriveError(Exception):
@@ -35,28 +37,28 @@ class DriveRefusalError(DriveError):
     @property
     def object_is_missing(self) -> bool:
         """Tell whether the drive does not have the entry at all."""
-        return self.code in _NO_SUCH_OBJECT
+        return self.code in NO_SUCH_OBJECT
 
 
 class ObjectAccess:
-    """Reads and writes entries of one node; each transfer waits for its answer.
+    """Reads and writes entries of one node; each transfer is a procedure that awaits its answer.
 
     Before each transfer, and while it waits, the computer's heartbeat goes out, so that the
     watchdog of the other drive does not trip while one is set up.
 
     Parameters
     ----------
-    link : CanLink
+    link : FrameLink
         The bus, open.
     node_id : int
         Which node.
     """
 
-    def __init__(self, link: CanLink, node_id: int) -> None:
+    def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
         self._node_id = node_id
 
-    def read(self, entry: Entry) -> int:
+    def read(self, entry: Entry) -> Procedure[int]:
         """Return an entry's value.
 
         Raises
@@ -69,20 +71,20 @@ class ObjectAccess:
             If the link is lost.
         """
         try:
-            data = self._upload(entry)
+            data = yield from self._upload(entry)
             narrower = entry.resized(len(data)) if len(data) < entry.size else None
             return (narrower or entry).unpack(data)
-        except (canopen.SdoAbortedError, canopen.SdoCommunicationError, ValueError) as error:
+        except (SdoAbortedError, SdoSilenceError, ValueError) as error:
             raise self._error("read", entry, error) from error
 
-    def ask(self, entry: Entry) -> int | None:
+    def ask(self, entry: Entry) -> Procedure[int | None]:
         """Return an entry's value, None if the drive refuses to tell it; else raises as `read`."""
         try:
-            return self.read(entry)
+            return (yield from self.read(entry))
         except DriveRefusalError:
             return None
 
-    def write(self, entry: Entry, value: int, *, variable: bool = False) -> None:
+    def write(self, entry: Entry, value: int, *, variable: bool = False) -> Procedure[None]:
         """Write an entry; raises as `read`.
 
         A drive in which it is wider or narrower than the standard has it gets it as wide as it has
@@ -90,13 +92,13 @@ class ObjectAccess:
         is `variable`: it will be given other values later.
         """
         try:
-            self._download(entry, entry.pack(value))
-        except canopen.SdoAbortedError as error:
-            if error.code in _OTHER_LENGTH and self._write_resized(entry, value):
+            yield from self._download(entry, entry.pack(value))
+        except SdoAbortedError as error:
+            if error.code in OTHER_LENGTH and (yield from self._write_resized(entry, value)):
                 return
-            if variable or not self._holds(entry, value):
+            if variable or not (yield from self._holds(entry, value)):
                 raise self._error(f"write {value} to", entry, error) from error
-        except canopen.SdoCommunicationError as error:
+        except SdoSilenceError as error:
             raise self._error(f"write {value} to", entry, error) from error
 
     def write_checked(
@@ -106,7 +108,7 @@ class ObjectAccess:
         *,
         taken: tuple[int, int] | None = None,
         variable: bool = False,
-    ) -> None:
+    ) -> Procedure[None]:
         """Write an entry that a safety rule depends on, and read it back; raises as `read`.
 
         Parameters
@@ -125,43 +127,44 @@ class ObjectAccess:
         DriveError
             Also if the drive has something else then.
         """
-        self.write(entry, value, variable=variable)
-        got = self.read(entry)
+        yield from self.write(entry, value, variable=variable)
+        got = yield from self.read(entry)
         lower, upper = taken or (value, value)
         if not lower <= got <= upper:
             raise DriveError(f"node {self._node_id} took {value} for {entry} and has {got}")
 
-    def offer(self, entry: Entry, value: int) -> None:
+    def offer(self, entry: Entry, value: int) -> Procedure[None]:
         """Write an entry that is good to have; a drive that refuses goes without."""
         with contextlib.suppress(DriveRefusalError):
-            self.write(entry, value)
+            yield from self.write(entry, value)
 
-    def _upload(self, entry: Entry) -> bytes:
+    def _upload(self, entry: Entry) -> Procedure[bytes]:
         self._link.beat()
-        return self._link.sdo(self._node_id).upload(entry.index, entry.subindex)
+        return (yield from self._link.sdo(self._node_id).upload(entry.index, entry.subindex))
 
-    def _download(self, entry: Entry, data: bytes) -> None:
+    def _download(self, entry: Entry, data: bytes) -> Procedure[None]:
         self._link.beat()
-        self._link.sdo(self._node_id).download(entry.index, entry.subindex, data)
+        client = self._link.sdo(self._node_id)
+        yield from client.download(entry.index, entry.subindex, data)
 
-    def _write_resized(self, entry: Entry, value: int) -> bool:
+    def _write_resized(self, entry: Entry, value: int) -> Procedure[bool]:
         try:
-            resized = entry.resized(len(self._upload(entry)))
+            resized = entry.resized(len((yield from self._upload(entry))))
             if resized is None:
                 return False
-            self._download(resized, resized.pack(value))
-        except (canopen.SdoAbortedError, canopen.SdoCommunicationError):
+            yield from self._download(resized, resized.pack(value))
+        except (SdoAbortedError, SdoSilenceError):
             return False
         return True
 
-    def _holds(self, entry: Entry, value: int) -> bool:
+    def _holds(self, entry: Entry, value: int) -> Procedure[bool]:
         try:
-            return self.read(entry) == value
+            return (yield from self.read(entry)) == value
         except DriveError:
             return False
 
     def _error(self, what: str, entry: Entry, error: Exception) -> DriveError:
-        if isinstance(error, canopen.SdoAbortedError):
+        if isinstance(error, SdoAbortedError):
             return DriveRefusalError(
                 f"node {self._node_id} refuses to {what} {entry}: {error} "
                 "(docs/hardware.md says what for)",

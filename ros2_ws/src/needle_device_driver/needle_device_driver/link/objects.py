@@ -142,6 +142,7 @@ SYNC = 0x080
 EMCY = 0x080
 TPDO1, TPDO2 = 0x180, 0x280
 RPDO1, RPDO2 = 0x200, 0x300
+SDO_ANSWER, SDO_REQUEST = 0x580, 0x600
 HEARTBEAT = 0x700
 
 # The computer's own node id, whose heartbeat the drives' watchdogs listen to.

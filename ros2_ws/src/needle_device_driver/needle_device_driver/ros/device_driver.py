@@ -17,7 +17,6 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
 from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import EndRequest
 from needle_common.process.reach import DISCOVERY, is_open
@@ -38,9 +37,11 @@ from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import LinkSettings
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.ros.device_interface import DeviceInterface
-from needle_device_driver.ros.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
@@ -60,7 +61,7 @@ It is a lifecycle node: `autostart` (default) configures and activates it, waiti
 Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
 """
 
-PARAMETERS = "needle_device_driver.ros.parameters:DeviceDriverParameters"
+PARAMETERS = "needle_device_driver.parameters:DeviceDriverParameters"
 PERIOD_NS = 20_000_000
 PERIOD = PERIOD_NS / NANOSECONDS
 # On a running clock the next cycle must come; a simulated one waits for this one's answers.
@@ -110,6 +111,7 @@ class DeviceDriverNode(WholeLifecycleNode):
             path_delay=values.path_delay,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
+            run=self._link.run,
         )
         self._active = False
         self._autostart = values.autostart
@@ -121,7 +123,6 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
         self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
-        self._told_unanswered = 0
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
             self,
@@ -178,7 +179,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._sim_time:
             # Simulated time may stand still; watchdogs do not.
             self._drives.beat()
-            self._drives.hear_first(time.monotonic())
+            self._link.run(self._drives.hear_first(time.monotonic()))
             self._supervisor.observe(time.monotonic())
             self._device.report()
             return
@@ -217,7 +218,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._supervisor.note_time(ros_ns, now)
         self._drives.collect()
         self._supervisor.drive(PERIOD, now)
-        self._drives.exchange(wait)
+        self._link.run(self._drives.exchange(wait))
         observed = time.monotonic()
         self._supervisor.observe(observed)
         self._device.report()
@@ -225,27 +226,13 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._device.publish_joint_states(ros_ns, observed)
 
     def _tell_health(self) -> None:
-        link = self._link
         values = {
-            "link": str(link.settings),
-            "frames_sent": str(link.frames_sent),
-            "frames_received": str(link.frames_received),
-            "bus_errors": str(link.errors),
             "late_cycles": str(self._schedule.late),
             # since the last word on it
             "longest_cycle_s": f"{self._schedule.take_longest():.4f}",
-            "unanswered_syncs": str(self._drives.unanswered),
         }
-        level, message = Level.OK, "connected"
-        if link.lost:
-            level, message = Level.ERROR, link.lost
-        elif not link.is_open:
-            level, message = Level.WARN, f"waiting for {self._waiting_for}"
-        elif self._drives.unanswered > self._told_unanswered:
-            count = self._drives.unanswered - self._told_unanswered
-            level, message = Level.WARN, f"{count} SYNCs were not answered in their cycle"
-        self._told_unanswered = self._drives.unanswered
-        self._diagnostics.set("can", Diagnostic(level, message, values))
+        health = self._drives.health(f"waiting for {self._waiting_for}", values)
+        self._diagnostics.set("can", health)
 
     # ---- lifecycle ----------------------------------------------------------------------------
 
@@ -256,7 +243,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._retry_at = now + _RETRY
         if self._device.others:
             raise UserError(f"{self.get_fully_qualified_name()}: {self._device.others}")
-        why_not = self._drives.probe()
+        why_not = self._link.run(self._drives.probe())
         if not why_not and self._supervisor.state is not State.UNCONFIGURED:
             reply = self._supervisor.reset(now)
             why_not = "" if reply.success else reply.message
@@ -278,7 +265,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         if self._supervisor.state is not State.UNCONFIGURED:
             # A fault from before the configuration; an emergency stop that is pressed stays.
             self._supervisor.reset(time.monotonic())
-        why_not = self._drives.probe()
+        why_not = self._link.run(self._drives.probe())
         simulated = not why_not and self._is_simulated()
         if self._settings.lock_step and not (why_not or simulated):
             why_not = "lock_step: a drive does not say that it is emulated; a real motor would turn"
@@ -306,7 +293,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         """Return whether this is part of a simulation: its time, and drives without motors."""
         nodes = [self._settings.drive(name).node_id for name in ("insertion", "rotation")]
         try:
-            return self._sim_time and are_emulated(self._link, nodes)
+            return self._sim_time and self._link.run(are_emulated(self._link, nodes))
         except LinkError:
             return False
 
@@ -366,9 +353,8 @@ class DeviceDriverNode(WholeLifecycleNode):
 
 def main() -> int:
     """Run device_driver; returns its exit code."""
-    # What canopen and python-can have to say comes as faults of the axes.
-    for name in ("canopen", "can"):
-        logging.getLogger(name).addHandler(logging.NullHandler())
+    # What python-can has to say comes as faults of the axes.
+    logging.getLogger("can").addHandler(logging.NullHandler())
 
     def spin(node: Node, end: EndRequest) -> int:
         assert isinstance(node, DeviceDriverNode)

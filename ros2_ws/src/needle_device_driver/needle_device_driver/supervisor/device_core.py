@@ -7,15 +7,15 @@ from collections.abc import Callable, Sequence
 from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
+from needle_device_driver.supervisor.homing_times import HomingTimes
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import MotionRun, axes_problem
 from needle_device_driver.supervisor.reports import REPLACED, SUCCEEDED, Event, Notice, StepResult
 from needle_device_driver.supervisor.retraction_bound import RetractionBound
 from needle_device_driver.supervisor.states import Activity, State, Trigger, next_state
 
-# Weight of the time on a switch: a drive leaves it at a quarter of the homing speed.
-_OFF_SWITCH = 0.25
 _WATCHED = (State.DISABLED, State.HOLDING, State.MOVING)
 
 
@@ -63,7 +63,7 @@ class DeviceCore:
         self._on_stop = on_stop
         self._retraction_bound = RetractionBound(limits.max_depth)
         self._run: MotionRun | None = None
-        self._homing_times = [0.0, 0.0]
+        self._homing_times = HomingTimes(limits)
         self._seen_powered = False
         self._pushed_too_fast = False
         self._let_go = self._unstopped = ""
@@ -138,6 +138,15 @@ class DeviceCore:
             return str(error)
         return ""
 
+    def carry_out(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[str]:
+        """Let both axes carry out an order; returns as `order`."""
+        try:
+            yield from self._axes.each_in_turn(order)
+        except AxisError as error:
+            self.fail(str(error), error.rule)
+            return str(error)
+        return ""
+
     def power_on(self) -> str:
         """Switch both axes on, where they stand; return what went wrong."""
         self._seen_powered = False
@@ -154,34 +163,33 @@ class DeviceCore:
         self.state = next_state(self.state, trigger)
         self.reason = reason
 
-    def configure(self) -> str:
+    def configure(self) -> Procedure[str]:
         """Set the axes up; return what went wrong."""
-        error = self.order(lambda axis: axis.configure())
-        if error:
+        if error := (yield from self.carry_out(lambda axis: axis.configure())):
             # The other axis may be set up, and would wait for a computer that says no more.
-            self.order(lambda axis: axis.close())
+            yield from self.carry_out(lambda axis: axis.close())
             return error
         self.configured = True
         self.go(Trigger.CONFIGURE, "configured")
         return ""
 
-    def let_go(self) -> bool:
+    def let_go(self) -> Procedure[bool]:
         """Switch the axes off and let go of them; return whether that was from DISABLED."""
         if self.configured:
             self.configured = False
-            self.order(lambda axis: axis.close())
+            yield from self.carry_out(lambda axis: axis.close())
         if self.state is not State.DISABLED:
             return False
         self.snapshot = None
         self.go(Trigger.DECONFIGURE, "deconfigured")
         return True
 
-    def reset(self, now: float) -> str:
+    def reset(self, now: float) -> Procedure[str]:
         """Leave a fault or emergency stop, the axes off; return what is still wrong."""
         trigger, reason = Trigger.RESET_UNCONFIGURED, "reset"
         if self.configured:
             try:
-                self._axes.each(lambda axis: axis.reset())
+                yield from self._axes.each_in_turn(lambda axis: axis.reset())
                 self._axes.each(lambda axis: axis.power(False))
             except AxisError as error:
                 return str(error)
@@ -201,17 +209,7 @@ class DeviceCore:
         legs: Sequence[Leg],
         stamp_ns: int | None = None,
     ) -> None:
-        """Begin a step or retraction from where the axes are.
-
-        Parameters
-        ----------
-        activity : Activity
-            Which of them.
-        legs : sequence of Leg
-            The way.
-        stamp_ns : int, optional
-            Of the command [ns].
-        """
+        """Begin a step or retraction from where the axes are; the stamp is the command's [ns]."""
         assert self.snapshot is not None
         self.activity, self.step_stamp_ns = activity, stamp_ns
         self._run = MotionRun(
@@ -244,18 +242,21 @@ class DeviceCore:
         self._run.replace(legs, self.snapshot)
         self.step_stamp_ns = stamp_ns
 
-    def start_homing(self) -> str:
+    def start_homing(self) -> Procedure[str]:
         """Begin to look for both home switches; return what went wrong."""
-        error = self.power_on()
-        if error:
+        if error := self.power_on():
             return error
         try:
-            self._axes.insertion.home(self._limits.homing_speed)
-            self._axes.rotation.home(self._limits.homing_rotation_rate)
+            yield from self._axes.insertion.home(self._limits.homing_speed)
+            yield from self._axes.rotation.home(self._limits.homing_rotation_rate)
         except AxisError as refusal:
             self.fail(str(refusal), refusal.rule)
             return str(refusal)
-        self._homing_times = [0.0, 0.0]
+        except GeneratorExit:
+            # Called off: the axes stay where they are, without power.
+            self.power_off()
+            raise
+        self._homing_times = HomingTimes(self._limits)
         self.activity = Activity.HOMING
         self.go(Trigger.HOMING_START, "homing")
         return ""
@@ -307,12 +308,8 @@ class DeviceCore:
     def drive_homing(self, period: float) -> None:
         """Let `period` [s] of a homing go by."""
         assert self.snapshot is not None
-        longest = self._limits.longest_homings
-        for k, (name, at) in enumerate(self.snapshot.by_name.items()):
-            self._homing_times[k] += period * at.moving * (_OFF_SWITCH if at.at_home_switch else 1)
-            if self._homing_times[k] > longest[k]:
-                text = f"no home switch of the {name} axis in {longest[k]:.0f} s"
-                self.fail(text, Rule.HOMING_TIME)
+        if text := self._homing_times.count(self.snapshot, period):
+            self.fail(text, Rule.HOMING_TIME)
 
     def drive(self, period: float, speed_scale: float, now: float) -> None:
         """Order the set-points of the next `period` [s] of what is under way."""

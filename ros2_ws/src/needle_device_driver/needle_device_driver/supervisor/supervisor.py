@@ -8,6 +8,7 @@ from needle_common.foreign_text import plain
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
+from needle_device_driver.procedure import Procedure, Runner, run_at_once
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command
 from needle_device_driver.supervisor.command_desk import CommandDesk
@@ -42,6 +43,8 @@ class MotionSupervisor:
         How many cycles after its order a set-point shows in the axes' snapshots.
     switching : callable, optional
         Returns whether an axis is on its way to where it was ordered, apart from set-points.
+    run : Runner
+        Runs the axes' procedures for the verbs that wait; ideal axes have nothing to wait for.
     """
 
     def __init__(
@@ -54,8 +57,10 @@ class MotionSupervisor:
         path_delay: float = 0.0,
         feedback_delay: int = 0,
         switching: Callable[[], bool] = lambda: False,
+        run: Runner = run_at_once,
     ) -> None:
         self._switching = switching
+        self._run = run
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._lock_step = lock_step
@@ -135,10 +140,14 @@ class MotionSupervisor:
     # ---- what comes from outside --------------------------------------------------------------
 
     def configure(self, now: float) -> Reply:
+        """Do `configuring` at one go."""
+        return self._run(self.configuring(now))
+
+    def configuring(self, now: float) -> Procedure[Reply]:
         """Set the axes up; moves nothing."""
         if self._core.state is not State.UNCONFIGURED:
             return self._not_in(State.UNCONFIGURED)
-        if error := self._core.configure():
+        if error := (yield from self._core.configure()):
             return Reply(False, error)
         self.observe(now)
         return Reply(True, "configured")
@@ -147,13 +156,17 @@ class MotionSupervisor:
         """Stop whatever moves, switch the axes off and let go of them."""
         if self._core.activity is not Activity.NONE:
             self._core.end_motion("aborted: the device is shut down", stop=True)
-        self._axes.each(lambda axis: axis.close())
+        self._run(self._axes.each_in_turn(lambda axis: axis.close()))
 
     def deconfigure(self) -> Reply:
+        """Do `deconfiguring` at one go."""
+        return self._run(self.deconfiguring())
+
+    def deconfiguring(self) -> Procedure[Reply]:
         """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
-        if not self._core.let_go():
+        if not (yield from self._core.let_go()):
             return Reply(False, f"the device is {self._core.state.value}")
         return Reply(True, "deconfigured")
 
@@ -248,6 +261,10 @@ class MotionSupervisor:
         return Reply(True, "needle out" if confirmed else "needle not out")
 
     def home(self, now: float) -> Reply:
+        """Do `homing` at one go."""
+        return self._run(self.homing(now))
+
+    def homing(self, now: float) -> Procedure[Reply]:
         """Begin to look for both home switches; only with the needle out."""
         if self._core.state is not State.DISABLED:
             return self._not_in(State.DISABLED)
@@ -255,7 +272,7 @@ class MotionSupervisor:
             return Reply(False, "confirm first that the needle is out (confirm_needle_out)")
         if self._switching():
             return Reply(False, _SWITCHING)
-        if error := self._core.start_homing():
+        if error := (yield from self._core.start_homing()):
             return Reply(False, error)
         self.observe(now)
         return Reply(True, "homing" if self._core.activity is Activity.HOMING else "homed")
@@ -291,7 +308,11 @@ class MotionSupervisor:
         self._core.abort("stopped on request")
         return Reply(True, f"{activity} stopped")
 
-    def reset(self, now: float) -> Reply:  # noqa: PLR0911 - each return is a reason
+    def reset(self, now: float) -> Reply:
+        """Do `resetting` at one go."""
+        return self._run(self.resetting(now))
+
+    def resetting(self, now: float) -> Procedure[Reply]:  # noqa: PLR0911 - each return is a reason
         """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
         if self._core.state is State.MOVING:
             return Reply(False, f"a {self._core.activity.value} is under way")
@@ -306,7 +327,7 @@ class MotionSupervisor:
             return Reply(False, "the emergency stop is still pressed")
         if not self._hold.is_off(now):
             return Reply(False, "release the hold first")
-        if problem := self._core.reset(now):
+        if problem := (yield from self._core.reset(now)):
             return Reply(False, problem)
         if not self._core.configured:
             return Reply(True, "reset; the device is not configured")

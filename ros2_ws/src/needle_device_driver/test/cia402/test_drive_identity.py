@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import canopen
 import pytest
 
 from needle_device_driver.cia402.drive_identity import are_emulated
 from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.sdo_aborts import SdoAbortedError, SdoSilenceError
+from needle_device_driver.procedure import Procedure, Wait, run
 
 
 class Named:
@@ -25,7 +26,8 @@ class Named:
         self._node = node
         return self
 
-    def upload(self, index: int, subindex: int) -> bytes:
+    def upload(self, index: int, subindex: int) -> Procedure[bytes]:
+        yield Wait(lambda: True, 0.0)
         assert (index, subindex) == (0x1008, 0)
         name = self._names[self._node]
         if isinstance(name, Exception):
@@ -39,13 +41,13 @@ class Named:
         (b"Emulated rotation drive", True),
         (b"EL7041", False),
         (b"", False),
-        (canopen.SdoAbortedError(0x0602_0000), False),
-        (canopen.SdoCommunicationError("no answer"), False),
+        (SdoAbortedError(0x0602_0000), False),
+        (SdoSilenceError(), False),
     ],
 )
 def test_one_drive_that_does_not_say_emulated_is_real(
     second: bytes | Exception, emulated: bool
 ) -> None:
     link = cast(CanLink, Named({1: b"Emulated insertion drive", 2: second}))
-    assert are_emulated(link, (1, 2)) is emulated
-    assert are_emulated(link, (2, 1)) is emulated
+    for nodes in ((1, 2), (2, 1)):
+        assert run(are_emulated(link, nodes), lambda until, seconds: until()) is emulated

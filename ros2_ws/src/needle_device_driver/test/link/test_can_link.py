@@ -15,9 +15,12 @@ import pytest
 
 from needle_common.errors import UserError
 from needle_device_driver.link import socketcand_bus
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings, open_bus
+from needle_device_driver.link.can_link import CanLink, open_bus
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import SLCAN_BITRATES, LinkSettings
 from needle_device_driver.link.object_access import DriveError, ObjectAccess
 from needle_device_driver.link.objects import DEVICE_TYPE
+from needle_device_driver.link.slcan_bus import SlcanBus
 
 
 class Adapter:
@@ -88,6 +91,10 @@ def received(link: CanLink, cob_id: int) -> list[bytes]:
 
     link.subscribe(cob_id, take)
     return frames
+
+
+def test_slcan_bitrates_are_those_that_the_adapter_takes() -> None:
+    assert set(SLCAN_BITRATES) == set(SlcanBus._BITRATES)
 
 
 def test_slcan_opens_with_the_bitrate_and_sends_frames(adapter: Adapter, make_link: Make) -> None:
@@ -169,7 +176,7 @@ def test_slcan_that_refuses_is_named_where_nobody_answers(
     wait_for(link, lambda: len(frames) == 1)
     assert link.refused == 2
     with pytest.raises(DriveError, match=r"does not answer.*the adapter refuses"):
-        ObjectAccess(link, 1).read(DEVICE_TYPE)
+        link.run(ObjectAccess(link, 1).read(DEVICE_TYPE))
 
 
 def test_slcan_a_flood_of_frames_is_taken_whole(adapter: Adapter, make_link: Make) -> None:

@@ -15,7 +15,7 @@ from needle_common.errors import OutOfBoundsError, UserError
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.emergency import describe_error
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters
 
 
 def settings(**changes: Any) -> DriveSettings:

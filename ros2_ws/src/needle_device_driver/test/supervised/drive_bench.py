@@ -11,8 +11,9 @@ from typing import Any
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink, LinkError
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
@@ -69,6 +70,7 @@ class DriveBench:
             self.settings.limits,
             feedback_delay=1,
             switching=lambda: self.drives.needs_cycles,
+            run=self.link.run,
         )
         self.ros_ns = 1_000_000_000
         self.stamps = itertools.count(1)
@@ -118,7 +120,7 @@ class DriveBench:
             self.drives.collect()
             self.supervisor.drive(PERIOD, self.now)
             # What is answered at once is here when the frame is sent.
-            self.drives.exchange(0.0)
+            self.link.run(self.drives.exchange(0.0))
             self.supervisor.observe(self.clock())
 
     def hold(self, pressed: bool = True, *, scale: float = 1.0) -> None:

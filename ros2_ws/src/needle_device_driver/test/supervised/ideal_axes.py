@@ -6,6 +6,7 @@ import itertools
 import math
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
@@ -42,14 +43,16 @@ class FakeAxis(Axis):
             raise AxisError(f"{self.name}: no link")
         self.orders.append(name)
 
-    def configure(self) -> None:
+    def configure(self) -> Procedure[None]:
+        yield from ()
         self._order("configure")
 
     def power(self, on: bool) -> None:
         self._order("on" if on else "off")
         self.powered, self.target, self.homing = on, None, False
 
-    def home(self, speed: float) -> None:
+    def home(self, speed: float) -> Procedure[None]:
+        yield from ()
         self._order("home")
         self.homed = self.position == 0.0
         self.homing, self.target, self.speed = not self.homed, 0.0, speed
@@ -63,11 +66,13 @@ class FakeAxis(Axis):
         self.stops += 1
         self.target, self.homing = None, False
 
-    def reset(self) -> None:
+    def reset(self) -> Procedure[None]:
+        yield from ()
         self._order("reset")
         self.fault = ""
 
-    def close(self) -> None:
+    def close(self) -> Procedure[None]:
+        yield from ()
         self.powered = False
 
     def poll(self, now: float) -> AxisSnapshot:

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.limits import SafetyLimits
 
 LIMITS = [field.name for field in dataclasses.fields(SafetyLimits)]

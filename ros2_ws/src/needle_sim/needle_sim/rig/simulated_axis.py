@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
+from needle_device_driver.procedure import Procedure
 
 
 class SimulatedAxis(Axis):
@@ -32,16 +33,18 @@ class SimulatedAxis(Axis):
         """True position of the axis [m or rad]."""
         return self._position
 
-    def configure(self) -> None:
+    def configure(self) -> Procedure[None]:
         """Do nothing: an ideal axis needs no set-up."""
+        yield from ()
 
     def power(self, on: bool) -> None:
         """Switch on or off; a target is forgotten."""
         self.stop()
         self._powered = on
 
-    def home(self, speed: float) -> None:
+    def home(self, speed: float) -> Procedure[None]:
         """Go to position 0 at `speed`."""
+        yield from ()
         self._order("home")
         self._homed = self._position == 0.0
         self._homing = not self._homed
@@ -58,8 +61,9 @@ class SimulatedAxis(Axis):
         self._velocity = 0.0
         self._homing = False
 
-    def reset(self) -> None:
+    def reset(self) -> Procedure[None]:
         """Clear the fault."""
+        yield from ()
         self.fault = ""
 
     def poll(self, now: float) -> AxisSnapshot:
@@ -76,8 +80,9 @@ class SimulatedAxis(Axis):
             fault=self.fault,
         )
 
-    def close(self) -> None:
+    def close(self) -> Procedure[None]:
         """Switch off."""
+        yield from ()
         self.power(False)
 
     def advance(self, period: float) -> None:

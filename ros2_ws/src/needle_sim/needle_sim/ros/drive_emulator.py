@@ -15,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
@@ -24,12 +23,13 @@ from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode
 from needle_sim.bus.pty_port import PtyPort
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drives.bus_health import bus_health
 from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.drives.fault_commands import COMMANDS
 from needle_sim.drives.power_state import PowerState
 from needle_sim.rig.sync_stamps import SyncStamps
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 HELP = f"""\
 drive_emulator: a stepper (insertion) and a servo (rotation) as CiA 402 drives on one CAN bus.
@@ -167,13 +167,7 @@ class DriveEmulatorNode(WholeNode):
         self._tell_health()
 
     def _tell_health(self) -> None:
-        states = {name: state.name for name, state in self._states.items()}
-        faults = [name for name, state in states.items() if state == PowerState.FAULT.name]
-        message = f"fault of {' and '.join(faults)}" if faults else "runs"
-        level = Level.WARN if faults or self._bus.is_cut else Level.OK
-        if self._bus.is_cut:
-            message += ", the bus is cut"
-        self._diagnostics.set("drives", Diagnostic(level, message, states))
+        self._diagnostics.set("drives", bus_health(self._bus))
 
 
 def main() -> int:

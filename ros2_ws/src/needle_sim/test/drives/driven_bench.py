@@ -10,21 +10,20 @@ from collections.abc import Callable
 from typing import Any
 
 import can
-import canopen
 
+from needle_common.can_frame import CanFrame
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.link.can_link import CanLink
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
-from needle_sim.bus.can_frame import CanFrame
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 PERIOD, TICK, FRAME = 0.02, 0.001, 0.0002
 UNITS = (0x608F, 0x60A8, 0x60A9, 0x60AA)
@@ -62,15 +61,14 @@ class _Adapter:
 class _Link(CanLink):
     """The driver's own link, without a thread: what the drives say is dealt with at once."""
 
-    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
+    def _begin_to_receive(self, bus: can.BusABC) -> None:
         """Nothing receives by itself."""
 
     def hear(self, frame: CanFrame) -> None:
-        if self._network is not None:
-            message = can.Message(
-                arbitration_id=frame.identifier, data=frame.data, is_extended_id=False
+        if self.is_open:
+            self._dispatch(
+                can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False)
             )
-            self._dispatch(message, self._network)
 
 
 class DrivenBench:
@@ -110,6 +108,7 @@ class DrivenBench:
             settings.limits,
             feedback_delay=1,
             switching=lambda: self.cycles.needs_cycles,
+            run=self.link.run,
         )
         self.ros_ns = 1_000_000_000
         self.due = self.now
@@ -152,7 +151,8 @@ class DrivenBench:
             self.supervisor.note_time(self.ros_ns, self.now)
             self.cycles.collect()
             self.supervisor.drive(PERIOD, self.now)
-            self.cycles.exchange(0.75 * PERIOD)
+            assert self.link is not None
+            self.link.run(self.cycles.exchange(0.75 * PERIOD))
             self.supervisor.observe(self.now)
 
     def hold(self, pressed: bool, scale: float = 1.0) -> None:

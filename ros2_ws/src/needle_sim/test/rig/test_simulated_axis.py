@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from needle_device_driver.axes.axis import AxisError
+from needle_device_driver.procedure import run_at_once
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.pace import Pace
 from needle_sim.rig.simulated_axis import SimulatedAxis
@@ -60,9 +61,9 @@ def test_an_axis_that_is_off_stopped_or_at_fault_stands_still() -> None:
     axis.advance(PERIOD)
     assert axis.position == 0.0
     with pytest.raises(AxisError, match="stalled"):
-        axis.home(1.0)
-    axis.reset()
-    axis.home(1.0)
+        run_at_once(axis.home(1.0))
+    run_at_once(axis.reset())
+    run_at_once(axis.home(1.0))
     assert axis.poll(7.0).homed
     assert axis.poll(7.0).time == 7.0
 
@@ -70,7 +71,7 @@ def test_an_axis_that_is_off_stopped_or_at_fault_stands_still() -> None:
 def test_homing_goes_to_zero_and_is_not_homed_until_there() -> None:
     axis = SimulatedAxis("rotation", position=0.05)
     axis.power(True)
-    axis.home(1.0)
+    run_at_once(axis.home(1.0))
     assert not axis.poll(0.0).homed
     assert axis.poll(0.0).moving
     for _ in range(3):
@@ -84,7 +85,7 @@ def test_the_needle_moves_by_what_the_axes_did() -> None:
     bench = make_bench()
     axes = SimulatedAxis("insertion"), SimulatedAxis("rotation")
     for axis, target in zip(axes, (0.001, 0.3), strict=True):
-        axis.configure()
+        run_at_once(axis.configure())
         axis.power(True)
         axis.start_move(target, target / 0.5)
     for _ in range(25):

@@ -21,7 +21,7 @@ from sensor_msgs.msg import JointState
 
 from needle_common.process.ros_domain import own_domain
 from needle_common.ros.conversions import JOINT_STATES, to_nanoseconds
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
 LIMIT = 20.0
 

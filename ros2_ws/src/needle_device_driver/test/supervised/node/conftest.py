@@ -10,12 +10,12 @@ import pytest
 from needle_device_driver.ros import device_driver as device_driver_node
 from own_context import own_context
 
-from .node_bench import Rig
+from .node_bench import Rig, emulated_as
 
 
 @pytest.fixture
 def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
-    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: True)
+    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(True))
     with own_context() as context:
         rigs: list[Rig] = []
 

@@ -31,6 +31,7 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.ros.device_driver import DeviceDriverNode
 
 from ..scripted_drives import ScriptedDrive
@@ -38,6 +39,16 @@ from ..scripted_drives import ScriptedDrive
 LIMIT = 20.0
 CHANNELS = itertools.count()
 JOINTS = ["insertion_joint", "rotation_joint"]
+
+
+def emulated_as(emulated: bool) -> Callable[..., Procedure[bool]]:
+    """Return what takes the place of `are_emulated`."""
+
+    def answer(_link: Any, _nodes: Any) -> Procedure[bool]:
+        yield from ()
+        return emulated
+
+    return answer
 
 
 class Peer:

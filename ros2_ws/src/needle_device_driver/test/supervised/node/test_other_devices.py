@@ -15,7 +15,7 @@ from needle_common.errors import UserError
 from needle_common.ros.conversions import LATCHED, RELIABLE
 from needle_device_driver.ros import device_driver as device_driver_node
 
-from .node_bench import Make
+from .node_bench import Make, emulated_as
 
 
 def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:
@@ -88,7 +88,7 @@ def test_simulated_is_what_has_emulated_drives_and_simulated_time(
     use_sim_time: bool,
     simulated: str,
 ) -> None:
-    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: emulated)
+    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(emulated))
     rig = make_rig(autostart=False, use_sim_time=use_sim_time, lock_step=False)
     rig.until(rig.partner.change.service_is_ready, "the driver")
     assert rig.partner.status.get("simulated", "") == ""
@@ -99,7 +99,7 @@ def test_simulated_is_what_has_emulated_drives_and_simulated_time(
 def test_lock_step_is_refused_where_a_drive_does_not_say_that_it_is_emulated(
     make_rig: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_driver_node, "are_emulated", lambda _link, _nodes: False)
+    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(False))
     rig = make_rig(lock_step=True)
     with pytest.raises(UserError, match="lock_step: a drive does not say that it is emulated"):
         rig.until(lambda: False, "the refusal")

@@ -9,8 +9,9 @@ import pytest
 
 from needle_device_driver.cia402 import drive_setup
 from needle_device_driver.cia402.pdo_setup import silence_unused
-from needle_device_driver.link.can_link import LinkError
+from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.object_access import ObjectAccess
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import State
 
@@ -327,12 +328,12 @@ def test_drive_reboot_within_its_set_up_voids_it(
     bench.homed()
     reboots = [True]
 
-    def reboots_once(access: ObjectAccess) -> None:
+    def reboots_once(access: ObjectAccess) -> Procedure[None]:
         if reboots:
             reboots.clear()
             bench.insertion.reboot()
             bench.bus.flush()
-        silence_unused(access)
+        yield from silence_unused(access)
 
     monkeypatch.setattr(drive_setup, "silence_unused", reboots_once)
     bench.insertion.reboot()

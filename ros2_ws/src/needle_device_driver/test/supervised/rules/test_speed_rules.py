@@ -10,7 +10,7 @@ import pytest
 
 from needle_device_driver.cia402.axis_speed import SpeedWatch
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.ros.parameters import DeviceDriverParameters
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.states import State
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import gc
 import itertools
-import logging
 import multiprocessing
 import os
 import shutil
@@ -80,8 +79,6 @@ def _settle_in() -> None:
     """Prepare this process for runs, once."""
     # What is imported stays, and need not be looked at for garbage.
     gc.freeze()
-    # What the bus has to say comes as faults of the axes.
-    logging.getLogger("canopen").addHandler(logging.NullHandler())
 
 
 def _run_seed(seed: int) -> RunResult:

@@ -10,11 +10,11 @@ import numpy as np
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 
 from needle_common.ros.conversions import RELIABLE, to_stamp
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
 from needle_sim.ros.conversions import to_tip, to_tip_pose
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 from needle_verification.ros.soak.virtual_node import VirtualNode
 from needle_verification.soak.virtual_world import VirtualWorld
 

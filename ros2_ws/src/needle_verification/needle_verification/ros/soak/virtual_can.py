@@ -8,10 +8,11 @@ from functools import partial
 from typing import Any
 
 import can
-import canopen
 
-from needle_device_driver.link.can_link import CanLink, LinkError, LinkSettings
-from needle_sim.bus.can_frame import CanFrame
+from needle_common.can_frame import CanFrame
+from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_verification.soak.link_faults import LinkFaults, Way
 from needle_verification.soak.virtual_world import VirtualProcess, VirtualWorld
@@ -147,9 +148,7 @@ class VirtualLink(CanLink):
 
     def hear(self, message: can.Message) -> None:
         """Take a frame off the bus, in what is the receiving thread elsewhere."""
-        network = self._network
-        if network is not None:
-            self._process.do_concurrently(lambda: self._dispatch(message, network))
+        self._process.do_concurrently(lambda: self._dispatch(message))
 
     def lose(self) -> None:
         """Take note that the adapter is gone."""
@@ -160,8 +159,8 @@ class VirtualLink(CanLink):
             raise LinkError(f"cannot open {settings}: No such file or directory")
         return _Opening(self._adapter, self, self._process)
 
-    def _begin_to_receive(self, bus: can.BusABC, network: canopen.Network) -> None:
-        del bus, network
+    def _begin_to_receive(self, bus: can.BusABC) -> None:
+        del bus
         self._adapter.plug_in(self)
 
 

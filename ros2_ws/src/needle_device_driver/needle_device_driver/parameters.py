@@ -9,7 +9,7 @@ from typing import Any
 from needle_common.errors import OutOfBoundsError, UserError
 from needle_common.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.cia402.drive_settings import DriveSettings
-from needle_device_driver.link.can_link import LINKS, LinkSettings
+from needle_device_driver.link.link_settings import LINKS, LinkSettings
 from needle_device_driver.supervisor.limits import (
     SafetyLimits,
     limit_parameter,
@@ -23,7 +23,9 @@ LONGEST_WATCHDOG = 0.5
 
 
 @dataclasses.dataclass(frozen=True)
-class _RigParameters:
+class DriverParameters:
+    """Parameters of device_driver that are not one drive's."""
+
     link: str = fixed_parameter(
         "slcan",
         "-",
@@ -178,7 +180,7 @@ def _axis(
     return [(f"{axis}_{name}", type(f.default), f) for name, f in fields.items()]
 
 
-DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
+DeviceDriverParameters: type[DriverParameters] = dataclasses.make_dataclass(
     "DeviceDriverParameters",
     [
         # A lead screw of 1 mm, 20000 counts a turn.
@@ -204,7 +206,7 @@ DeviceDriverParameters: type[_RigParameters] = dataclasses.make_dataclass(
             tolerance=1e-3,
         ),
     ],
-    bases=(_RigParameters,),
+    bases=(DriverParameters,),
     frozen=True,
 )
 DeviceDriverParameters.__doc__ = "Parameters of device_driver, fixed at start."

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
+CAN = "can"
+"""Name of the ports on the rig's CAN bus."""
+
 
 @dataclasses.dataclass(frozen=True)
 class CanFrame:

@@ -1,0 +1,82 @@
+"""drive_emulator as a component: two CiA 402 drives behind a CAN port."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from needle_common import messages as m
+from needle_common.can_frame import CAN, CanFrame
+from needle_common.component import (
+    Actions,
+    Component,
+    Diagnose,
+    Log,
+    Moment,
+    Output,
+    Port,
+    Publish,
+    Send,
+    Timer,
+)
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_sim.drives.bus_health import bus_health
+from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.power_state import PowerState
+
+POSITIONS = "sim/drive_positions"
+# How often the drives look at their clocks, and tell where their motors are [s].
+_LOOK, _PERIOD = 0.005, 0.02
+
+
+class DriveEmulator(Component):
+    """Both drives with their motors, from the moment when their power comes.
+
+    Parameters
+    ----------
+    settings : DriveEmulatorParameters
+        The node's parameters.
+
+    Attributes
+    ----------
+    bus : EmulatedBus
+        The drives; faults are planted there.
+    """
+
+    name = "drive_emulator"
+
+    def __init__(self, settings: DriveEmulatorParameters) -> None:
+        self.settings = settings
+        clock = MotionClock(settings.motion_clock)
+        self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, 0.0)
+        self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
+        self.outputs = (Output(POSITIONS, m.JointState),)
+        self.ports = (Port(CAN, self._on_frames),)
+        self.timers = (Timer(_LOOK, self._look), Timer(_PERIOD, self._tell_positions))
+
+    def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
+        for frame in frames:
+            self.bus.receive(frame, at.steady)
+        return self._send(self.bus.take_sent())
+
+    def _look(self, at: Moment) -> Actions:
+        yield from self._send(self.bus.poll(at.steady))
+        states = {name: drive.state for name, drive in self.bus.drives.items()}
+        if states == self._states:
+            return
+        for name, state in states.items():
+            if state is PowerState.FAULT and self._states[name] is not state:
+                code = self.bus.drives[name].error_code
+                yield Log("warning", f"{name} drive: fault 0x{code:04X}")
+        self._states = states
+        yield Diagnose("drives", bus_health(self.bus))
+
+    def _send(self, frames: Sequence[CanFrame]) -> Actions:
+        if frames:
+            yield Send(CAN, tuple(frames))
+
+    def _tell_positions(self, at: Moment) -> Actions:
+        axes = self.bus.axes(at.steady)
+        positions = tuple(axis.position for axis in axes.values())
+        velocities = tuple(axis.velocity for axis in axes.values())
+        names = tuple(f"{name}_joint" for name in axes)
+        yield Publish(POSITIONS, m.JointState(at.stamp_ns, names, positions, velocities))

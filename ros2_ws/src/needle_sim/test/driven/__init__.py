@@ -1,0 +1,1 @@
+"""The driver's component on the emulated drives, in virtual time."""

@@ -1,0 +1,199 @@
+"""Driver, emulated drives and somebody who gives orders, on a virtual runner."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from needle_common import messages as m
+from needle_common.can_frame import CAN, CanFrame
+from needle_common.component import (
+    BEST_EFFORT,
+    LATCHED,
+    Action,
+    Actions,
+    Answer,
+    Call,
+    Component,
+    Input,
+    Moment,
+    Output,
+    Publish,
+    Timer,
+)
+from needle_common.runners.faults import Arrivals, Fault, Link
+from needle_common.runners.virtual import VirtualRunner
+from needle_device_driver.device_driver import DeviceDriver
+from needle_device_driver.parameters import DeviceDriverParameters
+from needle_sim.drive_emulator import DriveEmulator
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+
+DRIVER, DRIVES = DeviceDriver.name, DriveEmulator.name
+
+
+class Person(Component):
+    """Holds, and does what a test asks for."""
+
+    name = "person"
+
+    def __init__(self) -> None:
+        self.status: dict[str, str] = {}
+        self.outcomes: list[str] = []
+        self.answers: list[Answer] = []
+        self.pressed = False
+        self.actions: list[Action] = []
+        self.inputs = (
+            Input("device/status", m.Status, self._on_status, LATCHED),
+            Input("device/result", m.CommandResult, self._on_result),
+        )
+        self.outputs = (
+            Output("device/hold", m.HoldState, BEST_EFFORT),
+            Output("device/joint_trajectory", m.Trajectory),
+            Output("device/estop", m.EmergencyStop),
+        )
+        self.timers = (Timer(0.01, self._act),)
+
+    def on_answer(self, answer: Answer, at: Moment) -> Actions:
+        self.answers.append(answer)
+        return ()
+
+    def _on_status(self, message: m.Status, at: Moment) -> Actions:
+        self.status = message.values
+        return ()
+
+    def _on_result(self, message: m.CommandResult, at: Moment) -> Actions:
+        self.outcomes.append(message.outcome)
+        return ()
+
+    def _act(self, at: Moment) -> Actions:
+        scale = 1.0 if self.pressed else 0.0
+        yield Publish("device/hold", m.HoldState(at.stamp_ns, "person", self.pressed, scale, 0.1))
+        yield from self.actions
+        self.actions = []
+
+
+class ComponentBench:
+    """The three, and every frame between driver and drives."""
+
+    def __init__(
+        self,
+        *,
+        seed: int = 1,
+        fault: Fault | None = None,
+        drives: dict[str, Any] | None = None,
+        **driver: Any,
+    ) -> None:
+        self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
+        settings = DeviceDriverParameters(link="virtual", channel=CAN, **driver)
+        self.driver = DeviceDriver(settings)
+        self.person = Person()
+        self.frames: list[tuple[float, str, CanFrame]] = []
+        self.runner = VirtualRunner(
+            [self.drives, self.driver, self.person],
+            seed,
+            faults=(self._note, *([] if fault is None else [fault])),
+        )
+
+    def _note(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+        if link.topic == CAN:
+            self.frames += [(now, link.sender, frame) for frame in message]
+        return ((0.0, message),)
+
+    @property
+    def state(self) -> str:
+        return self.person.status.get("state", "")
+
+    @property
+    def fault(self) -> str:
+        return self.person.status["fault"]
+
+    @property
+    def places(self) -> tuple[float, float]:
+        """Where the motors really are [m], [rad]."""
+        axes = self.drives.bus.axes(self.runner.now)
+        return axes["insertion"].position, axes["rotation"].position
+
+    def sent(self, since: float, *cob_ids: int) -> list[CanFrame]:
+        """Return the driver's frames of these COB-IDs since a time."""
+        return [
+            frame
+            for time, sender, frame in self.frames
+            if time > since and sender == DRIVER and frame.identifier in cob_ids
+        ]
+
+    def run(self, seconds: float) -> None:
+        end = self.runner.now + seconds
+        while self.runner.now < end - 1e-9:
+            self.runner.run(end - self.runner.now)
+
+    def until(self, condition: Callable[[], bool], seconds: float = 5.0) -> float:
+        """Run until something is so; return how long that took [s]."""
+        begin = self.runner.now
+        while not condition():
+            assert self.runner.now < begin + seconds, self.person.status
+            self.run(0.002)
+        return self.runner.now - begin
+
+    def ask(self, service: str, request: bool | None = None) -> None:
+        self.person.actions.append(Call(f"device/{service}", request))
+
+    def call(self, service: str, request: bool | None = None) -> Answer:
+        count = len(self.person.answers)
+        self.ask(service, request)
+        self.until(lambda: len(self.person.answers) > count)
+        return self.person.answers[-1]
+
+    def succeed(self, service: str, request: bool | None = None) -> None:
+        """Call a service until it is done: drives take a while to switch off."""
+        self.until(lambda: self.call(service, request).success)
+
+    def press_stop(self, pressed: bool = True) -> None:
+        self.person.actions.append(Publish("device/estop", m.EmergencyStop(pressed)))
+
+    def set_up(self) -> None:
+        self.until(lambda: self.state == "DISABLED")
+        self.succeed("confirm_needle_out", True)
+
+    def ready(self) -> None:
+        self.set_up()
+        assert self.call("home").success
+        self.until(lambda: self.person.status["homed"] == "true")
+        self.succeed("enable", True)
+        self.run(0.3)
+        self.person.pressed = True
+        self.run(0.1)
+
+    def step(self, length: float = 0.002, rotation: float = 0.5, duration: float = 1.0) -> None:
+        insertion, turn = (
+            float(self.person.status[key]) for key in ("insertion_m", "rotation_rad")
+        )
+        point = m.TrajectoryPoint((insertion + length, turn + rotation), duration)
+        names = (m.INSERTION_JOINT, m.ROTATION_JOINT)
+        stamp_ns = 1_000_000_000 + round(self.runner.now * 1e9)
+        command = m.Trajectory(stamp_ns, names, (point,))
+        self.person.actions.append(Publish("device/joint_trajectory", command))
+
+    def moving(self) -> None:
+        """Be in the middle of a step."""
+        self.ready()
+        begin = self.places[0]
+        self.step()
+        self.until(lambda: self.places[0] > begin + 0.0005)
+
+    def rests(self, seconds: float = 0.5) -> bool:
+        """Tell whether neither motor moves for some time."""
+        at = self.places
+        self.run(seconds)
+        return self.places == at
+
+
+def losing(identifiers: Sequence[int], begin: Callable[[], float]) -> Fault:
+    """Return a fault that loses the drives' frames of some identifiers from a time on."""
+
+    def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
+        if link.topic != CAN or link.sender != DRIVES or now < begin():
+            return ((0.0, message),)
+        return ((0.0, tuple(f for f in message if f.identifier not in identifiers)),)
+
+    return fault
