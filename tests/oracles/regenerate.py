@@ -68,15 +68,30 @@ class FrozenRun:
         What is simulated.
     options : str
         The other options of `scripts/simulate`.
+    parameters : str
+        Parameter file; empty: none.
     """
 
     level: str
     options: str = ""
+    parameters: str = ""
 
     def words(self, bag: Path) -> list[str]:
         """Return the command line."""
-        fixed = ["--level", self.level, "--depth-mm", "40", "--bag", str(bag)]
-        return ["scripts/simulate", *fixed, *shlex.split(self.options)]
+        words = ["--level", self.level, "--depth-mm", "40", "--bag", str(bag)]
+        if self.parameters:
+            file = bag.with_suffix(".yaml")
+            file.write_text(self.parameters, "utf-8")
+            words += ["--params", str(file)]
+        return ["scripts/simulate", *words, *shlex.split(self.options)]
+
+
+# Seven processes that do not rest: on a busy machine a watchdog would break into the run.
+_PATIENT = """\
+sim_rig: {ros__parameters: {tick_timeout: 30.0}}
+device_driver: {ros__parameters: {hold_timeout: 0.5}}
+simulated_operator: {ros__parameters: {hold_rate: 50.0}}
+"""
 
 
 RUNS: Mapping[str, FrozenRun] = {
@@ -88,7 +103,7 @@ RUNS: Mapping[str, FrozenRun] = {
     "tip_best_seed_2": FrozenRun("tip", "--seed 2"),
     "camera_best": FrozenRun("camera"),
     "drive_best": FrozenRun("drive"),
-    "drive_best_continuous": FrozenRun("drive", "--insertion continuous"),
+    "drive_best_continuous": FrozenRun("drive", "--insertion continuous", _PATIENT),
 }
 SCHEMA_RUNS = {"tip": "tip_best", "camera": "camera_best", "drive": "drive_best"}
 
@@ -205,14 +220,14 @@ def _tapped_bus(old: Path) -> Iterator[None]:
 
 def _freeze_run(name: str, old: Path, scratch: Path) -> None:
     run, bag, log = RUNS[name], scratch / name, scratch / f"{name}.can"
+    words = run.words(bag)
     tap = _tapped_bus(old) if run.level == "drive" else contextlib.nullcontext()
     with tap:
-        done = subprocess.run(
-            run.words(bag), cwd=old, env=_environment(NEEDLE_CAN_LOG=str(log)), check=False
-        )
+        environment = _environment(NEEDLE_CAN_LOG=str(log))
+        done = subprocess.run(words, cwd=old, env=environment, check=False)
     # A run that misses the plane is as good for comparing.
     if done.returncode not in (EXIT_DONE, EXIT_MISSED):
-        raise UserError(f"{shlex.join(run.words(bag))} ended with {done.returncode}")
+        raise UserError(f"{shlex.join(words)} ended with {done.returncode}")
     BAGS.mkdir(exist_ok=True)
     shutil.rmtree(BAGS / name, ignore_errors=True)
     copy_without_images(bag, BAGS / name)
