@@ -45,7 +45,8 @@ LONG_FILES = (
     "ros2_ws/src/needle_verification/test/checks/test_check_console_hold.py",
 )
 IN_BACKGROUND = re.compile(
-    r"tests/(test_(lint|reference)|site/\w+)\.py|.*/needle_(tracker|controller)/test/(?!ros/).*|"
+    r"tests/(test_(lint|reference)|(oracles|site)/\w+)\.py|"
+    r".*/needle_(tracker|controller)/test/(?!ros/).*|"
     r".*/needle_sim/test/(camera|needle|path_traced|studies)/.*|"
     r".*/needle_bags/test/(reading|recovery)/.*|"
     r".*/needle_analysis/test/(report/|run/|rerun/|ros/test_(rerun|hostile)).*|"

@@ -1,0 +1,27 @@
+"""`--help` of every command: the frozen text, but for what has a reason."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from reference.command_pages import help_of_module, help_of_script, scripts
+from reference.rig_nodes import executables
+
+HELP = Path(__file__).resolve().parent / "help"
+CHANGED = {
+    "scripts_simulate": "the run is in one process: --graph runs the nodes, --component adds one",
+}
+"""Commands whose text differs from the frozen one, and why."""
+
+
+def todays_texts() -> dict[str, str]:
+    texts = {name: help_of_module(module, name) for _, name, module in executables("command")}
+    texts["player"] = help_of_module("needle_bags.ros.player", "player")
+    return texts | {f"scripts_{name}": help_of_script(name) for name in scripts()}
+
+
+def test_commands_say_what_they_said() -> None:
+    frozen = {file.stem: file.read_text("utf-8") for file in HELP.glob("*.txt")}
+    today = todays_texts()
+    assert today.keys() == frozen.keys()
+    assert {name for name in today if today[name] != frozen[name]} == set(CHANGED)
