@@ -311,8 +311,8 @@ def _parser() -> CommandParser:
 
 def _components(given: Any) -> tuple[str, ...]:
     for name in given.component:
-        if given.graph or given.level == "drive":
-            raise UserError(f"--component {name}: goes with levels tip and camera, without --graph")
+        if given.graph:
+            raise UserError(f"--component {name} does not go with --graph")
         if not all(name.partition(":")):
             raise UserError(f"--component {name!r} is not MODULE:NAME, such as my_probe:Probe")
     return tuple(given.component)
