@@ -312,7 +312,7 @@ def _parser() -> CommandParser:
 def _components(given: Any) -> tuple[str, ...]:
     for name in given.component:
         if given.graph:
-            raise UserError(f"--component {name}: goes without --graph")
+            raise UserError(f"--component {name} does not go with --graph")
         if not all(name.partition(":")):
             raise UserError(f"--component {name!r} is not MODULE:NAME, such as my_probe:Probe")
     return tuple(given.component)

@@ -62,7 +62,7 @@ def test_a_module_that_is_not_there_is_named() -> None:
     ("words", "error"),
     [
         (["--component", "probe"], "'probe' is not MODULE:NAME"),
-        (["--component", "a:B", "--graph"], "without --graph"),
+        (["--component", "a:B", "--graph"], "does not go with --graph"),
     ],
 )
 def test_where_it_cannot_be_it_is_refused(words: list[str], error: str) -> None:

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from needle_bags.reading.bag_files import read_messages
+from needle_common.can_frame import CanFrame
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.reports import StepResult
-from needle_sim.bus.can_frame import CanFrame
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
-from needle_sim.ros.drive_emulator_parameters import DriveEmulatorParameters
 
 from .driven_bench import DrivenBench
 
