@@ -15,6 +15,7 @@ from needle_bringup.simulation.virtual_run import make_components, run_virtually
 FROZEN = json.loads((Path(__file__).resolve().parent / "topics.json").read_text("utf-8"))
 GONE = {
     "/clock": "the runner's time is no message: log times are virtual",
+    "/device_driver/transition_event": "a component has no lifecycle of ROS",
     "/parameter_events": "parameters are fixed, and stand in the bag's metadata",
     "/device_driver/transition_event": "a component has no lifecycle",
 }
