@@ -17,7 +17,6 @@ GONE = {
     "/clock": "the runner's time is no message: log times are virtual",
     "/device_driver/transition_event": "a component has no lifecycle of ROS",
     "/parameter_events": "parameters are fixed, and stand in the bag's metadata",
-    "/device_driver/transition_event": "a component has no lifecycle",
 }
 """Frozen topics that a virtual run does not have, and why."""
 ADDED = {
