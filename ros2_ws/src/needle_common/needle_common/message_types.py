@@ -38,7 +38,7 @@ class MessageTypes:
         lookup: Callable[[str], Any],
         array: Callable[[type[np.generic], Sequence[float]], Any],
         byte: Callable[[int], Any],
-        octets: Callable[[bytes], Any],
+        octets: Callable[[bytes | memoryview], Any],
     ) -> None:
         self.make = functools.cache(lookup)
         self.array = array
@@ -90,7 +90,7 @@ def rclpy_types() -> MessageTypes:
         lambda _, values: list(values),
         lambda value: bytes([value]),
         # Anything but an array of bytes is copied element by element.
-        partial(array.array, "B"),
+        lambda data: array.array("B", bytes(data)),
     )
 
 

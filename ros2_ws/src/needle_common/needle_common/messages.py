@@ -141,7 +141,7 @@ class Image:
     width: int
     encoding: str
     step: int
-    data: bytes = field(repr=False)
+    data: bytes | memoryview = field(repr=False)
 
 
 @dataclass(frozen=True)
