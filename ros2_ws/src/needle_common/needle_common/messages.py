@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 from needle_common.diagnostics import Diagnostic, Level
 
 INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
+HOLD_LIFETIME = 0.1
+"""So long does a message promise a person's hold: who stands still holds no longer [s]."""
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]

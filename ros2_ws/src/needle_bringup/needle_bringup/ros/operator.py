@@ -21,6 +21,7 @@ from needle_bringup.operator.retraction import RETRACT, STOP_STEERING, Retractio
 from needle_bringup.ros.operator_parameters import JOY, OperatorParameters
 from needle_common.commands.cli import EXIT_DONE
 from needle_common.diagnostics import Diagnostic, Level
+from needle_common.messages import HOLD_LIFETIME
 from needle_common.process.end_request import EndRequest
 from needle_common.ros.base_node import (
     LOOK_PERIOD,
@@ -31,7 +32,7 @@ from needle_common.ros.base_node import (
 )
 from needle_common.ros.bounded_subscription import listen
 from needle_common.ros.conversions import HOLD, LATCHED, to_nanoseconds, values_of
-from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
+from needle_common.ros.hold_topic import HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode

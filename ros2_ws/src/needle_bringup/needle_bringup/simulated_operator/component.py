@@ -30,8 +30,6 @@ from needle_common.component import (
 from needle_common.diagnostics import Diagnostic, Level
 
 HOLD = "device/hold"
-HOLD_LIFETIME = 0.1
-"""A message promises the hold for so long [s]."""
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
 # The hold is best effort: a release worth sending is worth sending again.
 _RELEASES = 3
@@ -142,7 +140,7 @@ class SimulatedOperator(Component):
 
     def _hold(self, at: Moment, *, pressed: bool) -> Publish:
         speed = self.settings.speed_scale if pressed else 0.0
-        state = m.HoldState(at.stamp_ns, self.name, pressed, speed, HOLD_LIFETIME)
+        state = m.HoldState(at.stamp_ns, self.name, pressed, speed, m.HOLD_LIFETIME)
         return Publish(HOLD, state)
 
     def _report(self) -> Diagnose:

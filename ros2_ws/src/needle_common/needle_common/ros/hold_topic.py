@@ -9,9 +9,6 @@ from sensor_msgs.msg import Joy
 
 from needle_common.ros.conversions import HOLD, to_stamp
 
-HOLD_LIFETIME = 0.1
-"""So long does a message promise a person's hold: who stands still holds no longer [s]."""
-
 
 class HoldTopic:
     """Publishes the hold; any thread may do so, one at a time.

@@ -14,9 +14,10 @@ from geometry_msgs.msg import PointStamped, PoseStamped
 from needle_common.diagnostics import Diagnostic, Level
 from needle_common.errors import UserError
 from needle_common.files.installed import find_shared
+from needle_common.messages import HOLD_LIFETIME
 from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_common.ros.conversions import LATCHED, to_quaternion
-from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
+from needle_common.ros.hold_topic import HoldTopic
 from needle_common.ros.life_signs import LifeSigns
 from needle_common.ros.parameters import NodeParameters
 from needle_common.ros.whole_node import WholeNode

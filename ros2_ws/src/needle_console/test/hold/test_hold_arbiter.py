@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hold_scene import Scene
-from needle_common.ros.hold_topic import HOLD_LIFETIME
+from needle_common.messages import HOLD_LIFETIME
 from needle_console.hold.hold_arbiter import IDLE, MOST_PAGES, SILENCE
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.hold.hold_talk import PERIOD

@@ -11,7 +11,8 @@ import sys
 
 import rclpy
 
-from needle_common.ros.hold_topic import HOLD_LIFETIME, HoldTopic
+from needle_common.messages import HOLD_LIFETIME
+from needle_common.ros.hold_topic import HoldTopic
 from needle_common.ros.whole_node import WholeNode
 from needle_console.hold.hold_state import OWNER, HoldState
 from needle_verification.trials.button_page import serving_button
