@@ -73,7 +73,7 @@ _needle_env() {
         if [ -n "${FASTRTPS_DEFAULT_PROFILES_FILE:-}" ]; then
             echo "env.sh: FASTRTPS_DEFAULT_PROFILES_FILE=$FASTRTPS_DEFAULT_PROFILES_FILE ignored: no such file" >&2
         fi
-        export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_common/needle_common/process/$profiles"
+        export FASTRTPS_DEFAULT_PROFILES_FILE="$root/ros2_ws/src/needle_core/needle_core/process/$profiles"
     fi
 }
 

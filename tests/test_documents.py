@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 from needle_tracker.calibrating.calibration_session import parse_session
 from typed_pages import PAGES, ROOT, PageError, Session, blocks
 

@@ -22,10 +22,10 @@ from needle_bringup.simulation.rig_configuration import (
     refuse_reserved,
 )
 from needle_bringup.simulation.simulate_options import parse
-from needle_common.settings.parameter_files import read_parameters
 from needle_controller.observers.estimator import Estimate, pose_estimate
 from needle_controller.planning.entry import entry_state
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_core.settings.parameter_files import read_parameters
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters

@@ -18,7 +18,7 @@ def broken(importer: str, imported: str) -> list[str]:
     for module in (importer, imported):
         graph.add_module(module, is_squashed="." not in module)
     graph.add_import(importer=importer, imported=imported, line_number=1, line_contents="")
-    options: dict[str, Any] = {"packages": ["needle_sim", "needle_common"]}
+    options: dict[str, Any] = {"packages": ["needle_sim", "needle_core"]}
     contract = RosRoomContract(name="wall", session_options={}, contract_options=options)
     found: list[str] = contract.check(graph, verbose=False).metadata["broken"]
     return found
@@ -34,7 +34,7 @@ def broken(importer: str, imported: str) -> list[str]:
         ("needle_sim.needle.plant", "rcl_interfaces"),
         # Through a module of the room, ROS would be imported all the same.
         ("needle_sim.needle.plant", "needle_sim.ros.conversions"),
-        ("needle_sim.needle.plant", "needle_common.ros.base_node"),
+        ("needle_sim.needle.plant", "needle_core.ros.base_node"),
     ],
 )
 def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, imported: str) -> None:
@@ -46,10 +46,10 @@ def test_a_pure_module_that_reaches_for_ros_breaks_the_wall(importer: str, impor
     [
         ("needle_sim.ros.sim_rig", "rclpy"),
         ("needle_sim.ros.conversions", "geometry_msgs"),
-        ("needle_sim.ros.sim_rig", "needle_common.ros.parameters"),
+        ("needle_sim.ros.sim_rig", "needle_core.ros.parameters"),
         ("needle_sim.ros.sim_rig", "needle_sim.ros.conversions"),
         ("needle_sim.needle.plant", "numpy"),
-        ("needle_sim.needle.plant", "needle_common.errors"),
+        ("needle_sim.needle.plant", "needle_core.errors"),
     ],
 )
 def test_the_rest_is_allowed(importer: str, imported: str) -> None:

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from code_lines import ROOT
-from needle_common.settings.parameter_fields import specs
+from needle_core.settings.parameter_fields import specs
 from reference.command_pages import commands_page, scripts
 from reference.diagnostic_pages import IN_EVERY_NODE, complaints, diagnostics_page
 from reference.endpoints import HEARS, MAKERS, OPEN_ENDED, PUBLISHES, SOURCES
@@ -19,7 +19,7 @@ from reference.node_pages import node_page, topics_page
 from reference.rig_nodes import RigNode, executables, rig_nodes
 
 # Of every node, or of a command that ends by itself.
-BESIDE_NODES = ("needle_common/ros/base_node.py", "needle_tracker/ros/check_calibration.py")
+BESIDE_NODES = ("needle_core/ros/base_node.py", "needle_tracker/ros/check_calibration.py")
 
 
 @pytest.fixture(scope="module")

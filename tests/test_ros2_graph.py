@@ -21,7 +21,7 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 
 STAND_IN = Path(__file__).parents[1] / "scripts" / "lib" / "ros2_standin.py"
 LIMIT = 60.0

@@ -11,7 +11,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import load_session
 
 FREE_VIEWS = 12

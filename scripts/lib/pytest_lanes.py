@@ -25,7 +25,7 @@ from xdist.remote import Producer
 from xdist.scheduler import LoadFileScheduling
 from xdist.workermanage import WorkerController
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 
 RUN = os.environ.get("NEEDLE_TEST_RUN", "")
 # These take half a minute and more: begun last, one of them would hold up the end of the run.

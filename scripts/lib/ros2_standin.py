@@ -115,9 +115,9 @@ def speak_to_graph(arguments: list[str]) -> NoReturn:
     """Become ros2_graph.py, with the packages that this interpreter was started without."""
     if not os.environ.get("AMENT_PREFIX_PATH"):
         fail(1, "no packages found: source scripts/env.sh first")
-    sys.path.insert(0, str(Path(__file__).parents[2] / "ros2_ws" / "src" / "needle_common"))
-    from needle_common.errors import UserError  # noqa: PLC0415
-    from needle_common.process.reach import settle_environment  # noqa: PLC0415
+    sys.path.insert(0, str(Path(__file__).parents[2] / "ros2_ws" / "src" / "needle_core"))
+    from needle_core.errors import UserError  # noqa: PLC0415
+    from needle_core.process.reach import settle_environment  # noqa: PLC0415
 
     try:
         settle_environment()

@@ -23,10 +23,10 @@ from needle_bags.format.bag_copy import BagCopy
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_images import pixels_of, plain_image
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
 
 ORACLES = Path(__file__).resolve().parent
 ROOT = ORACLES.parents[1]

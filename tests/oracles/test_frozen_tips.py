@@ -18,10 +18,10 @@ from needle_analysis.ros.rerun import Node
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_order import messages_as_sent
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_common.component import Actions, Moment, Publish
-from needle_common.convert import from_ros
-from needle_common.messages import Image, JointState, Pose
-from needle_common.rotations import quaternion_from_rotation
+from needle_core.component import Actions, Moment, Publish
+from needle_core.convert import from_ros
+from needle_core.messages import Image, JointState, Pose
+from needle_core.rotations import quaternion_from_rotation
 from needle_sim.camera_sensor import CameraSensor
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters

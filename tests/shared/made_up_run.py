@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
-from needle_common.files.bag_topic import BagTopic
+from needle_core.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STEPS = 120

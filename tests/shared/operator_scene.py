@@ -15,8 +15,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
-from needle_common.files.installed import find_executable
-from needle_common.ros.conversions import HOLD, LATCHED
+from needle_core.files.installed import find_executable
+from needle_core.ros.conversions import HOLD, LATCHED
 
 LIMIT = 20.0
 

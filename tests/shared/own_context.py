@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import rclpy
 from rclpy.context import Context
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 
 
 @contextmanager

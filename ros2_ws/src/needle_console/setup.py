@@ -3,7 +3,7 @@
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "needle_common"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "needle_core"))
 
 from package_setup import set_up
 

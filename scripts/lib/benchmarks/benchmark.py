@@ -17,15 +17,15 @@ import latency_benchmark
 import recording_benchmark
 import reference_loop
 import tracker_benchmark
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, output_file
-from needle_common.errors import UserError
 from needle_controller.model.gains import sampled_observer_gain
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
+from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 from needle_sim.studies.disturbances import Disturbances

@@ -24,9 +24,9 @@ import needle_tracker
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
 from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG, can_adapter
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.rig.bench import SimulatedBench

@@ -18,8 +18,8 @@ import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds, to_stamp
+from needle_core.errors import UserError
+from needle_core.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds, to_stamp
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.ros.conversions import to_camera_info, to_image
 from needle_verification.ros.drive_hand import DriveHand

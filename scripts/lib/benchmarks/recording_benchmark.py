@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.allocator import keep_freed_memory
-from needle_common.files.bag_topic import BagTopic
+from needle_core.files.bag_topic import BagTopic
 
 EXPOSURES = 150
 SMALL_EACH = 10

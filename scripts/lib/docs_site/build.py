@@ -9,9 +9,9 @@ from pathlib import Path
 
 from code_lines import ROOT
 from docs_site.navigation import FRONT
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 
 HELP = """\
 Write the documents as a site: this checkout's README, docs, packages' READMEs and decision records,

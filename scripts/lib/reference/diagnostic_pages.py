@@ -17,7 +17,7 @@ IN_EVERY_NODE = {
     "input": "a message or request was refused, or the node failed on it; counted by topic",
     "duplicates": "another node publishes what this one alone should",
 }
-"""Parts that any node may report, by `needle_common.ros`."""
+"""Parts that any node may report, by `needle_core.ros`."""
 _WORDS = "..."
 
 

@@ -13,9 +13,9 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from code_lines import ROOT
-from needle_common.diagnostics import Diagnostic
-from needle_common.ros.base_node import DiagnosticsPublisher
-from needle_common.ros.parameters import NodeParameters
+from needle_core.diagnostics import Diagnostic
+from needle_core.ros.base_node import DiagnosticsPublisher
+from needle_core.ros.parameters import NodeParameters
 
 PUBLISHES, HEARS, SERVES, CALLS = "publishes", "hears", "serves", "calls"
 MAKERS = {
@@ -32,7 +32,7 @@ OPEN_ENDED = {
     "obeys below `/replay` alone.",
     "needle_bags/ros/parameter_snapshots.py:__init__": "`recorder` asks every node for its "
     "parameters.",
-    "needle_common/ros/discovery.py:all_of": "Nodes ask those that they hear for "
+    "needle_core/ros/discovery.py:all_of": "Nodes ask those that they hear for "
     "`get_type_description`, to know that they are heard.",
 }
 """Functions whose endpoints are those of others: what a reader should know of them."""

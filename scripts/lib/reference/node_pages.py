@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from needle_common.settings.parameter_fields import ParameterSpec, specs
+from needle_core.settings.parameter_fields import ParameterSpec, specs
 from reference.endpoints import CALLS, HEARS, OPEN_ENDED, PUBLISHES, SERVES, Endpoint
 from reference.markdown import block, code, node_link, table
 from reference.rig_nodes import RigNode

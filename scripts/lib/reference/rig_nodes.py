@@ -21,8 +21,8 @@ from rclpy.signals import SignalHandlerOptions
 from code_lines import ROOT
 from needle_bags.player.player_options import parse_options
 from needle_bags.reading.bag_files import read_contents
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.executor import NodeExecutor
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.executor import NodeExecutor
 from reference.endpoints import PUBLISHES, SOURCES, Endpoint, Noted, noting
 
 BAG = ROOT / "bags" / "regression"

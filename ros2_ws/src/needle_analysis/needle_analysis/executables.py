@@ -1,6 +1,6 @@
 """The package's executables."""
 
-from needle_common.commands.executables import command, node
+from needle_core.commands.executables import command, node
 
 live_view = node("needle_analysis.ros.live_view")
 openigtlink = node("needle_analysis.ros.openigtlink")

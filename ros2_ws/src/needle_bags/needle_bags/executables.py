@@ -1,6 +1,6 @@
 """The package's executables."""
 
-from needle_common.commands.executables import command, node
+from needle_core.commands.executables import command, node
 
 recorder = node("needle_bags.ros.recorder")
 player = node("needle_bags.ros.player")

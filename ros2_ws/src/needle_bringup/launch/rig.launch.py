@@ -11,7 +11,7 @@ node starts, and a node that ends ends the others.
 from launch import LaunchDescription
 from needle_bringup.ros.launching import describe
 from needle_bringup.simulation.launch_nodes import nodes_beside_rig
-from needle_common.files.installed import find_shared
+from needle_core.files.installed import find_shared
 
 
 def generate_launch_description() -> LaunchDescription:

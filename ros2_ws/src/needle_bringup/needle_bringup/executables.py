@@ -1,6 +1,6 @@
 """The package's executables."""
 
-from needle_common.commands.executables import node
+from needle_core.commands.executables import node
 
 operator = node("needle_bringup.ros.operator")
 simulated_operator = node("needle_bringup.ros.simulated_operator")

@@ -1,5 +1,5 @@
 """The package's executables."""
 
-from needle_common.commands.executables import node
+from needle_core.commands.executables import node
 
 console = node("needle_console.ros.console")

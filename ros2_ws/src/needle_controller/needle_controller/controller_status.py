@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 
-from needle_common.diagnostics import Diagnostic, Level
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import SteeringState
+from needle_core.diagnostics import Diagnostic, Level
 
 _LEVELS = {SteeringState.FAULT: Level.ERROR, SteeringState.WAITING_FOR_TIP: Level.WARN}
 

@@ -10,27 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from needle_common import messages as m
-from needle_common.component import (
-    LATCHED,
-    RELIABLE,
-    Actions,
-    Component,
-    Delivery,
-    Diagnose,
-    Input,
-    Log,
-    Moment,
-    Output,
-    Peers,
-    Publish,
-    Reply,
-    Service,
-    Timer,
-)
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
-from needle_common.rotations import quaternion_from_rotation
 from needle_controller.controller_status import steering_diagnostic
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
@@ -54,6 +33,27 @@ from needle_controller.protocol.steering_types import (
 from needle_controller.protocol.steering_types import Log as SteeringLog
 from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core import messages as m
+from needle_core.component import (
+    LATCHED,
+    RELIABLE,
+    Actions,
+    Component,
+    Delivery,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Reply,
+    Service,
+    Timer,
+)
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
+from needle_core.rotations import quaternion_from_rotation
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"

@@ -2,11 +2,11 @@
 
 import numpy as np
 
-from needle_common.component import Moment
-from needle_common.messages import Point
 from needle_controller.model.target_motion import TargetMotion
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.component import Moment
+from needle_core.messages import Point
 
 PLACE, DRIFT = np.array([0.004, 0.0, 0.09]), np.array([1e-4, 0.0, 0.0])
 

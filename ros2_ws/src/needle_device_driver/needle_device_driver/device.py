@@ -8,8 +8,8 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from needle_common import messages as m
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.component import (
     LATCHED,
     Actions,
     Delivery,
@@ -22,8 +22,8 @@ from needle_common.component import (
     Publish,
     Service,
 )
-from needle_common.component import Reply as ServiceReply
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.component import Reply as ServiceReply
+from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage

@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from needle_common.can_frame import CAN, CanFrame
-from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
-from needle_common.component import (
+from needle_core.can_frame import CAN, CanFrame
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.component import (
     Actions,
     Component,
     Diagnose,

@@ -6,8 +6,8 @@ import dataclasses
 import math
 from typing import Any
 
-from needle_common.errors import OutOfBoundsError, UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link.link_settings import LINKS, LinkSettings
 from needle_device_driver.supervisor.limits import (

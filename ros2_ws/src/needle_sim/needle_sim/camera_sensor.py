@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common import messages as m
-from needle_common.component import Actions, Delivery, Output, Publish
-from needle_common.files.installed import find_shared
+from needle_core import messages as m
+from needle_core.component import Actions, Delivery, Output, Publish
+from needle_core.files.installed import find_shared
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS

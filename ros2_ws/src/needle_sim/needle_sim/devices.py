@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Protocol
 
-from needle_common import messages as m
-from needle_common.component import Actions, Input, Moment, Output, Peers, Publish, Service
+from needle_core import messages as m
+from needle_core.component import Actions, Input, Moment, Output, Peers, Publish, Service
 from needle_device_driver.device import EMERGENCY_STOP, DeviceRows
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.supervisor import MotionSupervisor

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from needle_common import messages as m
-from needle_common.can_frame import CAN, CanFrame
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.can_frame import CAN, CanFrame
+from needle_core.component import (
     Actions,
     Component,
     Diagnose,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import MotionClock

@@ -1,6 +1,6 @@
 """The package's executables."""
 
-from needle_common.commands.executables import command, node
+from needle_core.commands.executables import command, node
 
 sim_rig = node("needle_sim.ros.sim_rig")
 drive_emulator = node("needle_sim.ros.drive_emulator")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Protocol
 
-from needle_common import messages as m
-from needle_common.component import Actions, Output, Publish
+from needle_core import messages as m
+from needle_core.component import Actions, Output, Publish
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from needle_common import messages as m
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.component import (
     LATCHED,
     Actions,
     Component,
@@ -17,8 +17,8 @@ from needle_common.component import (
     Publish,
     Timer,
 )
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.rotations import quaternion_from_rotation
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.rotations import quaternion_from_rotation
 from needle_sim.devices import CYCLE, make_device
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sensors import RIG, make_sensor

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.supervisor.limits import (
     SafetyLimits,
     limit_parameter,

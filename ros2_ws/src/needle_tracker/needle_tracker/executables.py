@@ -1,6 +1,6 @@
 """The package's executables."""
 
-from needle_common.commands.executables import command, node
+from needle_core.commands.executables import command, node
 
 stereo_tracker = node("needle_tracker.ros.stereo_tracker")
 track_images = command("needle_tracker.answers.track_images")

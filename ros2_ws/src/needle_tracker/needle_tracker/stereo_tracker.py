@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterable
 from functools import partial
 
-from needle_common import messages as m
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.component import (
     LATCHED,
     RELIABLE,
     Actions,
@@ -22,7 +22,7 @@ from needle_common.component import (
     Publish,
     Timer,
 )
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic, Level
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers

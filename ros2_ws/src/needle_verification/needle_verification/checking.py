@@ -22,9 +22,9 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import ports_of
-from needle_common.process.shared_memory import dead_ports
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import ports_of
+from needle_core.process.shared_memory import dead_ports
 from needle_verification.descendants import processes_with, ran
 
 # Every process that a check starts carries this in its environment, so that none can hide.

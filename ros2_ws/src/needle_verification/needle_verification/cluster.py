@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 Part = TypeVar("Part")
 Result = TypeVar("Result")
@@ -27,7 +27,7 @@ CONNECTS_WITHIN = 30.0
 """How long a scheduler has to answer [s]."""
 _NUMERICAL = ("numpy", "scipy", "numba")
 _PACKAGES = (
-    "needle_analysis", "needle_bags", "needle_bringup", "needle_common", "needle_console",
+    "needle_analysis", "needle_bags", "needle_bringup", "needle_core", "needle_console",
     "needle_controller", "needle_device_driver", "needle_sim", "needle_tracker",
     "needle_verification",
 )  # fmt: skip

@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 _GRACE = 10.0
 _POLL = 0.05

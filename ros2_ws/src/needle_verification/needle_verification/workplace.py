@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 
 def checkout() -> Path:

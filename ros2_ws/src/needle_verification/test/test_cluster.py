@@ -15,7 +15,7 @@ import pytest
 
 from dask_cluster import NEEDED, Cluster
 from dying_part import end_every, end_process, end_the_first
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification import cluster
 from needle_verification.cluster import on_cluster
 from needle_verification.studies import cluster_study

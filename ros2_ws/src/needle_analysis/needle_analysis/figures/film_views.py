@@ -26,8 +26,8 @@ from needle_analysis.figures.film import Frame
 from needle_analysis.run.run_summary import GOAL, finite_tips, target_offset
 from needle_bags.reading.bag_images import SIDES, images_at
 from needle_bags.reading.bag_reader import Run
-from needle_common.errors import UserError
-from needle_common.files.plain_yaml import load_plain
+from needle_core.errors import UserError
+from needle_core.files.plain_yaml import load_plain
 from needle_tracker.optics.calibration import parse_calibration
 
 Floats = npt.NDArray[np.float64]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 import socket
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 MOST_LISTENERS = 8
 STALLED = 5.0

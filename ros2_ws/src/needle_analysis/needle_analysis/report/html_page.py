@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from needle_analysis.figures.figure_style import png_size
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 
 _CSS = """
 :root { color-scheme: light dark; --ink: #16191d; --soft: #565e68; --line: #dfe3e8;

@@ -10,7 +10,7 @@ from needle_analysis.report import html_page
 from needle_analysis.report.glossary import Glossary
 from needle_analysis.report.report_page import TILE_NOTE, TILES, verdict_text
 from needle_bags.reading.bag_reader import Run
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 
 Summary = Mapping[str, JsonValue]
 

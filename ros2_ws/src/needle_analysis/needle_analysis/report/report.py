@@ -24,10 +24,10 @@ from needle_analysis.run.innovation import innovations
 from needle_analysis.run.run_summary import summarize, tip_error
 from needle_analysis.run.stage_timing import StageTiming, stage_timings
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
-from needle_common.files.file_access import replace_file
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+from needle_core.files.file_access import replace_file
 
 PAGE = "report.html"
 

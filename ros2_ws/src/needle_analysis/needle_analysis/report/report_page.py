@@ -16,7 +16,7 @@ from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import rerun_of
 from needle_analysis.run.stage_timing import StageTiming
 from needle_bags.reading.bag_reader import Run
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 
 _MOST_EVENTS = 60
 CAPTIONS = {

@@ -19,8 +19,8 @@ from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import Run
 from needle_bags.reading.bag_rigs import CALIBRATION
 from needle_bags.recording.provenance import commit
-from needle_common.errors import UserError
-from needle_common.files.file_access import replace_file
+from needle_core.errors import UserError
+from needle_core.files.file_access import replace_file
 
 TABLE = "outputs.txt"
 

@@ -10,7 +10,7 @@ import numpy as np
 from needle_analysis.rerun.bag_pass import Output, estimate_errors
 from needle_analysis.rerun.comparison import FIELDS, Comparison, FieldResult, TopicResult
 from needle_bags.reading.bag_reader import Run
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 
 _SHOWN = 3
 _DEGREES = 180.0 / math.pi

@@ -12,12 +12,6 @@ from typing import Any
 from needle_analysis.rerun.bag_pass import Output, stored
 from needle_bags.reading.bag_order import SentMessage, messages_as_sent
 from needle_bags.ros.parameter_snapshots import plain_value
-from needle_common.component import Actions, Input, Moment, Publish
-from needle_common.convert import Converter, from_ros, to_nanoseconds
-from needle_common.errors import UserError
-from needle_common.message_types import rclpy_types
-from needle_common.messages import JointState
-from needle_common.ros.conversions import values_of
 from needle_controller.plane_controller import (
     STATUS,
     TARGET_PLANE,
@@ -28,6 +22,12 @@ from needle_controller.plane_controller import (
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import SteeringState
+from needle_core.component import Actions, Input, Moment, Publish
+from needle_core.convert import Converter, from_ros, to_nanoseconds
+from needle_core.errors import UserError
+from needle_core.message_types import rclpy_types
+from needle_core.messages import JointState
+from needle_core.ros.conversions import values_of
 
 _STEERING = (SteeringState.STEERING.value, SteeringState.WAITING_FOR_TIP.value)
 _LONGER_THAN_ANY_TIMEOUT = 1e6

@@ -16,8 +16,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from needle_analysis.live.live_needle import LiveNeedle, SeenTip
 from needle_analysis.live.spread import ellipsoid
-from needle_common.ros.conversions import to_quaternion, to_stamp
 from needle_controller.model.target_plane import RIG
+from needle_core.ros.conversions import to_quaternion, to_stamp
 
 Array = NDArray[np.float64]
 

@@ -25,18 +25,18 @@ from needle_analysis.live.marked_image import marked_image
 from needle_analysis.ros import live_messages
 from needle_analysis.ros.needle_hearing import NeedleHearing
 from needle_analysis.ros.transform_publishers import transform_publishers
-from needle_common.errors import UserError
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.conversions import (
+from needle_core.errors import UserError
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.conversions import (
     IMAGES_BEST_EFFORT,
     LATCHED,
     RELIABLE,
     to_nanoseconds,
 )
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.tracker_messages import frame_of
 from needle_tracker.optics.calibration import SIDES, calibration_from
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views

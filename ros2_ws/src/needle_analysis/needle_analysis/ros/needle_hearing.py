@@ -12,13 +12,13 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
 from needle_analysis.live.live_needle import Belief, LiveNeedle, SeenTip
-from needle_common import messages
-from needle_common.convert import from_ros
-from needle_common.errors import UserError
-from needle_common.ros.base_node import DiagnosticsPublisher
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds, values_of
-from needle_common.ros.discovery import unpublished
 from needle_controller.model.target_plane import plane_from_pose
+from needle_core import messages
+from needle_core.convert import from_ros
+from needle_core.errors import UserError
+from needle_core.ros.base_node import DiagnosticsPublisher
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds, values_of
+from needle_core.ros.discovery import unpublished
 from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.

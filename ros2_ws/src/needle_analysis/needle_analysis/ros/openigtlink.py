@@ -13,13 +13,13 @@ from rclpy.parameter import Parameter
 from needle_analysis.link.link_messages import packed
 from needle_analysis.link.link_server import LinkServer
 from needle_analysis.ros.needle_hearing import NeedleHearing
-from needle_common.commands.cli import EXIT_BAD_INPUT
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.commands.cli import EXIT_BAD_INPUT
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 HELP = """
 openigtlink: shows the needle to 3D Slicer and other OpenIGTLink clients, while one is connected.

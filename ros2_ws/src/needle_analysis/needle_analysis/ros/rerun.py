@@ -23,16 +23,16 @@ from needle_bags.format.bag_writer import refuse_existing_bag
 from needle_bags.reading.bag_files import read_messages
 from needle_bags.reading.bag_reader import Run, read_run
 from needle_bags.ros.parameter_snapshots import plain_value
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
-from needle_common.commands.options import CommandParser, output_file
-from needle_common.errors import UserError
-from needle_common.files.calibration_text import read_calibration
-from needle_common.files.plain_yaml import load_plain
-from needle_common.ros.parameters import OF_EVERY_NODE
-from needle_common.settings.parameter_files import Sections, none_for, read_sections, values_for
 from needle_controller.presets.own_parts import GROUPS
 from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
+from needle_core.errors import UserError
+from needle_core.files.calibration_text import read_calibration
+from needle_core.files.plain_yaml import load_plain
+from needle_core.ros.parameters import OF_EVERY_NODE
+from needle_core.settings.parameter_files import Sections, none_for, read_sections, values_for
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import parse_calibration
 

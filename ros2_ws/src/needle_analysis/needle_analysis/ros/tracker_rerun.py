@@ -9,9 +9,9 @@ import numpy as np
 from needle_analysis.rerun.bag_pass import Output, stored
 from needle_bags.reading.bag_images import TOPICS, plain_image
 from needle_bags.reading.bag_order import SentMessage
-from needle_common.component import Actions, Moment, Publish
-from needle_common.convert import Converter, from_ros
-from needle_common.message_types import rclpy_types
+from needle_core.component import Actions, Moment, Publish
+from needle_core.convert import Converter, from_ros
+from needle_core.message_types import rclpy_types
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.stereo_tracker import TIP_POSE, StereoTipTracker, image_topic

@@ -10,7 +10,7 @@ from geometry_msgs.msg import TransformStamped
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 
-from needle_common.ros.conversions import LATCHED, RELIABLE
+from needle_core.ros.conversions import LATCHED, RELIABLE
 
 
 class TransformPublishers:

@@ -7,8 +7,8 @@ import numpy.typing as npt
 
 from needle_analysis.run.run_events import is_aborted
 from needle_bags.reading.bag_reader import Run, Series, Stamps
-from needle_common.commands.cli import JsonValue, finite_or_none
 from needle_controller.presets.own_parts import GROUPS
+from needle_core.commands.cli import JsonValue, finite_or_none
 
 GOAL = 1e-3
 LAST_STRETCH = 20e-3

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 import pytest
 
 from needle_analysis.link.link_server import MOST_LISTENERS, STALLED, LinkServer
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 HEADER = struct.Struct("> H 12s 20s II Q Q")
 

@@ -20,7 +20,7 @@ from needle_analysis.run.run_events import troubles
 from needle_analysis.run.run_summary import commanded_rotation, summarize
 from needle_analysis.run.stage_timing import STAGES
 from needle_bags.reading.bag_reader import HealthEvent, Result, Status, read_run
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 
 MakeRun = Callable[..., Path]
 

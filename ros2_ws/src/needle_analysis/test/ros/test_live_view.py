@@ -25,8 +25,8 @@ from visualization_msgs.msg import Marker, MarkerArray
 from needle_analysis.ros import live_view
 from needle_analysis.ros.live_view import OUTPUTS, LiveViewNode
 from needle_bags.format.message_definitions import message_class
-from needle_common.ros.base_node import executor_of
-from needle_common.ros.conversions import IMAGES, JOINT_STATES, LATCHED, RELIABLE, to_stamp
+from needle_core.ros.base_node import executor_of
+from needle_core.ros.conversions import IMAGES, JOINT_STATES, LATCHED, RELIABLE, to_stamp
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 from own_context import own_context

@@ -21,8 +21,8 @@ from sensor_msgs.msg import JointState
 
 from needle_analysis.ros import openigtlink
 from needle_analysis.ros.openigtlink import OpenIGTLinkNode
-from needle_common.ros.base_node import executor_of
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_stamp
+from needle_core.ros.base_node import executor_of
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_stamp
 from own_context import own_context
 
 pyigtl = pytest.importorskip("pyigtl", reason="the lock is not installed: docs/slicer.md")

@@ -12,8 +12,8 @@ from rosbags.typesys.store import Typestore
 
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
-from needle_common.errors import UserError
-from needle_common.files.bag_topic import BagTopic
+from needle_core.errors import UserError
+from needle_core.files.bag_topic import BagTopic
 
 _STAMP_END = 12
 

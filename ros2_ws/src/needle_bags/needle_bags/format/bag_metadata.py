@@ -18,9 +18,9 @@ from rosbags.interfaces import (
 )
 from rosbags.rosbag2.metadata import dump_qos_v9
 
-from needle_common.files.bag_path import METADATA_FILE
-from needle_common.files.bag_topic import BagTopic
-from needle_common.files.file_access import replace_file
+from needle_core.files.bag_path import METADATA_FILE
+from needle_core.files.bag_topic import BagTopic
+from needle_core.files.file_access import replace_file
 
 METADATA_VERSION: Final = 9
 _NO_LIMIT: Final = QosTime(*divmod(2**63 - 1, 10**9))

@@ -8,9 +8,9 @@ from typing import Any
 
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
-from needle_common.errors import UserError
-from needle_common.files.bag_types import parsed_types
-from needle_common.files.installed import find_shared
+from needle_core.errors import UserError
+from needle_core.files.bag_types import parsed_types
+from needle_core.files.installed import find_shared
 
 _SEPARATOR = "=" * 80
 _BUILT_IN_TEXT = """

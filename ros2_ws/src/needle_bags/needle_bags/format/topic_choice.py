@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import re
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 
 @dataclasses.dataclass(frozen=True)

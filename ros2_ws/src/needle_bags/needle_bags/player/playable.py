@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from needle_bags.format.message_definitions import full_definition, message_class, type_hash
-from needle_common.errors import UserError
-from needle_common.files.bag_topic import BagTopic
+from needle_core.errors import UserError
+from needle_core.files.bag_topic import BagTopic
 
 
 def unplayable(topic: BagTopic) -> str:

@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from needle_bags.format.topic_choice import TopicChoice
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
-from needle_common.settings.bounds import check_bounds
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
+from needle_core.settings.bounds import check_bounds
 
 _DESCRIPTION = """\
 Plays a bag: sends its messages again, in their order and at their distances, with the quality of

@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from needle_common.files.bag_directory import BagDirectory
+from needle_core.files.bag_directory import BagDirectory
 
 
 def read_contents(path: Path) -> BagDirectory:

@@ -15,7 +15,7 @@ from needle_bags.format.bag_copy import stamp_of
 from needle_bags.reading.bag_files import read_messages
 from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import Run, nanoseconds
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 SIDES = ("left", "right")
 TOPICS = {

@@ -15,7 +15,7 @@ from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
-from needle_common.files.bag_directory import BagDirectory, SentMessage
+from needle_core.files.bag_directory import BagDirectory, SentMessage
 
 __all__ = ["Reorder", "SentMessage", "messages_as_sent", "raw_as_sent"]
 

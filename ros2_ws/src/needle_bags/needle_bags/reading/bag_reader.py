@@ -13,8 +13,8 @@ import numpy.typing as npt
 
 from needle_bags.reading.bag_files import read_contents, read_messages
 from needle_bags.reading.bag_rigs import CALIBRATION, namespace_of, namespaces, require_types
-from needle_common.errors import UserError
-from needle_common.files.plain_yaml import load_plain
+from needle_core.errors import UserError
+from needle_core.files.plain_yaml import load_plain
 
 Floats = npt.NDArray[np.float64]
 Stamps = npt.NDArray[np.int64]

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
 
 CALIBRATION = "stereo_tracker/calibration"
 _LANDMARK = "needle/controller_status"

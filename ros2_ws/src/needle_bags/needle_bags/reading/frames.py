@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from needle_bags.reading.bag_files import read_contents, read_messages
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 if TYPE_CHECKING:
     import pandas as pd

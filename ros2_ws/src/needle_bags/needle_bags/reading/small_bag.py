@@ -19,9 +19,9 @@ from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_images import pixels_of, plain_image
 from needle_bags.reading.bag_order import SentMessage, raw_as_sent
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_common.commands.cli import EXIT_DONE, run_command
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 
 _DESCRIPTION = """
 Copies a bag without what a rerun does not need, and with the images of a few exposures only,

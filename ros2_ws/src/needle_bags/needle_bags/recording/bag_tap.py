@@ -20,11 +20,11 @@ from rosbags.typesys import Stores, get_typestore
 from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.recording.provenance import commit, distribution, versions
-from needle_common.component import Component, Delivery, Input, Output
-from needle_common.convert import Converter, ros_type
-from needle_common.files.bag_records import RUN_RECORD
-from needle_common.files.bag_topic import BagTopic
-from needle_common.message_types import rosbags_types
+from needle_core.component import Component, Delivery, Input, Output
+from needle_core.convert import Converter, ros_type
+from needle_core.files.bag_records import RUN_RECORD
+from needle_core.files.bag_topic import BagTopic
+from needle_core.message_types import rosbags_types
 
 
 class BagTap:

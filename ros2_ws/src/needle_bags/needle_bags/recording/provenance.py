@@ -9,7 +9,7 @@ import subprocess
 from pathlib import Path
 
 _PACKAGES = (
-    "needle_common needle_tracker needle_controller needle_device_driver needle_sim "
+    "needle_core needle_tracker needle_controller needle_device_driver needle_sim "
     "needle_bags rclpy numpy scipy opencv-python-headless mcap rosbags matplotlib"
 )
 _DISTRIBUTION = "jazzy"

@@ -8,7 +8,7 @@ from typing import Final
 
 from needle_bags.recording.free_space import megabytes
 from needle_bags.recording.recording import Recording
-from needle_common.diagnostics import Level
+from needle_core.diagnostics import Level
 
 # Bytes that wait for the disk: a second of stereo images.
 WARN_WAITING: Final = 50_000_000

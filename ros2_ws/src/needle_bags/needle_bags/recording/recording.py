@@ -19,8 +19,8 @@ from needle_bags.format.bag_writer import (
 )
 from needle_bags.recording.free_space import FreeSpace, megabytes
 from needle_bags.recording.worker import Do, Job, Worker, WorkerThread
-from needle_common.errors import UserError
-from needle_common.files.bag_topic import BagTopic
+from needle_core.errors import UserError
+from needle_core.files.bag_topic import BagTopic
 
 FLUSH_PERIOD: Final = 0.1
 # What waits for a slow disk at most, in bytes; more is dropped, and counted. Nearly three seconds

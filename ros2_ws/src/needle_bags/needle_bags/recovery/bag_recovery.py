@@ -21,16 +21,16 @@ from tqdm import tqdm
 from needle_bags.format.bag_metadata import DataFile, bag_information, write_metadata
 from needle_bags.recovery.mcap_prefix import PrefixCopy, last_time
 from needle_bags.recovery.one_recording import difference, require_one_recording
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
-from needle_common.files.bag_path import (
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
+from needle_core.files.bag_path import (
     METADATA_FILE,
     BrokenBagError,
     read_information,
     recording_files,
 )
-from needle_common.files.bag_records import RUN_RECORD, custom_data_of
-from needle_common.files.file_access import open_regular, sync_directory
+from needle_core.files.bag_records import RUN_RECORD, custom_data_of
+from needle_core.files.file_access import open_regular, sync_directory
 
 # Key of the custom data that says what was lost.
 _RECOVERED: Final = "recovered"

@@ -20,9 +20,9 @@ from mcap.records import Attachment, Channel, Chunk, Header, Message, Metadata, 
 from mcap.writer import MCAP0_MAGIC, Writer
 
 from needle_bags.format.bag_writer import CHUNK_SIZE, LIBRARY
-from needle_common.files.bag_data import is_packed, unpack
-from needle_common.files.file_access import open_regular
-from needle_common.files.mcap_records import (
+from needle_core.files.bag_data import is_packed, unpack
+from needle_core.files.file_access import open_regular
+from needle_core.files.mcap_records import (
     CHUNK_LIMIT,
     RECORD_HEADER,
     TIME_LIMIT,

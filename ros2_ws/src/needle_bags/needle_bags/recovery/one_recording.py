@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Final
 
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
-from needle_common.files.bag_records import RUN_RECORD
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
+from needle_core.files.bag_records import RUN_RECORD
 
 _SECOND: Final = 10**9
 # A file begins so long before or after the one before it ends [ns] at most: its first message is

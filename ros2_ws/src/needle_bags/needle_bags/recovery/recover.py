@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from needle_bags.recovery.bag_recovery import BagRecovery, recover_bag
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, output_file
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
 
 _DESCRIPTION = """
 Makes a bag whole again whose recording was cut off (by a crash, kill -9, a power cut or a full

@@ -18,7 +18,7 @@ from needle_bags.format.message_loss import SequenceGaps
 from needle_bags.format.topic_choice import TopicChoice
 from needle_bags.recording.recording import Received
 from needle_bags.ros.conversions import IMAGE_TYPES, offered_qos, strictest_request
-from needle_common.files.bag_topic import BagTopic
+from needle_core.files.bag_topic import BagTopic
 
 # A look at the graph takes this long at most; what is left is looked at next time [s].
 GRAPH_TIME = 0.05

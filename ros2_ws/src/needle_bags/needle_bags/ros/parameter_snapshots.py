@@ -12,8 +12,8 @@ from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
 
-from needle_common.ros import discovery
-from needle_common.ros.question import Question
+from needle_core.ros import discovery
+from needle_core.ros.question import Question
 
 
 def plain_value(value: ParameterValue) -> Any:

@@ -32,18 +32,18 @@ from needle_bags.player.replay_names import REPLAY, is_guarded, marks_a_rig, pla
 from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, Keys
 from needle_bags.reading.bag_files import raw_messages, read_contents
 from needle_bags.ros.conversions import recorded_offer
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
-from needle_common.files.bag_topic import BagTopic
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import RELIABLE, to_stamp
-from needle_common.ros.discovery import AnsweringNodes, full_name
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, parameter
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, run_command
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
+from needle_core.files.bag_topic import BagTopic
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.conversions import RELIABLE, to_stamp
+from needle_core.ros.discovery import AnsweringNodes, full_name
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import check_fields, parameter
 
 CLOCK: Final = "/clock"
 # How long a rig that is there has to show itself before the first message; how much longer those

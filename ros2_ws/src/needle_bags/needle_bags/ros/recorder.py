@@ -25,18 +25,18 @@ from needle_bags.recording.recording import Received, Recording, open_recording
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
 from needle_bags.ros.recorder_parameters import RecorderParameters
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.files.bag_path import recover_hint
-from needle_common.files.bag_records import RUN_RECORD
-from needle_common.files.bag_topic import BagTopic
-from needle_common.files.calibration_text import read_calibration
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.discovery import PARAMETERS_OF
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.wait_list import WaitListExecutor
-from needle_common.ros.whole_node import WholeNode
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.files.bag_path import recover_hint
+from needle_core.files.bag_records import RUN_RECORD
+from needle_core.files.bag_topic import BagTopic
+from needle_core.files.calibration_text import read_calibration
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.discovery import PARAMETERS_OF
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.wait_list import WaitListExecutor
+from needle_core.ros.whole_node import WholeNode
 
 HELP = """
 recorder: records every topic of the graph into a bag (a rosbag2 directory with MCAP data).

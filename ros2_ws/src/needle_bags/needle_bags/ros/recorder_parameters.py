@@ -8,8 +8,8 @@ from needle_bags.format.bag_writer import COMPRESSIONS
 from needle_bags.format.topic_choice import TopicChoice
 from needle_bags.recording.recent_messages import RecentMessages
 from needle_bags.recording.recording import RESERVE
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 
 @dataclasses.dataclass(frozen=True)

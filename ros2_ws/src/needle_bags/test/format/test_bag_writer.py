@@ -27,8 +27,8 @@ from needle_bags.recording.recording import (
     Recording,
     open_recording,
 )
-from needle_common.errors import UserError
-from needle_common.files.bag_topic import BagTopic
+from needle_core.errors import UserError
+from needle_core.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"

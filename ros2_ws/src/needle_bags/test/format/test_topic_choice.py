@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from needle_bags.format.topic_choice import TopicChoice
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 TOPICS = ("/needle/tip", "/needle/tip_pose", "/stereo/left/image_raw", "/joint_states")
 

@@ -11,7 +11,7 @@ from needle_bags.player.playback import READ_AHEAD, PlaybackClock, ReadAhead
 from needle_bags.player.player_options import parse_options
 from needle_bags.player.replay_names import is_guarded, marks_a_rig, played_name
 from needle_bags.player.terminal_keys import BACK, FASTER, ON, PAUSE, SLOWER, keys_in
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 SECOND = 1_000_000_000
 TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"

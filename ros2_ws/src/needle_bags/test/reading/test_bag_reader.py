@@ -17,7 +17,7 @@ from needle_bags.format.bag_writer import BagWriter
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import raw_as_sent
 from needle_bags.reading.bag_reader import HealthEvent, Series, _Collector, read_run
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 MakeRun = Callable[..., Path]
 

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 from needle_bags.reading import frames
 from needle_bags.reading.bag_reader import Series, read_run
 from needle_bags.reading.frames import read_frames
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 BAG = Path(__file__).parents[5] / "bags" / "regression"
 TYPES = get_typestore(Stores.ROS2_JAZZY).types

@@ -24,7 +24,7 @@ from needle_bags.format.bag_metadata import (
     write_metadata,
 )
 from needle_bags.format.bag_writer import BagWriter
-from needle_common.files.bag_topic import BagTopic
+from needle_core.files.bag_topic import BagTopic
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPE = "std_msgs/msg/UInt8MultiArray"

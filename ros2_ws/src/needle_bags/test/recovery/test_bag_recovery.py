@@ -24,10 +24,10 @@ from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_reader import read_run
 from needle_bags.recovery import bag_recovery, recover
 from needle_bags.recovery.bag_recovery import recover_bag
-from needle_common.errors import UserError
-from needle_common.files.bag_data import unpack_file
-from needle_common.files.bag_directory import BagDirectory
-from needle_common.files.bag_topic import BagTopic
+from needle_core.errors import UserError
+from needle_core.files.bag_data import unpack_file
+from needle_core.files.bag_directory import BagDirectory
+from needle_core.files.bag_topic import BagTopic
 
 from .numbered_bag import (
     TOPICS,

@@ -14,8 +14,8 @@ from mcap.reader import make_reader
 
 from needle_bags.recovery.bag_recovery import recover_bag
 from needle_bags.recovery.mcap_prefix import last_time
-from needle_common.errors import UserError
-from needle_common.files.bag_directory import BagDirectory
+from needle_core.errors import UserError
+from needle_core.files.bag_directory import BagDirectory
 
 from .numbered_bag import (
     START,

@@ -13,8 +13,8 @@ from needle_analysis.ros import rerun
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.recovery import recover
 from needle_bags.recovery.bag_recovery import recover_bag
-from needle_common.errors import UserError
-from needle_common.files.bag_path import recording_files
+from needle_core.errors import UserError
+from needle_core.files.bag_path import recording_files
 
 from .numbered_bag import RUN, contents, damage, kill, numbers, write
 

@@ -13,7 +13,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
-from needle_common.ros import question
+from needle_core.ros import question
 
 PATIENCE = 20.0
 

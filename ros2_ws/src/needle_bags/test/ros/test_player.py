@@ -34,8 +34,8 @@ from needle_bags.format.bag_metadata import USUAL_QOS
 from needle_bags.format.bag_writer import BagWriter
 from needle_bags.format.message_definitions import full_definition, type_hash
 from needle_bags.ros import player as player_node
-from needle_common.files.bag_topic import BagTopic
-from needle_common.process.ros_domain import own_domain
+from needle_core.files.bag_topic import BagTopic
+from needle_core.process.ros_domain import own_domain
 
 PATIENCE = 30.0
 START = 1_700_000_000_000_000_000

@@ -19,23 +19,23 @@ from needle_bringup.operator.input_device import InputDevice
 from needle_bringup.operator.joy_source import JoySource
 from needle_bringup.operator.retraction import RETRACT, STOP_STEERING, Retraction
 from needle_bringup.ros.operator_parameters import JOY, OperatorParameters
-from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.messages import HOLD_LIFETIME
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import (
+from needle_core.commands.cli import EXIT_DONE
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.messages import HOLD_LIFETIME
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import (
     LOOK_PERIOD,
     STEADY_CLOCK,
     DiagnosticsPublisher,
     executor_of,
     run_node,
 )
-from needle_common.ros.bounded_subscription import listen
-from needle_common.ros.conversions import HOLD, LATCHED, to_nanoseconds, values_of
-from needle_common.ros.hold_topic import HoldTopic
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
+from needle_core.ros.bounded_subscription import listen
+from needle_core.ros.conversions import HOLD, LATCHED, to_nanoseconds, values_of
+from needle_core.ros.hold_topic import HoldTopic
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 
 HELP = """\
 operator: holds the needle's switch for a person: a foot pedal, a key, a joystick.

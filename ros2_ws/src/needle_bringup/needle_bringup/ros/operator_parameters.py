@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 
 from needle_bringup.operator.controls import Controls
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 PEDAL, JOYSTICK, JOY = "pedal", "joystick", "joy"
 _NONE = -1

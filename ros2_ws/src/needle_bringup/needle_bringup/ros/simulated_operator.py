@@ -23,17 +23,17 @@ from needle_bringup.simulated_operator.operator_sequence import (
 )
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import PROGRESS_FD, Progress
-from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.process.end_request import EndRequest
-from needle_common.process.reach import DISCOVERY, is_open
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
-from needle_common.ros.discovery import PARAMETERS_OF, RECORDER, full_name, publishers_of
-from needle_common.ros.hold_topic import HoldTopic
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.process.end_request import EndRequest
+from needle_core.process.reach import DISCOVERY, is_open
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.conversions import LATCHED, RELIABLE, values_of
+from needle_core.ros.discovery import PARAMETERS_OF, RECORDER, full_name, publishers_of
+from needle_core.ros.hold_topic import HoldTopic
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 
 HELP = """\
 simulated_operator: stands in for the person who holds the needle's switch, in simulation.

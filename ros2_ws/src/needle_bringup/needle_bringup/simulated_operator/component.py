@@ -9,9 +9,9 @@ from needle_bringup.simulated_operator.operator_sequence import (
     ServiceCall,
 )
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
-from needle_common import messages as m
-from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
+from needle_core.component import (
     BEST_EFFORT,
     LATCHED,
     Actions,
@@ -27,7 +27,7 @@ from needle_common.component import (
     Publish,
     Timer,
 )
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic, Level
 
 HOLD = "device/hold"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"

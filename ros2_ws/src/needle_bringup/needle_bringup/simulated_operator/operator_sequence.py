@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 
-from needle_common.process.claim import WAY_OUT
+from needle_core.process.claim import WAY_OUT
 
 
 @dataclasses.dataclass(frozen=True)

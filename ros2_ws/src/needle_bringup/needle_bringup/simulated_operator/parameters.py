@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 
 @dataclasses.dataclass(frozen=True)

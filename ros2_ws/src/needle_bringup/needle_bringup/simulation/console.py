@@ -18,13 +18,13 @@ from needle_bringup.simulation.rig_configuration import (
     write_parameters,
 )
 from needle_bringup.simulation.simulate import ROS_ARGUMENTS
-from needle_common.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
-from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
-from needle_common.process.end_request import EndRequest
-from needle_common.process.reach import settle_environment
-from needle_common.process.ros_domain import own_domain
-from needle_common.settings.parameter_files import Parameters
+from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
+from needle_core.errors import UserError
+from needle_core.files.installed import find_executable
+from needle_core.process.end_request import EndRequest
+from needle_core.process.reach import settle_environment
+from needle_core.process.ros_domain import own_domain
+from needle_core.settings.parameter_files import Parameters
 
 LOOPBACK = "127.0.0.1"
 _POLL = 0.1

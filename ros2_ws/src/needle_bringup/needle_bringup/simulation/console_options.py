@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 
 from needle_bringup.simulation.simulate_options import SimulateOptions, parse
-from needle_common.commands.options import CommandParser, join_start, whole_number
+from needle_core.commands.options import CommandParser, join_start, whole_number
 
 DESCRIPTION = """\
 Steer a simulated needle by hand, in a browser, in real time.

@@ -15,8 +15,8 @@ from needle_bringup.simulation.rig_configuration import (
     merge,
 )
 from needle_bringup.simulation.simulate_options import existing_file, parse
-from needle_common.errors import UserError
-from needle_common.settings.parameter_files import Parameters, read_parameters
+from needle_core.errors import UserError
+from needle_core.settings.parameter_files import Parameters, read_parameters
 
 LAUNCHED_PACKAGES = {**PACKAGES, "player": "needle_bags", "live_view": "needle_analysis"}
 """Package of each node that a launch file starts."""

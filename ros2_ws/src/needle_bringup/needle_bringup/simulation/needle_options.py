@@ -7,7 +7,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from needle_common.settings.parameter_files import Parameters
+from needle_core.settings.parameter_files import Parameters
 
 CURVATURE, DIAMETER, PRE_BEND, LEAN = 1.0 / 0.122, 0.7e-3, math.radians(10.0), math.radians(5.6)
 """The needle of [KC09], every node's default: curvature [1/m], diameter [m], bend, lean [rad]."""

@@ -6,8 +6,8 @@ import importlib
 import sys
 from pathlib import Path
 
-from needle_common.component import Component
-from needle_common.errors import UserError
+from needle_core.component import Component
+from needle_core.errors import UserError
 
 
 def own_component(given: str) -> Component:

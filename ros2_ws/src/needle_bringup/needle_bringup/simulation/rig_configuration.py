@@ -14,8 +14,8 @@ import yaml
 
 from needle_bringup.simulation.needle_options import needle_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of
-from needle_common.errors import UserError
-from needle_common.settings.parameter_files import Parameters
+from needle_core.errors import UserError
+from needle_core.settings.parameter_files import Parameters
 
 # Node -> its package, in the order in which they start.
 PACKAGES = {

@@ -27,7 +27,7 @@ from needle_bringup.simulation.rig_configuration import (
     write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of, parse
-from needle_common.commands.cli import (
+from needle_core.commands.cli import (
     EXIT_BAD_INPUT,
     EXIT_DONE,
     EXIT_MISSED,
@@ -35,13 +35,13 @@ from needle_common.commands.cli import (
     run_command,
     write_json,
 )
-from needle_common.commands.executables import loaded
-from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
-from needle_common.process.end_request import EndRequest
-from needle_common.process.reach import settle_environment
-from needle_common.process.ros_domain import own_domain
-from needle_common.settings.parameter_files import Parameters, read_parameters
+from needle_core.commands.executables import loaded
+from needle_core.errors import UserError
+from needle_core.files.installed import find_executable
+from needle_core.process.end_request import EndRequest
+from needle_core.process.reach import settle_environment
+from needle_core.process.ros_domain import own_domain
+from needle_core.settings.parameter_files import Parameters, read_parameters
 
 LOGS = "logs"
 PARAMETERS = "parameters.yaml"

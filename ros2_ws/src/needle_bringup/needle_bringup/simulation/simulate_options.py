@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from needle_common.commands.options import (
+from needle_core.commands.options import (
     CommandParser,
     join_start,
     number,
@@ -16,7 +16,7 @@ from needle_common.commands.options import (
     start,
     whole_number,
 )
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 DESCRIPTION = """\
 Steer a simulated needle into a plane with the real node graph, record it, and report how it went.

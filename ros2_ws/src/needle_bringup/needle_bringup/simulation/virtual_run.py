@@ -13,18 +13,18 @@ from needle_bags.recording.bag_tap import BagTap
 from needle_bringup.simulated_operator.component import SimulatedOperator
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
 from needle_bringup.simulated_operator.progress import Progress
-from needle_common.can_frame import CAN
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
-from needle_common.component import Action, Component, Exit, Output, Publish
-from needle_common.errors import UserError
-from needle_common.files.calibration_text import read_calibration
-from needle_common.files.installed import find_shared
-from needle_common.messages import Status
-from needle_common.runners.virtual import DIAGNOSTICS, LOG, Compute, VirtualRunner, uniform
-from needle_common.settings.parameter_fields import from_values
-from needle_common.settings.parameter_files import Parameters
 from needle_controller.plane_controller import STATUS, PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.can_frame import CAN
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_core.component import Action, Component, Exit, Output, Publish
+from needle_core.errors import UserError
+from needle_core.files.calibration_text import read_calibration
+from needle_core.files.installed import find_shared
+from needle_core.messages import Status
+from needle_core.runners.virtual import DIAGNOSTICS, LOG, Compute, VirtualRunner, uniform
+from needle_core.settings.parameter_fields import from_values
+from needle_core.settings.parameter_files import Parameters
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 

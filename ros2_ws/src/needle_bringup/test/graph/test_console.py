@@ -23,8 +23,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from needle_common.process.reach import DISCOVERY_RANGE
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
+from needle_core.process.reach import DISCOVERY_RANGE
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, values_of
 
 CHROMIUM = "/usr/bin/chromium"
 MISSING = [name for name in ("nicegui", "playwright") if importlib.util.find_spec(name) is None]

@@ -12,8 +12,8 @@ from unittest import mock
 import pytest
 
 from code_lines import ROOT
-from needle_common.files.installed import find_executable
-from needle_common.settings.parameter_files import NODES
+from needle_core.files.installed import find_executable
+from needle_core.settings.parameter_files import NODES
 from reference.rig_nodes import executables
 
 MODULES = {name: module for _, name, module in executables("node")}

@@ -17,9 +17,9 @@ from pathlib import Path
 import pytest
 
 from needle_bringup.simulation.node_process import NodeProcess, stop
-from needle_common.files.installed import find_executable
-from needle_common.process.reach import DISCOVERY_RANGE, PROFILES
-from needle_common.process.ros_domain import own_domain, ports_of
+from needle_core.files.installed import find_executable
+from needle_core.process.reach import DISCOVERY_RANGE, PROFILES
+from needle_core.process.ros_domain import own_domain, ports_of
 
 LIMIT = 30.0
 ADDRESS, STRANGER = "10.213.77.1", "10.213.77.2"

@@ -14,9 +14,9 @@ from std_srvs.srv import Trigger
 
 from needle_bringup.operator.controls import Controls
 from needle_bringup.ros.operator_parameters import OperatorParameters
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import RELIABLE, to_nanoseconds
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import RELIABLE, to_nanoseconds
 from operator_scene import OperatorScene, RigNode
 
 INSERT, RETRACT, STOP = 0, 1, 2

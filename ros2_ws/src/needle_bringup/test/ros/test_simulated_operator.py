@@ -11,8 +11,8 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.context import Context
 from std_srvs.srv import SetBool, Trigger
 
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import LATCHED, to_nanoseconds
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import LATCHED, to_nanoseconds
 from operator_scene import OperatorScene, RigNode
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from needle_bringup.simulation.console import console, console_parameters
 from needle_bringup.simulation.console_options import ConsoleOptions, parse_console
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 
 def test_a_rig_runs_in_real_time_without_a_stand_in_or_a_recorder() -> None:

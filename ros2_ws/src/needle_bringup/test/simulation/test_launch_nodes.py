@@ -15,9 +15,9 @@ from needle_bringup.simulation.launch_nodes import (
     replayed_nodes,
     simulated_nodes,
 )
-from needle_common.errors import UserError
-from needle_common.files.installed import find_shared
-from needle_common.settings.parameter_files import Parameters
+from needle_core.errors import UserError
+from needle_core.files.installed import find_shared
+from needle_core.settings.parameter_files import Parameters
 
 
 def simulated(**arguments: str) -> Parameters:

@@ -18,8 +18,8 @@ from needle_bringup.simulation.needle_options import (
 )
 from needle_bringup.simulation.rig_configuration import NODES, command_line_parameters, merge
 from needle_bringup.simulation.simulate_options import parse
-from needle_common.errors import UserError
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.sim_rig_parameters import SimRigParameters
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters

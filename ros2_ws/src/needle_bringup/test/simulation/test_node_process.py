@@ -6,7 +6,7 @@ import textwrap
 from pathlib import Path
 
 from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 
 
 def start(tmp_path: Path, script: str) -> NodeProcess:

@@ -9,10 +9,10 @@ import pytest
 
 from needle_bringup.simulation.own_component import own_component
 from needle_bringup.simulation.simulate_options import parse
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 PROBE = """
-from needle_common.component import Component
+from needle_core.component import Component
 
 class Probe(Component):
     name = "probe"

@@ -13,9 +13,9 @@ from needle_bringup.simulation.rig_configuration import (
     write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.errors import UserError
-from needle_common.settings.parameter_files import NODES, read_parameters
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
+from needle_core.settings.parameter_files import NODES, read_parameters
 
 
 def test_the_start_is_converted_to_si_and_to_an_offset_of_the_plane() -> None:

@@ -10,8 +10,8 @@ from needle_bringup.simulation.simulate_options import (
     command_of,
     parse,
 )
-from needle_common.errors import UserError
 from needle_controller.presets.steering_settings import PRESETS
+from needle_core.errors import UserError
 
 
 def test_every_preset_of_the_controller_can_be_asked_for() -> None:

@@ -13,9 +13,9 @@ from needle_analysis.ros import rerun
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components, run_virtually
-from needle_common.component import Output
-from needle_common.runners.faults import Fault, delay, drop, duplicate
-from needle_common.runners.virtual import VirtualRunner
+from needle_core.component import Output
+from needle_core.runners.faults import Fault, delay, drop, duplicate
+from needle_core.runners.virtual import VirtualRunner
 from needle_sim.sim_rig import SimRig
 
 SHORT = ("--level", "tip", "--depth-mm", "10")

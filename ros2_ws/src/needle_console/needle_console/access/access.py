@@ -8,7 +8,7 @@ import ipaddress
 from collections.abc import Sequence
 from urllib.parse import SplitResult, urlsplit
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 SHORTEST_TOKEN, LONGEST_TOKEN = 16, 100
 """Length of a token [characters]."""

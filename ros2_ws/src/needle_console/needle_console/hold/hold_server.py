@@ -18,12 +18,12 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from needle_common.errors import UserError
 from needle_console.access.access import Access
 from needle_console.hold.hold_state import HoldState
 from needle_console.hold.hold_talk import PERIOD, HoldTalk
 from needle_console.hold.page_message import LONGEST, GarbageError, read_token
 from needle_console.hold.refusals import Refusal
+from needle_core.errors import UserError
 
 PATH = "/hold"
 _MOST_CONNECTIONS = 32

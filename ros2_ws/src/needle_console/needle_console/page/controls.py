@@ -7,11 +7,11 @@ from typing import Any
 
 from nicegui import events, ui
 
-from needle_common.errors import UserError
 from needle_console.page.desk import Desk
 from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot
 from needle_console.view.targets import plane_pose, target_point
+from needle_core.errors import UserError
 
 _STEPS = (Button.CONFIRM, Button.HOME, Button.ENABLE, Button.START)
 _OTHERS = (Button.RESET, Button.SWITCH_OFF)

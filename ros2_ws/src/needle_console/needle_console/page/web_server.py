@@ -12,12 +12,12 @@ import uvicorn
 from fastapi import FastAPI, Response
 from nicegui import app, ui
 
-from needle_common.errors import UserError
 from needle_console.access.access import Access
 from needle_console.page.console_page import ConsolePage, HoldLink
 from needle_console.page.desk import Desk
 from needle_console.page.gate import Gate
 from needle_console.view.camera_feed import SIDES
+from needle_core.errors import UserError
 
 STATIC = Path(__file__).resolve().parents[1] / "static"
 # So long a page has to hear that the end has come; then without it, and at last by force [s].

@@ -8,13 +8,13 @@ from functools import partial
 
 from rclpy.node import Node
 
-from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import executor_of, run_node
 from needle_console.access.access import Access
 from needle_console.page.desk import Desk
 from needle_console.ros.console_node import ConsoleNode
 from needle_console.ros.console_parameters import ConsoleParameters
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import executor_of, run_node
 
 # What cannot wait has threads of its own: a signal is seen so late at most [s].
 _LOOK_PERIOD = 0.2

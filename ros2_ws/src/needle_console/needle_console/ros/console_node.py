@@ -11,16 +11,6 @@ from typing import Any, Protocol
 
 from geometry_msgs.msg import PointStamped, PoseStamped
 
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
-from needle_common.files.installed import find_shared
-from needle_common.messages import HOLD_LIFETIME
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
-from needle_common.ros.conversions import LATCHED, to_quaternion
-from needle_common.ros.hold_topic import HoldTopic
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
 from needle_console.access.access import Access
 from needle_console.hold.hold_state import OWNER, HoldState
 from needle_console.hold.retraction import Retraction
@@ -32,6 +22,16 @@ from needle_console.view.advice import STEERING, Button
 from needle_console.view.camera_feed import CameraFeed
 from needle_console.view.rig_picture import RigPicture
 from needle_console.view.snapshot import Array
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
+from needle_core.files.installed import find_shared
+from needle_core.messages import HOLD_LIFETIME
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
+from needle_core.ros.conversions import LATCHED, to_quaternion
+from needle_core.ros.hold_topic import HoldTopic
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import stereo_views
 

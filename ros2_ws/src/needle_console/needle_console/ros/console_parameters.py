@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 
 @dataclasses.dataclass(frozen=True)

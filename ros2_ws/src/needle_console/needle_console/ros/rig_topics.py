@@ -15,10 +15,10 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import Image, JointState
 
-from needle_common.ros.conversions import IMAGES_BEST_EFFORT, LATCHED, RELIABLE, values_of
 from needle_console.view.camera_feed import SIDES, CameraFeed
 from needle_console.view.rig_picture import RigPicture
 from needle_console.view.snapshot import Array
+from needle_core.ros.conversions import IMAGES_BEST_EFFORT, LATCHED, RELIABLE, values_of
 from needle_tracker.optics.calibration import rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
 

@@ -9,9 +9,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from needle_common.foreign_text import plain
 from needle_console.view.rig_state import controller_state, device_state
 from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot
+from needle_core.foreign_text import plain
 
 # Estimates that are closer together are drawn as one [m].
 SPACING = 2.5e-4

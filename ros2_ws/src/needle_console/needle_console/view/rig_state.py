@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Mapping
 
-from needle_common.foreign_text import plain
+from needle_core.foreign_text import plain
 
 _LONGEST_TEXT = 200
 

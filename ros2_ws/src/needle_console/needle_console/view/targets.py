@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from needle_common.settings.bounds import check_bounds
 from needle_console.view.snapshot import Array
+from needle_core.settings.bounds import check_bounds
 
 LARGEST_OFFSET_MM, LARGEST_TILT_DEG, LARGEST_MM = 50.0, 45.0, 150.0
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from needle_common.errors import UserError
 from needle_console.access.access import Access
 from needle_console.access.rate_limit import RateLimit
+from needle_core.errors import UserError
 
 TOKEN = "correct horse battery"
 

@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hold_scene import Scene
-from needle_common.messages import HOLD_LIFETIME
 from needle_console.hold.hold_arbiter import IDLE, MOST_PAGES, SILENCE
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.hold.hold_talk import PERIOD
 from needle_console.hold.nonces import Nonces
 from needle_console.hold.page_session import ECHO_AGE_LIMIT
 from needle_console.hold.refusals import Refusal
+from needle_core.messages import HOLD_LIFETIME
 
 
 def test_a_press_after_a_release_counts_with_its_speed_and_mode() -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from needle_common.errors import UserError
 from needle_console.access.access import Access
 from needle_console.hold.hold_arbiter import MOST_PAGES
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
+from needle_core.errors import UserError
 
 pytest.importorskip("websockets", reason="the console's lock is not installed: scripts/console")
 

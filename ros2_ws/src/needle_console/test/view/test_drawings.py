@@ -9,8 +9,6 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
-from needle_common.files.installed import find_shared
 from needle_console.view.camera_feed import CameraFeed
 from needle_console.view.chart import chart
 from needle_console.view.dial import dial
@@ -24,6 +22,8 @@ from needle_console.view.space import (
     to_view,
 )
 from needle_console.view.targets import plane_pose, target_point
+from needle_core.errors import UserError
+from needle_core.files.installed import find_shared
 from needle_tracker.optics.calibration import load_calibration
 from needle_tracker.optics.refraction import RefractedCamera, stereo_views
 

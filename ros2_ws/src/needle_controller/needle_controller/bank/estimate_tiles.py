@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 # Read by compiled code.
 LANES = 64

@@ -8,8 +8,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import Bounds, check_bounded_fields
 from needle_controller.bank.estimate_tiles import NOISES
 from needle_controller.bank.hypotheses import (
     LASTING,
@@ -20,6 +18,8 @@ from needle_controller.bank.hypotheses import (
     TorsionHypothesis,
 )
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
+from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 TORSION_HYPOTHESES = (
     TorsionHypothesis(0.0, 0.0, 0.0, 0.52),

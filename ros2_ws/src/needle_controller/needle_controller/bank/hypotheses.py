@@ -6,9 +6,9 @@ import dataclasses
 import math
 from typing import Annotated
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import Bounds, check_bounded_fields
 from needle_controller.bank.estimate_tiles import NOISES
+from needle_core.errors import UserError
+from needle_core.settings.bounds import Bounds, check_bounded_fields
 
 
 @dataclasses.dataclass(frozen=True)

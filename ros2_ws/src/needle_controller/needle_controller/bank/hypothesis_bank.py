@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
     E_TURN,
     ERROR,
@@ -38,6 +37,7 @@ from needle_controller.bank.tip_update import (
     take_tip,
 )
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 _NEWEST_SHARE = 0.1
 

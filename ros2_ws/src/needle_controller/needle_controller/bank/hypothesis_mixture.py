@@ -10,7 +10,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
     E_TURN,
@@ -36,6 +35,7 @@ from needle_controller.bank.hypotheses import LASTING
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes, rotation_from_angles
 from needle_controller.observers.estimator import Estimate
+from needle_core.compiled import compiled
 
 (
     T_ROLL,

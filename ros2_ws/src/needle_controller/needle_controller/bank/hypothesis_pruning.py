@@ -8,7 +8,6 @@ import math
 
 import numpy as np
 
-from needle_common.compiled import compiled
 from needle_controller.bank.estimate_tiles import (
     E_KAPPA,
     E_SCALE,
@@ -31,6 +30,7 @@ from needle_controller.bank.estimate_tiles import (
 )
 from needle_controller.bank.tip_update import rotate
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 _SAME_LAG = 0.001
 _SHAPES = 3.0

@@ -5,7 +5,7 @@ Written so that a compiler can do several at once: no calls to the mathematical 
 
 from __future__ import annotations
 
-from needle_common.compiled import inlined
+from needle_core.compiled import inlined
 
 FAR = 5.5
 """Bounds beyond so many standard deviations count as none."""

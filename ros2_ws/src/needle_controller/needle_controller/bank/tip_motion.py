@@ -8,7 +8,6 @@ terms "one element gains a multiple of another", each of which is one line for t
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
-from needle_common.compiled import compiled, inlined
 from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
     E_KAPPA,
@@ -30,6 +29,7 @@ from needle_controller.bank.estimate_tiles import (
 from needle_controller.bank.filter_settings import Drift
 from needle_controller.bank.torsion_model import turn_tip
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled, inlined
 
 LARGEST_TURN = 1.0
 """Most that an advance may turn the base at once [rad]; larger ones are to be divided."""

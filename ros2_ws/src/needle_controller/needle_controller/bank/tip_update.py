@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import math
 
-from needle_common.compiled import compiled, inlined
 from needle_controller.bank.estimate_tiles import (
     BEHIND_PLAY,
     E_KAPPA,
@@ -53,6 +52,7 @@ from needle_controller.bank.hypotheses import LASTING, NORMAL, UNIFORM
 from needle_controller.bank.normal_moments import falling_exponential, truncated_moments
 from needle_controller.bank.tip_motion import rotation_factors
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled, inlined
 
 FOUND, READ, ALONG, BOUND = 0, 1, 4, 13
 READING_ROWS = 16

@@ -10,8 +10,8 @@ L.
 # ruff: noqa: PLR0917
 from __future__ import annotations
 
-from needle_common.compiled import inlined
 from needle_controller.bank.normal_moments import falling_exponential
+from needle_core.compiled import inlined
 
 _SHORT_RAMP = 1e-3
 

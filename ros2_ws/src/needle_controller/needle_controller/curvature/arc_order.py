@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
 
 _CLIPPED = 3.0  # outliers count as if they were so many standard deviations off
 _NEIGHBOURS = 8  # within this share of all tips, two are neighbours

@@ -8,13 +8,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
 from needle_controller.curvature.curvature_fit import (
     CurvatureFit,
     CurvatureFitSettings,
     checked_tips,
     fit_curvature,
 )
+from needle_core.errors import UserError
 
 _CONTRADICTION = 4.0
 """Standard deviations beyond which the tips contradict a prior."""

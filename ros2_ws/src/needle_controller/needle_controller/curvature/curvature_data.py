@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from needle_common.errors import OutOfBoundsError, UserError
 from needle_controller.model.arrays import Array
+from needle_core.errors import OutOfBoundsError, UserError
 
 _COORDINATES = ("x_m", "y_m", "z_m")
 _LARGEST_COORDINATE = 1.0
@@ -162,7 +162,7 @@ def read_bag(path: Path) -> InsertionRecord:
     are left out.
     """
     # Here, for reading a CSV does without.
-    from needle_common.files.bag_directory import BagDirectory  # noqa: PLC0415
+    from needle_core.files.bag_directory import BagDirectory  # noqa: PLC0415
 
     tips: dict[int, list[float]] = {}
     joints: dict[int, list[float]] = {}

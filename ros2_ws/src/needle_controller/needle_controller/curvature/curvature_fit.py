@@ -24,8 +24,6 @@ from typing import Annotated
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 from needle_controller.curvature.insertion_arc import (
     BEND,
     ENTRY,
@@ -36,6 +34,8 @@ from needle_controller.curvature.insertion_arc import (
     headings,
 )
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
+from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 
 FEWEST_TIPS = 8
 SHORTEST_ARC = 0.01

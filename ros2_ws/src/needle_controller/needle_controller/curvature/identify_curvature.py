@@ -10,7 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from needle_common.commands.cli import (
+from needle_controller.curvature.arc_order import check_order
+from needle_controller.curvature.circle_fit import circle_curvature
+from needle_controller.curvature.curvature_checks import CheckedFit, fit_checked
+from needle_controller.curvature.curvature_data import InsertionRecord, read_record
+from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+from needle_core.commands.cli import (
     EXIT_DONE,
     EXIT_MISSED,
     JsonValue,
@@ -18,13 +23,8 @@ from needle_common.commands.cli import (
     run_command,
     write_json,
 )
-from needle_common.commands.options import CommandParser, number, output_file
-from needle_common.errors import UserError
-from needle_controller.curvature.arc_order import check_order
-from needle_controller.curvature.circle_fit import circle_curvature
-from needle_controller.curvature.curvature_checks import CheckedFit, fit_checked
-from needle_controller.curvature.curvature_data import InsertionRecord, read_record
-from needle_controller.curvature.curvature_fit import CurvatureFitSettings
+from needle_core.commands.options import CommandParser, number, output_file
+from needle_core.errors import UserError
 
 DESCRIPTION = """\
 Find the curvature of the needle's path in a tissue, from an insertion without rotation.

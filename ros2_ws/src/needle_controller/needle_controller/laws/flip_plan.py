@@ -13,8 +13,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import OutOfBoundsError, UserError
 from needle_controller.model.arrays import Array
+from needle_core.errors import OutOfBoundsError, UserError
 
 
 @dataclasses.dataclass(frozen=True)

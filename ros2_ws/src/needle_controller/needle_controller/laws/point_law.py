@@ -15,14 +15,14 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import OutOfBoundsError
-from needle_common.settings.bounds import check_bounded_fields
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.point_turns import PointLawSettings, point_turns
 from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.feedback_linearization import virtual_input
 from needle_controller.model.kinematics import ROLL
 from needle_controller.observers.estimator import Estimate
+from needle_core.errors import OutOfBoundsError
+from needle_core.settings.bounds import check_bounded_fields
 
 
 class PointLaw:

@@ -9,8 +9,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from needle_common.compiled import compiled
-from needle_common.settings.bounds import Bounds
 from needle_controller.bank.hypothesis_mixture import (
     T_AGREEMENT,
     T_LAG,
@@ -20,6 +18,8 @@ from needle_controller.bank.hypothesis_mixture import (
 )
 from needle_controller.laws.roll_turns import allowed_turn, base_turn
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
+from needle_core.settings.bounds import Bounds
 
 _BEVEL = -0.5 * math.pi
 """Direction to which a needle bends, about its heading from its own x axis [rad]: -y."""

@@ -12,7 +12,6 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.settings.bounds import check_bounded_fields
 from needle_controller.bank.hypothesis_mixture import (
     COLUMNS,
     T_AGREEMENT,
@@ -26,6 +25,7 @@ from needle_controller.laws.law import SteeringCommand
 from needle_controller.laws.roll_turns import RollLawSettings, roll_turns
 from needle_controller.model.kinematics import PITCH, ROLL, X
 from needle_controller.observers.estimator import Estimate
+from needle_core.settings.bounds import check_bounded_fields
 
 
 class RollLaw:

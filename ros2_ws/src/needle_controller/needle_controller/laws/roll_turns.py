@@ -9,8 +9,6 @@ from typing import Annotated, NamedTuple
 
 import numpy as np
 
-from needle_common.compiled import compiled
-from needle_common.settings.bounds import Bounds
 from needle_controller.bank.hypothesis_mixture import (
     T_AGREEMENT,
     T_BEHIND_PLAY,
@@ -22,6 +20,8 @@ from needle_controller.bank.hypothesis_mixture import (
     T_WEIGHT,
 )
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
+from needle_core.settings.bounds import Bounds
 
 _SMALLEST_LAG = 1e-6
 _USUAL_LAG = 0.008

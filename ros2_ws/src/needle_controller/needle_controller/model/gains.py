@@ -16,9 +16,9 @@ import functools
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import A, C, transition
+from needle_core.errors import UserError
 
 _SAME_LENGTH = 12
 """Digits to which lengths of steps agree."""

@@ -13,10 +13,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.reachability import LARGEST_PITCH, Reachability
 from needle_controller.model.target_plane import RIG
+from needle_core.errors import UserError
 
 
 def point_from_message(frame_id: str, position: npt.ArrayLike) -> Array:

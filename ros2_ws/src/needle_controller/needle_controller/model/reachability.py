@@ -17,8 +17,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import OutOfBoundsError, UserError
 from needle_controller.model.arrays import Array
+from needle_core.errors import OutOfBoundsError, UserError
 
 LARGEST_PITCH = math.radians(80.0)
 """Beyond this the coordinates (3) fail, and no needle should go there."""

@@ -7,10 +7,10 @@ import dataclasses
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.reachability import check_offset
+from needle_core.errors import UserError
 
 _UNIT_TOLERANCE = 1e-3
 RIG = "rig"

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 
 @compiled

@@ -8,11 +8,11 @@ import math
 
 import numpy as np
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
 from needle_controller.planning.legs import MOST_POINTS, cut_short, leg_length, leg_towards, trace
 from needle_controller.planning.path_settings import PathSettings, Unknown
 from needle_controller.planning.segments import segment_distance
+from needle_core.compiled import compiled
 
 
 @compiled

@@ -14,8 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 _TURN_ITERATIONS = 10
 _TURN_FOUND = 2e-3

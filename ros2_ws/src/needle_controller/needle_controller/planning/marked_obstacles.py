@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from needle_common.errors import UserError
-from needle_common.messages import Marker, Markers
 from needle_controller.model.kinematics import rotation_from_quaternion
 from needle_controller.model.target_plane import RIG
 from needle_controller.planning.obstacles import Obstacle, Obstacles
+from needle_core.errors import UserError
+from needle_core.messages import Marker, Markers
 
 # Of visualization_msgs/Marker.
 SPHERE, CYLINDER = 2, 3

@@ -9,10 +9,10 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import check_bounds
 from needle_controller.model.arrays import Array
 from needle_controller.planning.segments import segment_distance
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
 
 MOST_OBSTACLES = 64
 FARTHEST = 1.0

@@ -14,13 +14,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.settings.bounds import check_bounded_fields, check_bounds
 from needle_controller.model.arrays import Array
 from needle_controller.planning.clearance import assess
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.path_search import MOST_VIA_POINTS, search
 from needle_controller.planning.path_settings import PathSettings, Unknown
 from needle_controller.planning.via_points import candidate_points
+from needle_core.settings.bounds import check_bounded_fields, check_bounds
 
 _STREWN = 1000
 """Points that a search grows its tree to beside those around the obstacles."""

@@ -17,7 +17,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
 from needle_controller.planning.clearance import chain_margin
 from needle_controller.planning.legs import (
@@ -28,6 +27,7 @@ from needle_controller.planning.legs import (
     trace,
 )
 from needle_controller.planning.path_settings import PathSettings, Unknown
+from needle_core.compiled import compiled
 
 MOST_VIA_POINTS = 6
 _SHORTEST_LEG = 0.004

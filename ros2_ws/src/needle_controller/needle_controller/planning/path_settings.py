@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, NamedTuple
 
-from needle_common.settings.bounds import Bounds
+from needle_core.settings.bounds import Bounds
 
 
 # Read by compiled code.

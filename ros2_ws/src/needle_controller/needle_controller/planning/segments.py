@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 _POINT = 1e-18
 """Square of a length below which a segment counts as a point [m^2]."""

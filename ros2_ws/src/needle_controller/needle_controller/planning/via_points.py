@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from needle_common.compiled import compiled
 from needle_controller.model.arrays import Array
+from needle_core.compiled import compiled
 
 _AROUND = 12
 """Points of a ring."""

@@ -22,8 +22,8 @@ from typing import Any, cast
 
 import numpy as np
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
 
 GROUPS = {
     "estimator": "needle_controller.estimators",

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter, parameter
 from needle_controller.laws.flip_plan import FlipPlan
 from needle_controller.model.arrays import Array
 from needle_controller.model.gains import Gains, gains_by_diagonals
 from needle_controller.model.point_reach import check_point
 from needle_controller.model.target_plane import TargetPlane, check_within_reach, offset_plane
 from needle_controller.presets.own_parts import GROUPS, check_is_offered, own_part
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter, parameter
 
 ONE_SIDED_PRESETS = ("paper", "open_loop")
 """Their coordinates end at roll +-90 deg."""

@@ -15,25 +15,25 @@ from rclpy.qos import QoSProfile
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from needle_common.component import Actions, Diagnose, Input, Log, Moment, Publish
-from needle_common.convert import Converter, from_ros, ros_type
-from needle_common.message_types import rclpy_types
-from needle_common.process.watched_time import WatchedTime
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.conversions import LATCHED, RELIABLE, to_qos
-from needle_common.ros.discovery import (
+from needle_controller.plane_controller import COMMANDS, STATUS, TARGETS, PlaneController
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_controller.protocol.steering_types import SteeringState
+from needle_core.component import Actions, Diagnose, Input, Log, Moment, Publish
+from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.message_types import rclpy_types
+from needle_core.process.watched_time import WatchedTime
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.conversions import LATCHED, RELIABLE, to_qos
+from needle_core.ros.discovery import (
     AnsweringNodes,
     signature,
     unheard,
     unpublished,
     unrecorded,
 )
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_controller.plane_controller import COMMANDS, STATUS, TARGETS, PlaneController
-from needle_controller.presets.steering_settings import SteeringSettings
-from needle_controller.protocol.steering_types import SteeringState
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 
 HELP = """
 plane_controller: steers the needle into the target plane, or to the target point, one insertion

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import OutOfBoundsError, UserError
 from needle_controller.bank.estimate_tiles import SCALE, rows
 from needle_controller.bank.filter_settings import ROLL_HYPOTHESES, FilterSettings
 from needle_controller.bank.hypotheses import (
@@ -29,6 +28,7 @@ from needle_controller.bank.hypothesis_mixture import (
 from needle_controller.laws.roll_law import RollLaw
 from needle_controller.laws.roll_turns import RollLawSettings, roll_turns
 from needle_controller.model.kinematics import rotation_from_angles
+from needle_core.errors import OutOfBoundsError, UserError
 
 from .needles import (
     CURVATURE,

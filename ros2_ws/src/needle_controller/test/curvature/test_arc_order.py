@@ -9,11 +9,11 @@ import pytest
 from numpy.random import Generator, default_rng
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import UserError
 from needle_controller.curvature.arc_order import check_order, order
 from needle_controller.curvature.curvature_checks import fit_checked
 from needle_controller.curvature.curvature_fit import CurvatureFitSettings
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant
 
 RADIUS = 0.122

@@ -12,10 +12,10 @@ from numpy.random import default_rng
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from needle_common.errors import UserError
 from needle_controller.curvature.curvature_data import read_record
 from needle_controller.curvature.identify_curvature import main
 from needle_controller.model.arrays import Array
+from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant
 
 from .insertions import RADIUS, STEP, insertion_tips, uniform

@@ -13,7 +13,6 @@ from scipy.linalg import expm
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import OutOfBoundsError
 from needle_controller.bank.hypothesis_mixture import (
     COLUMNS,
     T_AGREEMENT,
@@ -36,6 +35,7 @@ from needle_controller.laws.point_turns import (
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.observers.estimator import Estimate
+from needle_core.errors import OutOfBoundsError
 
 CURVATURE = 1.0 / 0.122
 STEP = 0.001

@@ -8,7 +8,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from needle_common.errors import OutOfBoundsError
 from needle_controller.bank.hypothesis_mixture import (
     COLUMNS,
     T_AGREEMENT,
@@ -27,6 +26,7 @@ from needle_controller.laws.roll_turns import RollLawSettings, base_turn, neares
 from needle_controller.model.arrays import Array
 from needle_controller.model.feedback_linearization import linearized_from_reduced
 from needle_controller.observers.estimator import Estimate
+from needle_core.errors import OutOfBoundsError
 
 CURVATURE = 1.0 / 0.122
 DEG = np.pi / 180.0

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import integrate, linalg
 
-from needle_common.errors import UserError
 from needle_controller.model.feedback_linearization import A, B, C, process_covariance, transition
 from needle_controller.model.gains import Gains, design_gains, held_input, sampled_observer_gain
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.errors import UserError
 
 STD = 0.001 / np.sqrt(3.0)
 WEIGHTS: dict[str, Any] = {

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.point_reach import (
     check_point,
@@ -17,6 +16,7 @@ from needle_controller.model.point_reach import (
     point_reachability,
     widest_at,
 )
+from needle_core.errors import UserError
 
 CURVATURE = 1.0 / 0.122
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from numpy.random import default_rng
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.reachability import (
     LARGEST_PITCH,
@@ -18,6 +17,7 @@ from needle_controller.model.reachability import (
     least_insertion,
     reachability,
 )
+from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
 CURVATURE = 1.0 / 0.122

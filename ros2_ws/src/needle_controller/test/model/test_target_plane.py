@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import UserError
 from needle_controller.model.target_plane import check_within_reach, offset_plane, plane_from_pose
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.tip_gate import (
@@ -14,6 +13,7 @@ from needle_controller.protocol.tip_gate import (
     refuse_message,
     refuse_position,
 )
+from needle_core.errors import UserError
 
 UNIT = [0.0, 0.0, 0.0, 1.0]
 DEPTH = 0.12

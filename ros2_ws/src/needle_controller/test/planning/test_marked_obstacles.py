@@ -5,9 +5,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
-from needle_common.messages import Marker, Markers
 from needle_controller.planning.marked_obstacles import CYLINDER, SPHERE, obstacles_from_markers
+from needle_core.errors import UserError
+from needle_core.messages import Marker, Markers
 
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 CUBE, DELETEALL = 1, 3

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.planning.obstacle_files import read_obstacles
 from needle_controller.planning.obstacles import MOST_OBSTACLES, Obstacle, Obstacles
 from needle_controller.planning.segments import segment_distance
+from needle_core.errors import UserError
 
 SPHERE = Obstacle((0.0, 0.0, 0.05), (0.0, 0.0, 0.05), 0.004)
 

@@ -6,12 +6,12 @@ import math
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.planning.legs import move, seen_from
 from needle_controller.planning.obstacles import Obstacle, Obstacles
 from needle_controller.planning.path_planner import NeedlePath, PathPlanner, TipState
 from needle_controller.planning.path_settings import PathSettings
+from needle_core.errors import UserError
 
 CURVATURE = 1.0 / 0.122
 RATE = math.radians(30.0) / 0.001

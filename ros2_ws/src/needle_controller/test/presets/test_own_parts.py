@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
 from needle_controller.observers.estimator import pose_estimate
 from needle_controller.planning.entry import entry_state
 from needle_controller.planning.obstacles import Obstacle, Obstacles
@@ -21,6 +20,7 @@ from needle_controller.presets.own_planner import tried_planner
 from needle_controller.presets.path_steering import PathSteering
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_core.errors import UserError
 
 ESTIMATOR = '''
 import numpy as np

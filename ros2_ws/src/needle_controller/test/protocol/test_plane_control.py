@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
 OFFSET = 0.003

@@ -10,7 +10,6 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import offset_plane
@@ -18,6 +17,7 @@ from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSet
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import POINT_TOLERANCE, next_step
 from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.errors import UserError
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 
 TARGET = (0.008, -0.006, 0.07)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic, Level
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.link.frame_link import FrameLink, LinkError

@@ -6,8 +6,8 @@ import dataclasses
 import math
 from typing import Annotated
 
-from needle_common.errors import OutOfBoundsError, UserError
-from needle_common.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
+from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.settings.bounds import ABOVE_0, Bounds, check_bounded_fields
 from needle_device_driver.link import objects as od
 
 # Methods of CiA 402: to a limit switch or a home switch, or where the axis stands.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 LINKS = ("slcan", "socketcan", "socketcand", "virtual")
 SLCAN_BITRATES = (

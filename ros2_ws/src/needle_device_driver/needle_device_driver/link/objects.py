@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import struct
 
-from needle_common.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError
 
 
 @dataclasses.dataclass(frozen=True)

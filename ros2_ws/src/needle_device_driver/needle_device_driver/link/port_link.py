@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.link.link_settings import LinkSettings
 

@@ -10,7 +10,7 @@ from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.ros.conversions import to_diagnostic_status, to_nanoseconds, to_stamp
+from needle_core.ros.conversions import to_diagnostic_status, to_nanoseconds, to_stamp
 from needle_device_driver.axes.axis_pair import PairSnapshot
 from needle_device_driver.device import device_diagnostic
 from needle_device_driver.supervisor.command import (

@@ -16,23 +16,23 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-from needle_common.commands.cli import EXIT_DONE
-from needle_common.errors import UserError
-from needle_common.process.end_request import EndRequest
-from needle_common.process.reach import DISCOVERY, is_open
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
-from needle_common.ros.discovery import (
+from needle_core.commands.cli import EXIT_DONE
+from needle_core.errors import UserError
+from needle_core.process.end_request import EndRequest
+from needle_core.process.reach import DISCOVERY, is_open
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
+from needle_core.ros.discovery import (
     AnsweringNodes,
     one_too_many,
     unheard,
     unpublished,
     unrecorded,
 )
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameter_desk import ParameterDesk
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeLifecycleNode
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameter_desk import ParameterDesk
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeLifecycleNode
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.cia402.drive_cycle import DriveCycle

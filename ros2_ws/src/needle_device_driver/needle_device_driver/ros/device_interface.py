@@ -15,11 +15,11 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.errors import UserError
-from needle_common.process.claim import WAY_OUT, Claim
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
-from needle_common.ros.bounded_subscription import listen
-from needle_common.ros.conversions import (
+from needle_core.errors import UserError
+from needle_core.process.claim import WAY_OUT, Claim
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
+from needle_core.ros.bounded_subscription import listen
+from needle_core.ros.conversions import (
     ESTOPS_HEARD,
     HOLDS_HEARD,
     JOINT_STATES,
@@ -27,7 +27,7 @@ from needle_common.ros.conversions import (
     RELIABLE,
     to_stamp,
 )
-from needle_common.ros.discovery import publishers_of, signature
+from needle_core.ros.discovery import publishers_of, signature
 from needle_device_driver.device import device_diagnostic
 from needle_device_driver.ros.conversions import (
     to_command,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 
-from needle_common.foreign_text import plain
+from needle_core.foreign_text import plain
 from needle_device_driver.rules import Rule
 
 MAX_SENDERS = 16

@@ -6,8 +6,8 @@ import dataclasses
 import math
 from typing import Any
 
-from needle_common.settings.bounds import ABOVE_0, check_bounds
-from needle_common.settings.parameter_fields import fixed_parameter, specs
+from needle_core.settings.bounds import ABOVE_0, check_bounds
+from needle_core.settings.parameter_fields import fixed_parameter, specs
 
 # No configuration reaches beyond these: they are properties of the rig, not of a run.
 HARD_SPEED_CAP = 0.005

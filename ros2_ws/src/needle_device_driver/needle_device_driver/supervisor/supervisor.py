@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from needle_common.foreign_text import plain
+from needle_core.foreign_text import plain
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg

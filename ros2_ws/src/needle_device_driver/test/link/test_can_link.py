@@ -13,7 +13,7 @@ from pathlib import Path
 import can
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_device_driver.link import socketcand_bus
 from needle_device_driver.link.can_link import CanLink, open_bus
 from needle_device_driver.link.frame_link import LinkError

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from hypothesis import given
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_core.errors import OutOfBoundsError, UserError
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
 from needle_device_driver.link.emergency import describe_error

@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_core.errors import OutOfBoundsError, UserError
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.supervisor import command_stamps, hold, limits, stamp_ages
 from needle_device_driver.supervisor.limits import SafetyLimits

@@ -10,8 +10,8 @@ import termios
 import tty
 from pathlib import Path
 
-from needle_common.can_frame import CanFrame
-from needle_common.errors import UserError
+from needle_core.can_frame import CanFrame
+from needle_core.errors import UserError
 from needle_sim.bus.slcan_adapter import SlcanAdapter
 
 _READ_SIZE = 4096

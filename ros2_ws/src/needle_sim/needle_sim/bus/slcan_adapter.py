@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 
 DONE = b"\r"
 REFUSED = b"\a"

@@ -11,7 +11,7 @@ from typing import TextIO
 import cv2
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.view import GreyImage
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_sim.needle.se3 import FloatArray

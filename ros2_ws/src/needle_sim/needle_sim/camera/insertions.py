@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.image_folder import Truth, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import Scenario

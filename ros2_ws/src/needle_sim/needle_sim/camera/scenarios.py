@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import check_bounds
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from needle_common.errors import UserError
-from needle_common.files.calibration_text import read_calibration
-from needle_common.files.plain_yaml import load_plain
-from needle_common.settings.bounds import ABOVE_0, check_bounds
+from needle_core.errors import UserError
+from needle_core.files.calibration_text import read_calibration
+from needle_core.files.plain_yaml import load_plain
+from needle_core.settings.bounds import ABOVE_0, check_bounds
 from needle_sim.camera.window import SimulatedWindow
 from needle_sim.needle.se3 import FloatArray
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic, Level
 from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.power_state import PowerState
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import enum
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_sim.bus.canopen_device import SYNC
 from needle_sim.drives.drive_motion import MOTION_STEP
 from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings

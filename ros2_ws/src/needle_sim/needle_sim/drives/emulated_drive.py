@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_sim.bus.canopen_device import HEARTBEAT_LOST, CanopenDevice
 from needle_sim.bus.object_dictionary import Abort, SdoAbortError
 from needle_sim.drives.drive_motion import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.drives.emulated_bus import EmulatedBus
 
 AXES = ("insertion", "rotation")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 
 # A path that is shorter than this is a point in any image [m].

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 Metal = Literal["polished", "drawn", "oxide", "painted"]
 Lamps = Literal["softbox", "softboxes", "strip", "room"]

@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 VARIANT = "llvm_ad_mono"
 """Grey light, compiled by LLVM: on one core 5 times as many paths a second as scalar_rgb."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from needle_common.ros.conversions import to_quaternion
+from needle_core.ros.conversions import to_quaternion
 from needle_sim.camera.stereo_rig import SimulatedCamera
 from needle_sim.needle.se3 import FloatArray
 

@@ -14,14 +14,14 @@ from rclpy.node import Node
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
-from needle_common.commands.cli import EXIT_DONE
-from needle_common.errors import UserError
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
+from needle_core.commands.cli import EXIT_DONE
+from needle_core.errors import UserError
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.conversions import JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.bus_health import bus_health

@@ -13,18 +13,18 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Header
 
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
-from needle_common.process.claim import WAY_OUT
-from needle_common.ros.base_node import DiagnosticsPublisher
-from needle_common.ros.conversions import (
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
+from needle_core.process.claim import WAY_OUT
+from needle_core.ros.base_node import DiagnosticsPublisher
+from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
     RELIABLE,
     to_nanoseconds,
     values_of,
 )
-from needle_common.ros.discovery import unheard
+from needle_core.ros.discovery import unheard
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.driven_tick import DrivenTick
 

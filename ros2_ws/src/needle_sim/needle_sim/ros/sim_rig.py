@@ -13,12 +13,12 @@ from rclpy.node import Node
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.process.end_request import EndRequest
-from needle_common.process.watched_time import WatchedTime
-from needle_common.ros.base_node import DiagnosticsPublisher, executor_of, run_node
-from needle_common.ros.conversions import (
+from needle_core.commands.cli import EXIT_DONE
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.process.end_request import EndRequest
+from needle_core.process.watched_time import WatchedTime
+from needle_core.ros.base_node import DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.conversions import (
     LATCHED,
     NANOSECONDS,
     RELIABLE,
@@ -26,10 +26,10 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.ros.discovery import AnsweringNodes, unheard, unpublished, unrecorded
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
+from needle_core.ros.discovery import AnsweringNodes, unheard, unpublished, unrecorded
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.rig.lock_step import Action, LockStep
 from needle_sim.rig.pace import Pace

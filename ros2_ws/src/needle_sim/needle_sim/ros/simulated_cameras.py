@@ -14,7 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.ros.conversions import IMAGES, RELIABLE
+from needle_core.ros.conversions import IMAGES, RELIABLE
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS

@@ -8,8 +8,8 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
-from needle_common.errors import UserError
-from needle_common.ros.base_node import DiagnosticsPublisher
+from needle_core.errors import UserError
+from needle_core.ros.base_node import DiagnosticsPublisher
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.states import Activity

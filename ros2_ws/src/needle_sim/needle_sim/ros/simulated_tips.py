@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.subscription import Subscription
 
-from needle_common.ros.conversions import RELIABLE
+from needle_core.ros.conversions import RELIABLE
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.ros.conversions import to_tip, to_tip_pose
 from needle_sim.sim_rig_parameters import SimRigParameters

@@ -15,9 +15,9 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 from tqdm import tqdm
 
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, number, output_file, whole_number
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, number, output_file, whole_number
+from needle_core.errors import UserError
 from needle_sim.camera.image_folder import ImageFolder
 from needle_sim.camera.insertions import CURVATURE, RenderedPair, render_insertion
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS, Scenario, find_scenario

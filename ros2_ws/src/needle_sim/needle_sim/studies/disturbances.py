@@ -14,7 +14,7 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies import study_noise
 

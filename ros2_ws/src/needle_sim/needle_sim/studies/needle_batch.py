@@ -11,7 +11,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.needle.tissue import Torsion
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.projection import project
 from needle_sim.camera.renderer import StereoRenderer
 from needle_sim.camera.scenarios import SCENARIOS

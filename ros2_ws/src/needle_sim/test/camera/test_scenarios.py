@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.optimize import fsolve
 
-from needle_common.errors import OutOfBoundsError, UserError
+from needle_core.errors import OutOfBoundsError, UserError
 from needle_sim.camera.bubbles import BubbleCloud
 from needle_sim.camera.optics import Optics
 from needle_sim.camera.passing import Event, cable_line, event_at

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.stereo_rig import load_stereo_rig
 
 CALIBRATION = Path(__file__).parents[3] / "needle_tracker" / "config" / "calibration.yaml"

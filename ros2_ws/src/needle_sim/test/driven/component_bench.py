@@ -6,9 +6,9 @@ import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from needle_common import messages as m
-from needle_common.can_frame import CAN, CanFrame
-from needle_common.component import (
+from needle_core import messages as m
+from needle_core.can_frame import CAN, CanFrame
+from needle_core.component import (
     BEST_EFFORT,
     LATCHED,
     Action,
@@ -22,8 +22,8 @@ from needle_common.component import (
     Publish,
     Timer,
 )
-from needle_common.runners.faults import Arrivals, Fault, Link
-from needle_common.runners.virtual import VirtualRunner
+from needle_core.runners.faults import Arrivals, Fault, Link
+from needle_core.runners.virtual import VirtualRunner
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator

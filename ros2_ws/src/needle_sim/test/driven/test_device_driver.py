@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from needle_common.runners.faults import delay, silence
+from needle_core.runners.faults import delay, silence
 from needle_device_driver.device_driver import EXIT_BROKEN
 
 from .component_bench import DRIVER, DRIVES, ComponentBench, losing

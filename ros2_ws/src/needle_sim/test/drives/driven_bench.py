@@ -11,7 +11,7 @@ from typing import Any
 
 import can
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle

@@ -7,7 +7,7 @@ from typing import Any
 
 import canopen
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock

@@ -12,8 +12,8 @@ import can
 import canopen
 import pytest
 
-from needle_common.can_frame import CanFrame
-from needle_common.errors import UserError
+from needle_core.can_frame import CanFrame
+from needle_core.errors import UserError
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_server import DriveServer

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from needle_bags.reading.bag_files import read_messages
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.reports import StepResult
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_sim.bus.slcan_adapter import SlcanAdapter
 
 

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.path_traced.appearance import (
     APPEARANCES,
     FLOORS,

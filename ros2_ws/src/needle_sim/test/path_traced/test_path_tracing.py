@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import SimulatedCamera, StereoRig, load_stereo_rig
 from needle_sim.path_traced.appearance import draw_appearance

@@ -19,8 +19,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import JOINT_STATES, to_nanoseconds
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import JOINT_STATES, to_nanoseconds
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
 LIMIT = 20.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from needle_common.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_sim.sim_rig_parameters import SimRigParameters
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.insertions import random_path, render_insertion
 from needle_sim.camera.scenarios import SCENARIOS

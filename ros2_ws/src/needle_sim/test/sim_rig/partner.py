@@ -18,8 +18,8 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.ros.base_node import STEADY_CLOCK
-from needle_common.ros.conversions import (
+from needle_core.ros.base_node import STEADY_CLOCK
+from needle_core.ros.conversions import (
     HOLD,
     IMAGES,
     JOINT_STATES,

@@ -17,8 +17,8 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import LATCHED, RELIABLE, to_nanoseconds
+from needle_core.errors import UserError
+from needle_core.ros.conversions import LATCHED, RELIABLE, to_nanoseconds
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.ros.sim_rig import SimRigNode
 from own_context import own_context

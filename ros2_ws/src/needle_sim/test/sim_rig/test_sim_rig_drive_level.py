@@ -17,8 +17,8 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_msgs.msg import Bool, Header
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import (
+from needle_core.errors import UserError
+from needle_core.ros.conversions import (
     IMAGES,
     JOINT_STATES,
     LATCHED,

@@ -6,7 +6,7 @@ import dataclasses
 from collections import deque
 from typing import Any
 
-from needle_common.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic, Level
 from needle_tracker.answers.swapped_images import SUSPICION
 from needle_tracker.sources.insertion_history import InsertionHistory
 from needle_tracker.sources.pairing import OTHER_SIDE, PairMatcher

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError
 
 Array = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.optics.calibration import SIDES, StereoCalibration
 from needle_tracker.sources.image_files import Image, open_pairs
 

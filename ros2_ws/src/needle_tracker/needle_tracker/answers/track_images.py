@@ -16,10 +16,10 @@ from typing import Any
 import cv2
 from tqdm import tqdm
 
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, number, output_file
-from needle_common.errors import UserError
-from needle_common.settings.parameter_files import none_for, read_sections, values_for
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, number, output_file
+from needle_core.errors import UserError
+from needle_core.settings.parameter_files import none_for, read_sections, values_for
 from needle_tracker.answers.annotation import Image, annotate
 from needle_tracker.answers.swapped_images import SUSPICION, SwapWatch
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters

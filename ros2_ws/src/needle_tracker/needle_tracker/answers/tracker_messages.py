@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from needle_common.messages import (
+from needle_core.messages import (
     INSERTION_JOINT,
     Image,
     JointState,

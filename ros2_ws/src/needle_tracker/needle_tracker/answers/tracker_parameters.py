@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 from pathlib import Path
 
-from needle_common.errors import UserError
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.answers.pair_answers import PairingSettings
 from needle_tracker.answers.reference_images import read_reference
 from needle_tracker.image.search_grid import Reach

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 from needle_tracker.sources.image_files import read_numbers
 from needle_tracker.tracking.measurement import Measurement
 from needle_tracker.tracking.refusals import TrackState

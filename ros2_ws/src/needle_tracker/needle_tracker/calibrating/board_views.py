@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Session
 from needle_tracker.calibrating.charuco import check_board_seen
 from needle_tracker.calibrating.rig_model import BoardView, Corners

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 from needle_tracker.calibrating.board_views import nothing_seen, views_in_folders
 from needle_tracker.calibrating.calibration_figures import residual_figure, rig_figure, save_figure
 from needle_tracker.calibrating.calibration_outliers import doubts, misfits, square_error

@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.rig_calibration import RigCalibration
 from needle_tracker.calibrating.rig_model import BoardView
 from needle_tracker.optics.calibration import SIDES, Camera

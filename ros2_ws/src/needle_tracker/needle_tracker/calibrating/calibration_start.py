@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.rig_model import BoardView, Corners
 from needle_tracker.optics.calibration import LEAST_BASELINE, SIDES, Camera, StereoCalibration
 from needle_tracker.optics.window import Window

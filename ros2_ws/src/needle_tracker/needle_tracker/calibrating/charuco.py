@@ -15,8 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
-from needle_common.settings.bounds import check_bounds
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
 from needle_tracker.sources.image_files import Image
 
 Array = NDArray[np.float64]

@@ -7,10 +7,10 @@ from argparse import Namespace
 from collections.abc import Sequence
 from pathlib import Path
 
-from needle_common.commands.cli import JsonValue
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
-from needle_common.settings.bounds import check_bounds
+from needle_core.commands.cli import JsonValue
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
 from needle_tracker.calibrating.calibration_check import (
     CAMERAS,
     NOTHING_SHOWN,

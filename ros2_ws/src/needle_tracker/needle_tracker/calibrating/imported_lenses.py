@@ -11,8 +11,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
-from needle_common.files.calibration_text import KALIBR, OPENCV, ROS, foreign_format, read_text
+from needle_core.errors import UserError
+from needle_core.files.calibration_text import KALIBR, OPENCV, ROS, foreign_format, read_text
 from needle_tracker.optics.calibration import (
     SIDES,
     Camera,

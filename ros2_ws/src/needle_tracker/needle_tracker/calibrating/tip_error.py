@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.rig_model import BoardView, Corners, RigModel
 from needle_tracker.optics.calibration import StereoCalibration

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled, inlined
+from needle_core.compiled import compiled, inlined
 
 Ridge = NDArray[np.float32]
 Rows = NDArray[np.int64]

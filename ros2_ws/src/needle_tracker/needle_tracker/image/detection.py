@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_tracker.image.best_paths import Ridge, Rows, best_paths
 from needle_tracker.image.search_grid import SearchGrid
 

@@ -16,7 +16,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled, inlined
+from needle_core.compiled import compiled, inlined
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_tracker.image.detection import Path
 from needle_tracker.image.search_grid import Reach
 from needle_tracker.optics.compiled_projection import pixel_ray

@@ -17,7 +17,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -15,7 +15,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_tracker.image.strip import LEAST_ROWS, STEP_PX
 
 Array = NDArray[np.float64]

@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled, inlined
+from needle_core.compiled import compiled, inlined
 from needle_tracker.optics.calibration import Camera
 
 Array = NDArray[np.float64]

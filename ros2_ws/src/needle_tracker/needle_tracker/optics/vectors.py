@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import inlined
+from needle_core.compiled import inlined
 
 Array = NDArray[np.float64]
 

@@ -15,23 +15,23 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.commands.cli import EXIT_DONE
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.errors import UserError
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import (
+from needle_core.commands.cli import EXIT_DONE
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import (
     LOOK_PERIOD,
     STEADY_CLOCK,
     DiagnosticsPublisher,
     executor_of,
     run_node,
 )
-from needle_common.ros.conversions import IMAGES, to_stamp
-from needle_common.ros.discovery import unheard
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.ros.conversions import IMAGES, to_stamp
+from needle_core.ros.discovery import unheard
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_tracker.optics.calibration import SIDES, Camera, load_calibration
 from needle_tracker.sources.image_files import Image as GreyImage
 from needle_tracker.sources.stereo_source import (

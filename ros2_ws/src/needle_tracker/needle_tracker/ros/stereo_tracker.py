@@ -11,16 +11,16 @@ from typing import Any
 from ament_index_python.packages import get_package_share_directory
 from rclpy.subscription import Subscription
 
-from needle_common.component import Actions, Diagnose, Input, Log, Moment, Publish
-from needle_common.convert import Converter, from_ros, ros_type
-from needle_common.files.calibration_text import read_calibration
-from needle_common.message_types import rclpy_types
-from needle_common.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_common.ros.conversions import to_qos
-from needle_common.ros.discovery import AnsweringNodes, unpublished, unrecorded
-from needle_common.ros.life_signs import LifeSigns
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
+from needle_core.component import Actions, Diagnose, Input, Log, Moment, Publish
+from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.files.calibration_text import read_calibration
+from needle_core.message_types import rclpy_types
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
+from needle_core.ros.conversions import to_qos
+from needle_core.ros.discovery import AnsweringNodes, unpublished, unrecorded
+from needle_core.ros.life_signs import LifeSigns
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import SIDES, calibration_from
 from needle_tracker.stereo_tracker import (

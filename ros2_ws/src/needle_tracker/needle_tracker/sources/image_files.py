@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 Image = NDArray[np.uint8]
 

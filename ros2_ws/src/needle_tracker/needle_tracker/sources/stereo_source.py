@@ -11,7 +11,7 @@ from typing import Any, Protocol, cast
 import cv2
 import numpy as np
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.sources.image_files import Image, NamedPair, PairSequence, open_pairs
 
 Sizes = dict[str, tuple[int, int]]

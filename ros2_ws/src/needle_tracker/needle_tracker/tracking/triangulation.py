@@ -13,7 +13,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_tracker.image.tip_fit import ImageTip
 from needle_tracker.optics.compiled_projection import pixel_ray, solve_position
 from needle_tracker.optics.refraction import RefractedCamera

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError
 from needle_sim.needle.needle_shape import NeedleShape
 from needle_tracker.answers.pre_bend import heading_of
 

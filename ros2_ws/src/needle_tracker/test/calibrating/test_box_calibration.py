@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.insertions import render_insertion
 from needle_sim.camera.scenarios import CLEAN
 from needle_sim.camera.stereo_rig import load_stereo_rig

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_check import CheckResult, check
 from needle_tracker.calibrating.calibration_session import Place
 from needle_tracker.calibrating.rig_calibration import calibrate

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_outliers import doubts, square_error
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate
 from needle_tracker.calibrating.rig_model import BoardView, Corners

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibration_session import load_session, parse_session
 
 from .session import session_content

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.charuco import CharucoBoard, check_board_seen, write_board
 
 from .synthetic_rig import BOARD, board_image

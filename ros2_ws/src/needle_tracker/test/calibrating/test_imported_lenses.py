@@ -13,7 +13,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.answers.track_images import main as track_images
 from needle_tracker.calibrating.calibrate_stereo import main as calibrate_stereo
 from needle_tracker.calibrating.calibration_outliers import doubts, square_error

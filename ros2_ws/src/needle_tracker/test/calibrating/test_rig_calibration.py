@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.calibrating.calibrate_stereo import save_calibration
 from needle_tracker.calibrating.calibration_start import cameras_alone, first_calibration
 from needle_tracker.calibrating.rig_calibration import RigCalibration, calibrate

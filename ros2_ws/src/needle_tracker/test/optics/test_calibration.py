@@ -12,7 +12,7 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.optics.calibration import load_calibration, parse_calibration, rotation_matrix
 
 

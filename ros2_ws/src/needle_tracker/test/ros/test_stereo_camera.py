@@ -20,9 +20,9 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image
 
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import IMAGES, RELIABLE, to_nanoseconds
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import IMAGES, RELIABLE, to_nanoseconds
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.ros.stereo_camera import StereoCameraNode
 from needle_tracker.sources.stereo_source import (

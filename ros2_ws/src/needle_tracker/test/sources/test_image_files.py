@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_tracker.sources.image_files import open_pairs
 
 LEFT, RIGHT = 10, 200  # grey values

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from needle_common.diagnostics import Level
+from needle_core.diagnostics import Level
 from needle_tracker.answers.annotation import describe
 from needle_tracker.answers.health import Health
 from needle_tracker.optics.calibration import StereoCalibration

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from needle_common.files.installed import find_executable
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.files.installed import find_executable
 from needle_sim.rig.bench import SimulatedBench
 from needle_verification.checking import Check, Finding, Workbench, payloads
 from needle_verification.descendants import ran

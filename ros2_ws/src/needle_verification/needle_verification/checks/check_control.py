@@ -16,15 +16,15 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from needle_bringup.simulation.node_process import NodeProcess, stop
-from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
-from needle_common.process.ros_domain import own_domain
 from needle_controller.model.gains import design_gains
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.errors import UserError
+from needle_core.files.installed import find_executable
+from needle_core.process.ros_domain import own_domain
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.descendants import ran
 from needle_verification.studies import control_studies

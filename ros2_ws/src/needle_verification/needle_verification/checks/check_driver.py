@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from needle_common.commands.cli import EXIT_DONE
+from needle_core.commands.cli import EXIT_DONE
 from needle_verification.checking import (
     Check,
     Finding,

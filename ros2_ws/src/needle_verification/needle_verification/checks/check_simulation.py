@@ -13,8 +13,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from needle_bags.reading.bag_reader import read_run
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
+from needle_core.errors import UserError
 from needle_verification.checking import (
     Check,
     Finding,

@@ -11,9 +11,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.checks import (
     check_bags,

@@ -6,9 +6,9 @@ import contextlib
 import sys
 from collections.abc import Sequence
 
-from needle_common.commands.cli import EXIT_DONE, run_command, write_json
-from needle_common.commands.options import CommandParser, output_file
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, run_command, write_json
+from needle_core.commands.options import CommandParser, output_file
+from needle_core.errors import UserError
 from needle_verification.descendants import ending_descendants
 from needle_verification.workplace import checkout, make_folder, temporary_folder
 

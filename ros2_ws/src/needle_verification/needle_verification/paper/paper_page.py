@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 from needle_verification.paper.paper_figures import common_r1, converged_share
 from needle_verification.paper.paper_results import (
     DEPTH_MM,

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
-from needle_common.files.installed import find_executable
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue
+from needle_core.files.installed import find_executable
 from needle_verification.descendants import ran
 
 Columns = Mapping[str, npt.NDArray[np.float64]]

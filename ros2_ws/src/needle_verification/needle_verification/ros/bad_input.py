@@ -16,7 +16,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PointStamped
 from sensor_msgs.msg import Image, JointState
 
-from needle_common.ros.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
+from needle_core.ros.conversions import IMAGES, JOINT_STATES, RELIABLE, to_nanoseconds, to_stamp
 from needle_verification.ros.listening_node import ListeningNode
 
 LEFT_IMAGE = "left_image"

@@ -17,8 +17,8 @@ from geometry_msgs.msg import PoseStamped
 from rcl_interfaces.srv import GetParameters, ListParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import LATCHED, RELIABLE, values_of
+from needle_core.errors import UserError
+from needle_core.ros.conversions import LATCHED, RELIABLE, values_of
 from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 Answer = dict[str, Any]

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import NANOSECONDS
+from needle_core.errors import UserError
+from needle_core.ros.conversions import NANOSECONDS
 from needle_verification.ros.drive_hand import INSERTION_COUNT, DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
 from needle_verification.trials.trial_runner import Outcomes, Trial

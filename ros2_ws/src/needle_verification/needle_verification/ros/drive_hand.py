@@ -14,9 +14,9 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.errors import UserError
-from needle_common.ros.base_node import STEADY_CLOCK
-from needle_common.ros.conversions import (
+from needle_core.errors import UserError
+from needle_core.ros.base_node import STEADY_CLOCK
+from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
     NANOSECONDS,
@@ -25,7 +25,7 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_common.ros.hold_topic import HoldTopic
+from needle_core.ros.hold_topic import HoldTopic
 from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 JOINTS = ("insertion_joint", "rotation_joint")

@@ -12,7 +12,7 @@ from typing import Any
 from rosgraph_msgs.msg import Clock
 
 from needle_bringup.simulation.rig_configuration import PATIENT_WATCHDOG
-from needle_common.ros.conversions import RELIABLE, to_stamp
+from needle_core.ros.conversions import RELIABLE, to_stamp
 from needle_verification.ros.drive_hand import INSERTION_COUNT, ROTATION_COUNT, DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver
 

@@ -11,7 +11,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from needle_common.commands.options import CommandParser
+from needle_core.commands.options import CommandParser
 from needle_verification.ros.drive_faults import FAULTS, fault_trials
 from needle_verification.ros.drive_steps import random_steps
 from needle_verification.ros.fuzz_trials import fuzz_trials

@@ -17,7 +17,7 @@ from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
 from needle_bags.format.message_definitions import message_class
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, values_of
 from needle_verification.ros.listening_node import ListeningNode
 from needle_verification.trials.random_messages import random_message
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time

@@ -10,7 +10,7 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from needle_common.ros.conversions import LATCHED, values_of
+from needle_core.ros.conversions import LATCHED, values_of
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 from needle_verification.trials.trial_runner import Outcomes, Trial

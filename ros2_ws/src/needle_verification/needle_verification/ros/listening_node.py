@@ -10,10 +10,10 @@ from typing import Any
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 
-from needle_common.errors import UserError
-from needle_common.process.reach import keep_to_this_machine
-from needle_common.ros.base_node import executor_of
-from needle_common.ros.whole_node import WholeNode
+from needle_core.errors import UserError
+from needle_core.process.reach import keep_to_this_machine
+from needle_core.ros.base_node import executor_of
+from needle_core.ros.whole_node import WholeNode
 
 PATIENCE = 20.0
 

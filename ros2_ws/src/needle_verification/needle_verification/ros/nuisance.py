@@ -21,8 +21,8 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import HOLD, RELIABLE
+from needle_core.errors import UserError
+from needle_core.ros.conversions import HOLD, RELIABLE
 
 POINTS = 1_000_000
 NAME = 1_000_000

@@ -14,7 +14,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from std_msgs.msg import Bool
 
-from needle_common.ros.conversions import RELIABLE, values_of
+from needle_core.ros.conversions import RELIABLE, values_of
 from needle_device_driver.parameters import LONGEST_WATCHDOG
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import TrialProcesses, drives_and_driver

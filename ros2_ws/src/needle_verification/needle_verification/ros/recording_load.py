@@ -26,13 +26,13 @@ from sensor_msgs.msg import CameraInfo, Image, JointState, Joy
 from std_msgs.msg import Header
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.process.end_request import EndRequest
-from needle_common.ros.base_node import run_node
-from needle_common.ros.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
-from needle_common.ros.discovery import unrecorded
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import check_fields, fixed_parameter
+from needle_core.process.end_request import EndRequest
+from needle_core.ros.base_node import run_node
+from needle_core.ros.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
+from needle_core.ros.discovery import unrecorded
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 
 HELP = """\
 recording_load: publishes stereo images and what goes with them, as a rig at full rate does.

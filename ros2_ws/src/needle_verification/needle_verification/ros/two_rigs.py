@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.commands.cli import EXIT_BAD_INPUT
+from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_verification.ros.drive_hand import DriveHand
 from needle_verification.trials.trial_processes import (
     Parameters,

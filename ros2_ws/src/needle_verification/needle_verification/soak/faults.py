@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 
 class Kind(enum.Enum):

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 NANOSECONDS = 1_000_000_000
 # Readings of the two clocks when a world begins [ns].

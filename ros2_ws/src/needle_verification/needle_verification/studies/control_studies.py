@@ -10,8 +10,8 @@ import subprocess
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
+from needle_core.errors import UserError
+from needle_core.files.installed import find_executable
 from needle_verification.checking import Finding
 
 AT_END = "converged_at_end"

@@ -13,11 +13,11 @@ from functools import partial
 
 import numpy as np
 
-from needle_common.commands.cli import EXIT_DONE
 from needle_controller.observers.estimator import Estimator
 from needle_controller.presets.point_steering import PointSteering
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
+from needle_core.commands.cli import EXIT_DONE
 from needle_sim.studies.disturbances import Disturbances
 from needle_sim.studies.point_study import run_point_study
 from needle_sim.studies.point_targets import FARTHEST, MovingTargets, random_targets

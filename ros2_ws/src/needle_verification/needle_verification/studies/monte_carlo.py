@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_verification.studies.cluster_study import run_parts
 from needle_verification.studies.monte_carlo_options import MonteCarloOptions, parse

@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from needle_bringup.simulation.simulate_options import add_own_part_options
-from needle_common.commands.options import (
+from needle_controller.presets.steering_settings import PRESETS
+from needle_core.commands.options import (
     CommandParser,
     join_start,
     number,
@@ -16,8 +17,7 @@ from needle_common.commands.options import (
     start,
     whole_number,
 )
-from needle_common.errors import UserError
-from needle_controller.presets.steering_settings import PRESETS
+from needle_core.errors import UserError
 from needle_sim.studies.disturbances import NOISE_SHAPES, Disturbances
 from needle_sim.studies.start_grids import GRIDS, StartBounds
 

@@ -14,8 +14,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from needle_common.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, number, output_file, whole_number
 from needle_controller.laws.law import SteeringCommand
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.presets import make_controller
@@ -23,6 +21,8 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import next_step
 from needle_controller.protocol.plane_control import PlaneControl
+from needle_core.commands.cli import EXIT_DONE, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, number, output_file, whole_number
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.se3 import FloatArray
 from needle_verification.studies.obstacle_scenes import ObstacleScene, clearance, make_scene

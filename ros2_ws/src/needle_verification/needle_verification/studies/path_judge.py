@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from needle_common.compiled import compiled
+from needle_core.compiled import compiled
 from needle_sim.needle.se3 import FloatArray
 
 _STEP = 0.001

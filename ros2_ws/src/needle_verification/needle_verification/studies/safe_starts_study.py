@@ -15,14 +15,14 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from needle_common.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
-from needle_common.commands.options import CommandParser, join_start, number, output_file
-from needle_common.errors import UserError
 from needle_controller.planning.obstacle_files import read_obstacles
 from needle_controller.planning.obstacles import Obstacles
 from needle_controller.planning.safe_starts import SafeStarts, safe_starts
 from needle_controller.presets.path_steering import path_planner
 from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED, JsonValue, run_command, write_json
+from needle_core.commands.options import CommandParser, join_start, number, output_file
+from needle_core.errors import UserError
 
 OFFSETS = np.linspace(-0.024, 0.024, 17)
 ANGLES = np.radians(np.linspace(-16.0, 16.0, 17))

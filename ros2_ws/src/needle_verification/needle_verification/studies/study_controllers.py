@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from needle_common.errors import UserError
 from needle_controller.laws.law import SteeringCommand, StepLaw
 from needle_controller.laws.roll_law import hypotheses_of
 from needle_controller.model.arrays import Array
@@ -29,6 +28,7 @@ from needle_controller.presets.steering_settings import (
     SteeringSettings,
 )
 from needle_controller.protocol.trust import ends_elsewhere
+from needle_core.errors import UserError
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.beliefs import Belief
 from needle_sim.studies.point_targets import INSERTION_SPEED

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 from needle_sim.needle.se3 import FloatArray
 from needle_sim.studies.figures_of_merit import Outcomes, figures, joined
 from needle_sim.studies.point_study import PointOutcomes, point_figures, run_point_study

@@ -16,8 +16,8 @@ from ament_index_python.packages import get_package_share_directory
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from needle_common.commands.cli import EXIT_DONE, run_command
-from needle_common.commands.options import CommandParser
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.appearance import Appearance, draw_appearance
 from needle_sim.path_traced.insertion import trace_insertion

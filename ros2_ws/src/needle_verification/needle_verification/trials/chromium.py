@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 _FLAGS = (
     "--headless=new",

@@ -19,8 +19,8 @@ from rosbags.rosbag2 import Reader
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
 from needle_verification.checking import unreadable
 from needle_verification.descendants import busy
 

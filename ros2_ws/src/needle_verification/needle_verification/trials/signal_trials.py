@@ -13,8 +13,8 @@ from pathlib import Path
 from needle_bringup.simulation.node_process import NodeProcess
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
 from needle_verification.checking import unreadable
 from needle_verification.descendants import busy
 from needle_verification.trials.trial_processes import TrialProcesses

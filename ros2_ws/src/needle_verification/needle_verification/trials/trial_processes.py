@@ -16,8 +16,8 @@ from needle_bringup.simulation.rig_configuration import (
     write_parameters,
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.errors import UserError
-from needle_common.files.installed import find_executable
+from needle_core.errors import UserError
+from needle_core.files.installed import find_executable
 
 _PACKAGES = {**PACKAGES, "console": "needle_console"}
 _KILL_GRACE = 5.0

@@ -15,11 +15,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from needle_common.commands.cli import EXIT_DONE, run_command
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
-from needle_common.settings.bounds import check_bounds
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.settings.bounds import check_bounds
 
 Outcomes = Iterator[dict[str, Any]]
 

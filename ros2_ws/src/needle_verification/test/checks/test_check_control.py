@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.checking import Finding, Workbench
 from needle_verification.checks import check_control
 from needle_verification.checks.check_control import Size

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.checking import Finding, Workbench
 from needle_verification.checks import verify
 

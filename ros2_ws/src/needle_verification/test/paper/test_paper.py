@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.paper.paper import main
 from needle_verification.paper.paper_figures import common_r1, converged_share
 from needle_verification.paper.paper_results import Floats, SteeringTrial, missed_later, settled_mm

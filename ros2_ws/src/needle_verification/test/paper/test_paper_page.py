@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from needle_bags.reading.bag_reader import Run, read_run
-from needle_common.commands.cli import JsonValue
+from needle_core.commands.cli import JsonValue
 from needle_verification.paper import paper_results, paper_runs
 from needle_verification.paper.paper import main
 from needle_verification.paper.paper_runs import Columns, Laboratory

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.checking import Workbench, trial_outcomes
 from needle_verification.checks import check_computers
 from patience import GENEROUS_MS

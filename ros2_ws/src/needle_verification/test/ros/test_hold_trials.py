@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 from needle_verification.checking import Workbench
 from needle_verification.checks import check_hold_sources
 from needle_verification.ros.holds.hold_trials import KINDS, hold_trials

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 from needle_verification.ros.listening_node import ros
 from needle_verification.ros.nuisance import NUISANCE_KINDS
 from needle_verification.ros.nuisance_trials import nuisance_trials

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.soak import faults
 from needle_verification.soak.faults import (
     PAGE,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from ament_index_python.packages import get_package_share_directory
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.tracking.calibration_study import calibrated_tip_errors
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_sim.camera.projection import project
 from needle_sim.camera.stereo_rig import load_stereo_rig
 from needle_sim.path_traced.tracer import load_mitsuba

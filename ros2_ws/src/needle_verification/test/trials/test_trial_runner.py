@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 from needle_verification.trials.trial_runner import run_trials, trials_of
 
 KINDS = ("cut", "stall")

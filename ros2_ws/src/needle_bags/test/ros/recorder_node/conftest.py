@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from needle_common.process.ros_domain import own_domain
+from needle_core.process.ros_domain import own_domain
 
 from .recorder_process import Source
 

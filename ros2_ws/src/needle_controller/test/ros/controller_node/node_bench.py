@@ -24,8 +24,9 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from needle_common.diagnostics import Diagnostic, Level
-from needle_common.ros.conversions import (
+from needle_controller.ros.plane_controller import PlaneControllerNode
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
     RELIABLE,
@@ -34,7 +35,6 @@ from needle_common.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_controller.ros.plane_controller import PlaneControllerNode
 
 LIMIT = 20.0
 TICK = 20_000_000

@@ -11,19 +11,19 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
-from needle_common.convert import from_ros
-from needle_common.diagnostics import Level
-from needle_common.errors import UserError
-from needle_common.messages import PoseWithCovariance
-from needle_common.ros.conversions import (
-    RELIABLE,
-    to_nanoseconds,
-    to_stamp,
-)
 from needle_controller.model.kinematics import rotation_from_angles
 from needle_controller.plane_controller import tip_covariance
 from needle_controller.protocol.joint_history import CONFIRMED_BY
 from needle_controller.ros.plane_controller import main
+from needle_core.convert import from_ros
+from needle_core.diagnostics import Level
+from needle_core.errors import UserError
+from needle_core.messages import PoseWithCovariance
+from needle_core.ros.conversions import (
+    RELIABLE,
+    to_nanoseconds,
+    to_stamp,
+)
 
 from .node_bench import TICK, Bench
 

@@ -11,8 +11,8 @@ from geometry_msgs.msg import (
 )
 from visualization_msgs.msg import Marker, MarkerArray
 
-from needle_common.diagnostics import Level
-from needle_common.ros.conversions import (
+from needle_core.diagnostics import Level
+from needle_core.ros.conversions import (
     RELIABLE,
 )
 

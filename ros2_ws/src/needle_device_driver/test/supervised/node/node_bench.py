@@ -22,7 +22,7 @@ from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.ros.conversions import (
+from needle_core.ros.conversions import (
     HOLD,
     JOINT_STATES,
     LATCHED,

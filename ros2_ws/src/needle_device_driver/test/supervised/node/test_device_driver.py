@@ -17,9 +17,9 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import to_nanoseconds
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import to_nanoseconds
 
 from .node_bench import Make, Rig
 

@@ -11,8 +11,8 @@ from lifecycle_msgs.msg import Transition
 from rosgraph_msgs.msg import Clock
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import LATCHED, RELIABLE
+from needle_core.errors import UserError
+from needle_core.ros.conversions import LATCHED, RELIABLE
 from needle_device_driver.ros import device_driver as device_driver_node
 
 from .node_bench import Make, emulated_as

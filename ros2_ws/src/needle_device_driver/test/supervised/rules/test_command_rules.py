@@ -7,7 +7,7 @@ import math
 
 import pytest
 
-from needle_common.errors import OutOfBoundsError
+from needle_core.errors import OutOfBoundsError
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.limits import SafetyLimits

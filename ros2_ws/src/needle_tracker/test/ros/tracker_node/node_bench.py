@@ -17,7 +17,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
-from needle_common.ros.conversions import (
+from needle_core.ros.conversions import (
     IMAGES,
     JOINT_STATES,
     RELIABLE,

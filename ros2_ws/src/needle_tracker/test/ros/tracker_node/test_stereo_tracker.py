@@ -19,8 +19,8 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import (
+from needle_core.errors import UserError
+from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
     RELIABLE,

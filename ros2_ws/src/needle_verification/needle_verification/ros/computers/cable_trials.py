@@ -27,9 +27,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 
 from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG
-from needle_common.commands.options import CommandParser
-from needle_common.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
-from needle_common.ros.conversions import LATCHED, values_of
+from needle_core.commands.options import CommandParser
+from needle_core.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
+from needle_core.ros.conversions import LATCHED, values_of
 from needle_verification.ros.holds.hands import (
     LATEST,
     OPERATOR,

@@ -11,11 +11,11 @@ from pathlib import Path
 
 from geometry_msgs.msg import PointStamped
 
-from needle_common.ros.base_node import STEADY_CLOCK, run_node
-from needle_common.ros.conversions import RELIABLE, to_stamp
-from needle_common.ros.parameters import NodeParameters
-from needle_common.ros.whole_node import WholeNode
-from needle_common.settings.parameter_fields import fixed_parameter
+from needle_core.ros.base_node import STEADY_CLOCK, run_node
+from needle_core.ros.conversions import RELIABLE, to_stamp
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+from needle_core.settings.parameter_fields import fixed_parameter
 from needle_sim.rig.bench import SimulatedBench
 from needle_verification.trials.computers.light import Light
 

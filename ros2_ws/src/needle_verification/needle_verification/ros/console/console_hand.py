@@ -10,8 +10,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from sensor_msgs.msg import JointState
 
-from needle_common.ros.base_node import STEADY_CLOCK
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, RELIABLE
+from needle_core.ros.base_node import STEADY_CLOCK
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, RELIABLE
 from needle_verification.ros.drive_hand import JOINTS, DriveHand
 
 SPEED = 0.005

@@ -14,8 +14,8 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-from needle_common.errors import UserError
 from needle_console.hold.hold_state import OWNER
+from needle_core.errors import UserError
 from needle_verification.ros.console.console_hand import ConsoleHand
 from needle_verification.trials.button_page import BUTTON
 from needle_verification.trials.chromium import Chromium, Tab

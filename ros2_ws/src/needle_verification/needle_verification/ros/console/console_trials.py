@@ -16,8 +16,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 from needle_verification.ros.console.console_losses import LOSSES, Loss, let_go
 from needle_verification.ros.console.console_scene import Scene
 from needle_verification.ros.listening_node import ros

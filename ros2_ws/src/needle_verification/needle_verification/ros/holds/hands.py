@@ -12,9 +12,9 @@ from typing import Protocol
 from sensor_msgs.msg import Joy
 
 from needle_bringup.simulation.simulate_options import SimulateOptions
-from needle_common.errors import UserError
-from needle_common.ros.base_node import STEADY_CLOCK
-from needle_common.ros.conversions import RELIABLE
+from needle_core.errors import UserError
+from needle_core.ros.base_node import STEADY_CLOCK
+from needle_core.ros.conversions import RELIABLE
 from needle_verification.ros.holds.hold_witness import HoldWitness
 from needle_verification.trials.piped_pedal import PipedPedal
 from needle_verification.trials.trial_processes import (

@@ -16,7 +16,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from needle_common.commands.options import CommandParser
+from needle_core.commands.options import CommandParser
 from needle_verification.ros.holds.hands import (
     HANDS,
     LATEST,

@@ -12,8 +12,8 @@ from rclpy.client import Client
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
-from needle_common.errors import UserError
-from needle_common.ros.conversions import JOINT_STATES, LATCHED, values_of
+from needle_core.errors import UserError
+from needle_core.ros.conversions import JOINT_STATES, LATCHED, values_of
 from needle_verification.ros.listening_node import ListeningNode
 
 _INSERTION = "insertion_joint"

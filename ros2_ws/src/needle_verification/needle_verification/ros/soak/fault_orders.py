@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Bool
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp
+from needle_core.ros.conversions import HOLD, LATCHED, RELIABLE, to_stamp
 from needle_verification.ros.soak.virtual_bench import Sight
 from needle_verification.ros.soak.virtual_can import LINKS
 from needle_verification.ros.soak.virtual_node import Place, VirtualNode, placed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from needle_common.ros.conversions import values_of
+from needle_core.ros.conversions import values_of
 from needle_verification.ros.soak.virtual_rig import VirtualRig
 from needle_verification.soak.faults import Moment
 

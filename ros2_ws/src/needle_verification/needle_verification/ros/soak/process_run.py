@@ -14,9 +14,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
 
-from needle_common.errors import UserError
-from needle_common.process.ros_domain import own_domain
-from needle_common.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
+from needle_core.errors import UserError
+from needle_core.process.ros_domain import own_domain
+from needle_core.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
 from needle_verification.ros.drive_hand import JOINTS, DriveHand
 from needle_verification.ros.listening_node import ros
 from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig

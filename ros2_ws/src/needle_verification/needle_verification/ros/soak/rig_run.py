@@ -10,7 +10,7 @@ from typing import Any
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import Joy
 
-from needle_common.ros.conversions import values_of
+from needle_core.ros.conversions import values_of
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_verification.ros.soak.fault_orders import LATEST_MESSAGE, FaultOrders
 from needle_verification.ros.soak.moment_watch import watch_moments

@@ -9,14 +9,14 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from needle_common.commands.cli import (
+from needle_core.commands.cli import (
     EXIT_DONE,
     EXIT_INTERRUPTED,
     EXIT_MISSED,
     run_command,
     write_json,
 )
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 from needle_verification.ros.soak.many_runs import (
     results_here,
     results_of_cluster,

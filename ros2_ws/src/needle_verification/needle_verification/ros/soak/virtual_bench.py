@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 
-from needle_common.ros.conversions import RELIABLE, to_stamp
+from needle_core.ros.conversions import RELIABLE, to_stamp
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.needle.plant import NeedlePlant, initial_pose

@@ -9,7 +9,7 @@ from typing import Any
 
 import can
 
-from needle_common.can_frame import CanFrame
+from needle_core.can_frame import CanFrame
 from needle_device_driver.link.can_link import CanLink
 from needle_device_driver.link.frame_link import LinkError
 from needle_device_driver.link.link_settings import LinkSettings

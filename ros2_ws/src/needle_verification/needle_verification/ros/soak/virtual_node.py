@@ -17,9 +17,9 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.time import Time
 
-from needle_common.errors import UserError
-from needle_common.ros.base_node import DiagnosticsPublisher
-from needle_common.ros.whole_node import WholeLifecycleNode, WholeNode
+from needle_core.errors import UserError
+from needle_core.ros.base_node import DiagnosticsPublisher
+from needle_core.ros.whole_node import WholeLifecycleNode, WholeNode
 from needle_verification.ros.soak.virtual_services import VirtualClient, VirtualService
 from needle_verification.ros.soak.virtual_topics import (
     VirtualGraph,

@@ -11,7 +11,7 @@ from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool, Trigger
 
-from needle_common.ros.conversions import HOLD, LATCHED, RELIABLE, values_of
+from needle_core.ros.conversions import HOLD, LATCHED, RELIABLE, values_of
 from needle_verification.ros.soak.virtual_node import VirtualNode
 from needle_verification.soak.faults import CONSOLE
 from needle_verification.soak.virtual_page import VirtualPage

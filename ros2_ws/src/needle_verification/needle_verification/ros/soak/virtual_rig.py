@@ -12,9 +12,9 @@ from typing import Any
 from rclpy.node import Node
 
 from needle_bringup.ros.operator import OperatorNode
-from needle_common.errors import UserError
 from needle_console.ros.console_node import ConsoleNode
 from needle_controller.ros.plane_controller import PlaneControllerNode
+from needle_core.errors import UserError
 from needle_device_driver.ros.device_driver import DeviceDriverNode
 from needle_verification.ros.soak.virtual_bench import TIP_NOISE, Bench, TrackerStandIn
 from needle_verification.ros.soak.virtual_can import VirtualCan, VirtualLink

@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 
 from needle_bags.recording.recording import MESSAGES_LOST
 from needle_bags.recovery.bag_recovery import recover_bag
-from needle_common.files.bag_path import METADATA_FILE
-from needle_common.files.plain_yaml import load_plain
+from needle_core.files.bag_path import METADATA_FILE
+from needle_core.files.plain_yaml import load_plain
 
 # A killed recorder's bag has what it took so long before [ns]: it writes out every 0.1 s
 # (docs/architecture.md), and a burst takes its time.

@@ -18,9 +18,9 @@ import struct
 import sys
 import time
 
-from needle_common.commands.cli import EXIT_DONE, run_command
-from needle_common.commands.options import CommandParser
-from needle_common.errors import UserError
+from needle_core.commands.cli import EXIT_DONE, run_command
+from needle_core.commands.options import CommandParser
+from needle_core.errors import UserError
 from needle_verification.trials.computers.namespaces import enter_network
 
 INTERFACE = "cable0"

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 
-from needle_common.errors import UserError
+from needle_core.errors import UserError
 
 ADDRESSES = ("10.213.78.1", "10.213.78.2")
 _LIBC = ctypes.CDLL(None, use_errno=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from needle_common.commands.cli import EXIT_INTERRUPTED
+from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_verification.ros.soak import soak
 from needle_verification.ros.soak.rig_run import RunResult
 from needle_verification.soak.faults import Fault, Kind, read_schedule

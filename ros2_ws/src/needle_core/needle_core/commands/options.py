@@ -1,0 +1,139 @@
+"""Options of command lines: how all commands parse them, and refuse what cannot be in one line."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NoReturn, overload
+
+from needle_core.commands.cli import STANDARD_OUTPUT
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Raises `UserError` for words that it does not understand; options are written in full.
+
+    Parameters
+    ----------
+    name : str
+        The command's.
+    description, epilog : str
+        Texts of `--help` before and after the options, shown line by line as they are.
+    """
+
+    def __init__(self, name: str, description: str, epilog: str) -> None:
+        super().__init__(
+            prog=name,
+            description=description,
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+        )
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Parse; with `--json -`, standard output is for the JSON alone, words go to stderr."""
+        given = super().parse_known_args(args, namespace)
+        if str(getattr(given[0], "json", None)) == STANDARD_OUTPUT:
+            sys.stdout = sys.stderr
+        return given
+
+    def error(self, message: str) -> NoReturn:
+        """Raise what argparse would print before it ends the process."""
+        raise UserError(f"{message}; see --help")
+
+
+def number(name: str, text: str, lower: float, upper: float, unit: str) -> float:
+    """Return the number that an option was given.
+
+    Parameters
+    ----------
+    name, text : str
+        The option, and what stands behind it.
+    lower, upper : float
+        Inclusive bounds, in `unit`; infinity counts where it is a bound.
+    unit : str
+        What it is given in, "-" for none.
+
+    Raises
+    ------
+    UserError
+        If it is no number or not within the bounds.
+    """
+    try:
+        value = float(text)
+    except ValueError:
+        raise UserError(f"{name} {text!r} is not a number") from None
+    check_bounds(name, value, lower, upper, unit, unlimited=upper == math.inf)
+    return value
+
+
+def whole_number(name: str, text: str, lower: int, upper: int) -> int:
+    """Return the whole number that an option was given; arguments and errors as of `number`."""
+    try:
+        value = int(text)
+    except ValueError:
+        raise UserError(f"{name} {text!r} is not a whole number") from None
+    check_bounds(name, value, lower, upper, "-")
+    return value
+
+
+@overload
+def output_file(name: str, text: None) -> None: ...
+@overload
+def output_file(name: str, text: str | Path) -> Path: ...
+def output_file(name: str, text: str | Path | None) -> Path | None:
+    """Return the file that an option names to be written; None where it was not given, `-` as is.
+
+    Raises
+    ------
+    UserError
+        If it is a folder, or in one that does not exist: better told before the work than after.
+    """
+    if text is None:
+        return None
+    path = Path(text).expanduser()
+    if str(path) == STANDARD_OUTPUT:
+        return path
+    if path.is_dir() or not path.parent.is_dir():
+        raise UserError(f"{name} {text}: its folder must exist, and it must not be a folder")
+    return path
+
+
+_STARTS = ("--initial", "--target")
+
+
+def join_start(arguments: Sequence[str]) -> list[str]:
+    """Write `--initial -3,2,15` as `--initial=-3,2,15`: argparse takes the former for an option.
+
+    Likewise `--target`.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1] in _STARTS and argument[1:2] in "0123456789.ni":
+            joined[-1] = f"{joined[-1]}={argument}"
+        else:
+            joined.append(argument)
+    return joined
+
+
+def start(text: str, largest_x: float, largest_pitch: float) -> tuple[float, float, float]:
+    """Return (x in mm, pitch and roll in degrees) of `--initial X_MM,PITCH_DEG,ROLL_DEG`.
+
+    Raises
+    ------
+    UserError
+        If these are not three numbers, |x| <= `largest_x`, |pitch| <= `largest_pitch`, |roll| <=
+        180.
+    """
+    parts = text.split(",")
+    if len(parts) != 3:
+        raise UserError(f"--initial {text!r} is not X_MM,PITCH_DEG,ROLL_DEG, such as -3,2,15")
+    return (
+        number("--initial X_MM", parts[0], -largest_x, largest_x, "mm"),
+        number("--initial PITCH_DEG", parts[1], -largest_pitch, largest_pitch, "deg"),
+        number("--initial ROLL_DEG", parts[2], -180.0, 180.0, "deg"),
+    )

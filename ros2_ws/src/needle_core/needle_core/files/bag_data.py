@@ -1,0 +1,116 @@
+"""A bag's data beside plain MCAP: SQLite, and what was compressed as a whole or by message."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+from urllib.parse import quote
+
+import zstandard
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader
+
+from needle_core.files.file_access import open_regular
+from needle_core.files.mcap_records import CHUNK_LIMIT, TIME_LIMIT
+
+# A data file that is compressed as a whole may be so large when it is not [B].
+FILE_LIMIT: Final = 2**33
+_BLOCK: Final = 2**20
+
+
+class SqliteData:
+    """An SQLite file, read as `McapFile` reads; it does not tell when messages were sent."""
+
+    def __init__(self, reader: Reader) -> None:
+        self._reader = reader
+
+    @property
+    def span(self) -> tuple[int, int] | None:
+        """Log times of the first and the last message [ns]; None in an empty file."""
+        if not self._reader.message_count:
+            return None
+        if not 0 <= self._reader.start_time < self._reader.end_time <= TIME_LIMIT:
+            raise ValueError("its times lie beyond the year 2262")
+        return self._reader.start_time, self._reader.end_time - 1
+
+    def counts(self) -> Mapping[str, int]:
+        """Return messages by topic."""
+        found: Counter[str] = Counter()
+        for connection in self._reader.connections:
+            found[connection.topic] += connection.msgcount
+        return found
+
+    def definitions(self) -> dict[str, tuple[str, str]]:
+        """Return encoding and text of each type's definition."""
+        kinds = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+        return {
+            connection.msgtype: (kinds[connection.msgdef.format], connection.msgdef.data)
+            for connection in self._reader.connections
+            if connection.msgdef.format in kinds
+        }
+
+    def read(
+        self, topics: Collection[str], start: int, stop: int
+    ) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield topic, log time, publish time [ns] and data, in order of log time."""
+        connections = [c for c in self._reader.connections if c.topic in topics]
+        # The limit itself is no number of SQLite's.
+        end = stop if stop < TIME_LIMIT else None
+        if connections:
+            for connection, log_time, data in self._reader.messages(connections, start, end):
+                yield connection.topic, log_time, log_time, bytes(data)
+
+
+def is_sound_database(file: Path) -> bool:
+    """Return whether SQLite finds a data file's messages, and nothing wrong."""
+    try:
+        address = f"file:{quote(str(file))}?immutable=1"
+        with contextlib.closing(sqlite3.connect(address, uri=True)) as database:
+            database.execute("SELECT id FROM messages LIMIT 1")
+            return bool(database.execute("PRAGMA quick_check(1)").fetchone() == ("ok",))
+    except sqlite3.Error:
+        return False
+
+
+def is_packed(data: bytes) -> bool:
+    """Return whether a message was compressed by itself; none in CDR begins so."""
+    return data.startswith(zstandard.FRAME_HEADER)
+
+
+def unpack(data: bytes) -> bytes:
+    """Return a message that was compressed by itself.
+
+    Raises
+    ------
+    ValueError, zstandard.ZstdError
+        If it is damaged, or too large.
+    """
+    with zstandard.ZstdDecompressor().stream_reader(data, read_across_frames=True) as stream:
+        plain = stream.read(CHUNK_LIMIT + 1)
+    if len(plain) > CHUNK_LIMIT:
+        raise ValueError(f"a message holds more than {CHUNK_LIMIT} bytes")
+    return plain
+
+
+def unpack_file(path: Path, folder: Path) -> Path:
+    """Write what a compressed data file holds into a folder; return where.
+
+    Raises
+    ------
+    ValueError, zstandard.ZstdError, OSError
+        If it is damaged, or too large.
+    """
+    plain = folder / path.stem
+    size = 0
+    with open_regular(path) as packed, plain.open("xb") as stream:
+        reader = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+        while block := reader.read(_BLOCK):
+            size += len(block)
+            if size > FILE_LIMIT:
+                raise ValueError(f"{path.name} holds more than {FILE_LIMIT} bytes")
+            stream.write(block)
+    return plain

@@ -1,0 +1,241 @@
+"""Opens a rosbag2 directory: what it says is in it is what is read, or an error."""
+
+from __future__ import annotations
+
+import contextlib
+import tempfile
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePath
+from typing import Any, Final, NamedTuple
+
+from mcap.records import Metadata
+from rosbags.rosbag2 import Reader
+from rosbags.typesys.store import Typestore
+
+from needle_core.errors import UserError
+from needle_core.files.bag_data import SqliteData, is_packed, unpack, unpack_file
+from needle_core.files.bag_path import METADATA_FILE, read_information, readable, require_bag
+from needle_core.files.bag_records import custom_data_of, distribution_of
+from needle_core.files.bag_topic import BagTopic, offered_profiles
+from needle_core.files.bag_types import typestore_of
+from needle_core.files.file_access import open_regular
+from needle_core.files.mcap_file import McapFile
+from needle_core.files.mcap_records import TIME_LIMIT
+
+_NEWEST_VERSION: Final = 9
+
+
+class SentMessage(NamedTuple):
+    """A message as it is in the bag.
+
+    Attributes
+    ----------
+    time, log_time : int
+        When it was sent (received, where the bag does not tell) and received [ns].
+    topic, type_name : str
+        Its topic and type.
+    data : bytes
+        The message as CDR.
+    """
+
+    time: int
+    log_time: int
+    topic: str
+    type_name: str
+    data: bytes
+
+
+class BagDirectory:
+    """A bag open for reading; what it says about itself stays known when it is closed.
+
+    Parameters
+    ----------
+    path : Path
+        A rosbag2 directory, MCAP or SQLite; or an MCAP file, which is read alone.
+
+    Raises
+    ------
+    BrokenBagError
+        If it is not whole.
+    UserError
+        If there is none, or it holds what is not read here.
+
+    Attributes
+    ----------
+    topics : dict of str to BagTopic
+        By name.
+    counts : dict of str to int
+        Messages for each topic.
+    custom_data : dict of str to str
+        What the recorder left in metadata.yaml, or in the file.
+    distribution : str
+        ROS distribution it was recorded with; empty where not known.
+    start, end : int
+        Log times of the first and the last message [ns]; 0 in an empty bag.
+    records : list of Metadata
+        Of a file that is read alone: its metadata records.
+    is_packed : bool
+        Whether messages were compressed one by one, by those that were read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        require_bag(path)
+        self.path = path
+        self.is_packed = False
+        self.records: list[Metadata] = []
+        self._stack = contextlib.ExitStack()
+        try:
+            with readable(path):
+                if path.is_dir():
+                    self._open_directory()
+                else:
+                    self._open_file()
+                spans = [file.span for file in self._files if file.span is not None]
+                self.start = min((first for first, _ in spans), default=0)
+                self.end = max((last for _, last in spans), default=0)
+        except BaseException:
+            self._stack.close()
+            raise
+
+    def __enter__(self) -> BagDirectory:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def messages(
+        self, wanted: Callable[[str], bool], start: int = 0, stop: int = TIME_LIMIT
+    ) -> Iterator[SentMessage]:
+        """Yield the messages of wanted topics with start <= log time < stop [ns], in order.
+
+        Raises
+        ------
+        UserError
+            If the bag holds other messages than it says.
+        """
+        topics = {name for name in self.topics if wanted(name)}
+        with readable(self.path):
+            for file in self._files:
+                for topic, log_time, sent, data in file.read(topics, start, stop):
+                    self.is_packed |= is_packed(data)
+                    plain = unpack(data) if is_packed(data) else data
+                    type_name = self.topics[topic].type_name
+                    yield SentMessage(sent, log_time, topic, type_name, plain)
+
+    def typestore(self) -> Typestore:
+        """Return the types that the bag defines, to be read; Jazzy's if it defines none."""
+        return typestore_of(
+            tuple(
+                (topic.encoding, topic.definition, topic.type_name, topic.type_hash)
+                for topic in self.topics.values()
+                if topic.definition
+            )
+        )
+
+    def deserialize(self, store: Typestore, message: SentMessage) -> Any:
+        """Return a message's content.
+
+        Raises
+        ------
+        UserError
+            If it does not fit its definition.
+        """
+        try:
+            return store.deserialize_cdr(message.data, message.type_name)
+        # whatever rosbags' generated code meets in bytes of another type
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+            raise UserError(
+                f"{self.path}: a message of {message.topic} does not fit its definition "
+                f"({reason}): it was recorded so, or damaged where no checksum tells"
+            ) from error
+
+    def _open_directory(self) -> None:
+        information = read_information(self.path)
+        version = information.get("version")
+        if not isinstance(version, int):
+            raise ValueError(f"{METADATA_FILE} is of version {version!r}")
+        try:
+            kind = self._require_known(information)
+            # Old versions put the bag's own name first.
+            names = [PurePath(name).name for name in information["relative_file_paths"]]
+            self._files = [self._open(self.path / name, kind) for name in names]
+            custom = information.get("custom_data") or {}
+            self.custom_data = {str(key): str(value) for key, value in custom.items()}
+            self.distribution = str(information.get("ros_distro") or "")
+            self._read_topics(information["topics_with_message_count"])
+            total = information["message_count"]
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            if version <= _NEWEST_VERSION:
+                raise
+            raise UserError(
+                f"{self.path}: {METADATA_FILE} is of version {version} and not read here, where "
+                f"{_NEWEST_VERSION} is the newest: the bag need not be broken"
+            ) from error
+        self._compare(total)
+
+    def _open_file(self) -> None:
+        file = self._open(self.path, "mcap")
+        assert isinstance(file, McapFile)
+        self._files = [file]
+        self.records = file.metadata()
+        self.custom_data = custom_data_of(self.records)
+        self.distribution = distribution_of(self.records)
+        self._read_topics(file.topics())
+
+    def _require_known(self, information: Mapping[str, Any]) -> str:
+        """Return the kind of storage; refuse what is not broken and not read here."""
+        kind = str(information["storage_identifier"])
+        mode = str(information.get("compression_mode") or "none").lower()
+        packing = str(information.get("compression_format") or "zstd").lower()
+        if kind not in ("mcap", "sqlite3"):
+            raise UserError(f"{self.path}: its storage {kind!r} is not read here")
+        if mode != "none" and packing != "zstd":
+            raise UserError(f"{self.path}: its compression {packing!r} is not read here")
+        return kind
+
+    def _open(self, path: Path, kind: str) -> McapFile | SqliteData:
+        if path.suffix == ".zstd":
+            folder = self._stack.enter_context(tempfile.TemporaryDirectory())
+            path = unpack_file(path, Path(folder))
+        if kind == "mcap":
+            file = McapFile(path)
+            self._stack.callback(file.close)
+            return file
+        open_regular(path).close()
+        return SqliteData(self._stack.enter_context(Reader(path)))
+
+    def _read_topics(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        definitions: dict[str, tuple[str, str]] = {}
+        for file in self._files:
+            for name, definition in file.definitions().items():
+                definitions.setdefault(name, definition)
+        self.counts: Counter[str] = Counter()
+        self.topics: dict[str, BagTopic] = {}
+        for entry in entries:
+            told = entry["topic_metadata"]
+            name, type_name = str(told["name"]), str(told["type"])
+            if told.get("serialization_format", "cdr") != "cdr":
+                raise UserError(f"{self.path}: {name} is not in CDR, which alone is read here")
+            known = self.topics.get(name)
+            if known is not None and known.type_name != type_name:
+                raise UserError(
+                    f"{self.path}: {name} has two types in this bag, {known.type_name} and "
+                    f"{type_name}: record them under two names"
+                )
+            self.counts[name] += int(entry["message_count"])
+            type_hash = str(told.get("type_description_hash") or "")
+            qos = offered_profiles(told.get("offered_qos_profiles") or [])
+            encoding, text = definitions.get(type_name, ("ros2msg", ""))
+            self.topics[name] = BagTopic(name, type_name, text, type_hash, qos, encoding)
+
+    def _compare(self, total: int) -> None:
+        there: Counter[str] = Counter()
+        for file in self._files:
+            there.update(file.counts())
+        if +self.counts != +there or total != there.total():
+            raise ValueError(
+                f"{METADATA_FILE} tells of {self.counts.total()} messages, the data of "
+                f"{there.total()}, or of others"
+            )

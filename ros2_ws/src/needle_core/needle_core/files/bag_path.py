@@ -1,0 +1,169 @@
+"""Paths of bags: a bag or a file of one, whether it can be read, and what to type if it cannot."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import re
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path, PurePath
+from typing import Any, Final
+
+from needle_core.errors import UserError
+from needle_core.files.bag_data import is_sound_database
+from needle_core.files.file_access import open_regular
+from needle_core.files.plain_yaml import load_plain
+
+METADATA_FILE: Final = "metadata.yaml"
+METADATA_LIMIT: Final = 2**24
+_DATA_FILE: Final = re.compile(r"([^.].*?)(?:_(\d+))?\.mcap(?:\.zstd)?")
+
+
+class BrokenBagError(UserError):
+    """A bag that is damaged or was not completed; the message names the remedy.
+
+    Parameters
+    ----------
+    path : Path
+        The bag.
+    reason : str
+        The fault.
+    state : str
+        The bag's state in a few words.
+    """
+
+    def __init__(self, path: Path, reason: str, state: str = "is broken") -> None:
+        super().__init__(f"{path}: the bag {state} ({reason}): {repair_hint(path)}")
+        self.reason = reason
+
+
+def recover_hint(path: Path) -> str:
+    """Return what to type for an MCAP bag that is not whole."""
+    return f"run `ros2 run needle_bags recover {path}`"
+
+
+def repair_hint(path: Path) -> str:
+    """Return what to type for a bag that is not whole, by what its folder holds."""
+    databases = sorted(path.glob("*.db3"))
+    kind = "sqlite3" if databases and not any(path.glob("*.mcap")) else "mcap"
+    with contextlib.suppress(OSError, ValueError):
+        kind = read_information(path).get("storage_identifier", kind)
+    if kind != "sqlite3":
+        return recover_hint(path)
+    for file in databases:
+        for journal in (file.with_name(f"{file.name}-{kind}") for kind in ("wal", "journal")):
+            if journal.is_file() and journal.stat().st_size:
+                command = f"sqlite3 {file} 'PRAGMA journal_mode=DELETE'"
+                return f"SQLite has not taken in {journal.name} yet: run `{command}`"
+        if not is_sound_database(file):
+            return (
+                f"{file.name} is damaged, and `recover` mends MCAP only: "
+                f"`sqlite3 {file} .recover` may still read a part"
+            )
+    return f"run `ros2 bag reindex {path}`" if databases else "`recover` mends MCAP only"
+
+
+def recording_files(folder: Path) -> list[Path]:
+    """Return the files of a folder's only MCAP recording: `<stem>.mcap` or `<stem>_<n>.mcap`.
+
+    Of several stems, the one with the folder's name is the recording's. If numbers are missing
+    between others, the first of them is returned, too: that file does not exist.
+
+    Raises
+    ------
+    UserError
+        If there are several, and none has the folder's name.
+    """
+    stems: dict[str, dict[tuple[int, str], Path]] = {}
+    for file in sorted(folder.iterdir()):
+        if match := _DATA_FILE.fullmatch(file.name):
+            key = (int(match[2] or 0), file.name.removesuffix(".zstd"))
+            stems.setdefault(match[1], {}).setdefault(key, file)
+    stem = folder.absolute().name
+    if len(stems) > 1 and stem not in stems:
+        names = ", ".join(next(iter(files.values())).name for files in stems.values())
+        count = "two" if len(stems) == 2 else len(stems)
+        raise UserError(
+            f"{folder}: {count} recordings in one folder ({names}) and no {METADATA_FILE}: "
+            "give each a folder of its own, or name one of the files"
+        )
+    stem = stem if stem in stems else next(iter(stems), stem)
+    files = stems.get(stem, {})
+    for (before, _), (number, _) in pairwise(sorted(files)):
+        if number > before + 1:
+            name = f"{stem}_{before + 1}.mcap"
+            files[before + 1, name] = folder / name
+    return [file for _, file in sorted(files.items())]
+
+
+def require_bag(path: Path) -> None:
+    """Raise a `UserError` if a path is neither a bag with metadata.yaml nor an MCAP file."""
+    if path.is_file():
+        if ".mcap" not in path.suffixes[-2:]:
+            meant = f", {path.absolute().parent}" if path.name == METADATA_FILE else ""
+            raise UserError(f"{path} is a file: name an .mcap file or the bag's directory{meant}")
+    elif not path.is_dir():
+        raise UserError(f"{path}: no such bag directory")
+    elif os.path.lexists(path / METADATA_FILE):
+        return
+    files = [path] if path.is_file() else recording_files(path)
+    if any(is_being_recorded(file) for file in files):
+        raise UserError(f"{path}: the bag is still being recorded")
+    if path.is_dir():
+        if not files and not any(path.glob("*.db3")):
+            raise UserError(f"{path} is not a bag: it has no {METADATA_FILE}")
+        raise BrokenBagError(path, f"{METADATA_FILE} is missing", "was not completed")
+
+
+def is_being_recorded(file: Path) -> bool:
+    """Return whether a recorder is writing a data file right now."""
+    try:
+        with open_regular(file) as stream:
+            fcntl.flock(stream, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    except OSError:
+        return False
+    return False
+
+
+@contextlib.contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Turn whatever a bag's content makes a reader raise into one line."""
+    try:
+        yield
+    except (UserError, GeneratorExit):
+        raise
+    # Readers meet broken bags with all kinds of exceptions: assertions, struct errors, KeyError...
+    except Exception as error:
+        lines = str(error).splitlines()
+        reason = lines[0].rstrip(".")[:200] if lines else type(error).__name__
+        if isinstance(error, OSError):
+            reason = error.strerror or reason
+            if error.filename:
+                reason = f"{PurePath(os.fsdecode(error.filename)).name}: {reason}"
+        raise BrokenBagError(path, reason) from error
+
+
+def read_information(path: Path) -> dict[str, Any]:
+    """Return metadata.yaml's content.
+
+    Raises
+    ------
+    OSError, ValueError
+        If it cannot be read, or is not what rosbag2 writes.
+    """
+    with open_regular(path / METADATA_FILE) as stream:
+        data = stream.read(METADATA_LIMIT + 1)
+    if len(data) > METADATA_LIMIT:
+        raise ValueError(f"{METADATA_FILE} is larger than {METADATA_LIMIT} bytes")
+    try:
+        document = load_plain(data.decode())
+    except ValueError as error:
+        raise ValueError(f"{METADATA_FILE}: {error}") from error
+    information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else 0
+    if not isinstance(information, dict):
+        raise ValueError(f"{METADATA_FILE} is not what rosbag2 writes")
+    return information

@@ -1,0 +1,104 @@
+"""Families of ROS message classes: rclpy's, and those of rosbags' type stores."""
+
+from __future__ import annotations
+
+import array
+import functools
+import importlib
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from needle_core.messages import Quaternion, Vector3
+
+NANOSECONDS = 1_000_000_000
+# A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
+_FIRST_SEC, _LAST_SEC, _LAST_NANOSEC = -(2**31), 2**31 - 1, 2**32 - 1
+
+
+class MessageTypes:
+    """One family of message classes, found by name.
+
+    Parameters
+    ----------
+    lookup : callable
+        Returns the class of a type name such as `geometry_msgs/msg/Point`.
+    array : callable
+        Makes a numeric sequence field from numpy type and values.
+    byte : callable
+        Makes a `byte` field.
+    octets : callable
+        Makes a `uint8[]` field, without a loop over its elements.
+    """
+
+    def __init__(
+        self,
+        lookup: Callable[[str], Any],
+        array: Callable[[type[np.generic], Sequence[float]], Any],
+        byte: Callable[[int], Any],
+        octets: Callable[[bytes | memoryview], Any],
+    ) -> None:
+        self.make = functools.cache(lookup)
+        self.array = array
+        self.byte = byte
+        self.octets = octets
+
+    def header(self, stamp_ns: int, frame_id: str = "") -> Any:
+        """Return a std_msgs/Header."""
+        return self.make("std_msgs/msg/Header")(stamp=self.time(stamp_ns), frame_id=frame_id)
+
+    def time(self, stamp_ns: int) -> Any:
+        """Return a builtin_interfaces/Time; beyond its range the nearest that it can tell."""
+        sec = min(max(stamp_ns // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
+        nanosec = min(max(stamp_ns - sec * NANOSECONDS, 0), _LAST_NANOSEC)
+        return self.make("builtin_interfaces/msg/Time")(sec=sec, nanosec=nanosec)
+
+    def duration(self, seconds: float) -> Any:
+        """Return a builtin_interfaces/Duration."""
+        sec, nanosec = divmod(round(seconds * NANOSECONDS), NANOSECONDS)
+        return self.make("builtin_interfaces/msg/Duration")(sec=sec, nanosec=nanosec)
+
+    def point(self, position: Vector3) -> Any:
+        """Return a geometry_msgs/Point."""
+        x, y, z = position
+        return self.make("geometry_msgs/msg/Point")(x=x, y=y, z=z)
+
+    def vector(self, values: Vector3) -> Any:
+        """Return a geometry_msgs/Vector3."""
+        x, y, z = values
+        return self.make("geometry_msgs/msg/Vector3")(x=x, y=y, z=z)
+
+    def pose(self, position: Vector3, orientation: Quaternion) -> Any:
+        """Return a geometry_msgs/Pose."""
+        x, y, z, w = orientation
+        quaternion = self.make("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
+        make = self.make("geometry_msgs/msg/Pose")
+        return make(position=self.point(position), orientation=quaternion)
+
+
+def rclpy_types() -> MessageTypes:
+    """Return the message classes of the installed ROS."""
+
+    def lookup(name: str) -> Any:
+        package, kind, short = name.split("/")
+        return getattr(importlib.import_module(f"{package}.{kind}"), short)
+
+    return MessageTypes(
+        lookup,
+        lambda _, values: list(values),
+        lambda value: bytes([value]),
+        # Anything but an array of bytes is copied element by element.
+        lambda data: array.array("B", bytes(data)),
+    )
+
+
+def rosbags_types(store: Any) -> MessageTypes:
+    """Return the message classes of one of rosbags' type stores."""
+    return MessageTypes(
+        lambda name: store.types[name],
+        lambda kind, values: np.array(values, dtype=kind),
+        lambda value: value,
+        partial(np.frombuffer, dtype=np.uint8),
+    )

@@ -1,0 +1,236 @@
+"""Messages on the graph as small dataclasses, SI units; `convert` maps them to ROS."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from needle_core.diagnostics import Diagnostic, Level
+
+INSERTION_JOINT, ROTATION_JOINT = "insertion_joint", "rotation_joint"
+HOLD_LIFETIME = 0.1
+"""So long does a message promise a person's hold: who stands still holds no longer [s]."""
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+
+@dataclass(frozen=True)
+class JointState:
+    """Positions [m or rad] and velocities [m/s or rad/s] of named joints at one instant."""
+
+    stamp_ns: int
+    names: tuple[str, ...]
+    positions: tuple[float, ...]
+    velocities: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class TrajectoryPoint:
+    """One point of a trajectory.
+
+    Attributes
+    ----------
+    positions : tuple of float
+        Target of each joint [m or rad].
+    time_from_start : float
+        Nominal time at which it is reached [s].
+    others : tuple of float
+        Every other number that the point carries: velocities, accelerations, effort.
+    """
+
+    positions: tuple[float, ...]
+    time_from_start: float
+    others: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """A command; its stamp is that of the tip that caused it."""
+
+    stamp_ns: int
+    joint_names: tuple[str, ...]
+    points: tuple[TrajectoryPoint, ...]
+
+
+@dataclass(frozen=True)
+class CommandResult:
+    """The end of a command: its stamp, and `succeeded`, `replaced` or `aborted: reason`."""
+
+    stamp_ns: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class HoldState:
+    """State of a person's hold.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        The sender's own count [ns]; increases.
+    source : str
+        Whose hand.
+    pressed : bool
+        Whether hold to run is pressed.
+    speed_scale : float
+        Share of the nominal speed, 0 to 1.
+    lifetime : float
+        How long the message counts [s]; infinite where it does not say.
+    """
+
+    stamp_ns: int
+    source: str
+    pressed: bool
+    speed_scale: float
+    lifetime: float = math.inf
+
+
+@dataclass(frozen=True)
+class EmergencyStop:
+    """State of the emergency stop."""
+
+    pressed: bool
+
+
+@dataclass(frozen=True)
+class Point:
+    """A point [m]: a measured tip, or a target."""
+
+    stamp_ns: int
+    frame_id: str
+    position: Vector3
+
+
+@dataclass(frozen=True)
+class Vector:
+    """Three numbers."""
+
+    stamp_ns: int
+    frame_id: str
+    values: Vector3
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A position [m] and orientation."""
+
+    stamp_ns: int
+    frame_id: str
+    position: Vector3
+    orientation: Quaternion
+
+
+@dataclass(frozen=True)
+class PoseWithCovariance:
+    """A pose with its covariance: 36 numbers, row by row, as in geometry_msgs."""
+
+    stamp_ns: int
+    frame_id: str
+    position: Vector3
+    orientation: Quaternion
+    covariance: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Image:
+    """An image; `data` has `height` rows of `step` bytes."""
+
+    stamp_ns: int
+    frame_id: str
+    height: int
+    width: int
+    encoding: str
+    step: int
+    data: bytes | memoryview = field(repr=False)
+
+
+@dataclass(frozen=True)
+class RegionOfInterest:
+    """Part of the sensor that an image shows [px]; 0x0: all of it."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """A camera's calibration, with the names of sensor_msgs/CameraInfo."""
+
+    stamp_ns: int
+    frame_id: str
+    height: int
+    width: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    r: tuple[float, ...]
+    p: tuple[float, ...]
+    binning_x: int = 0
+    binning_y: int = 0
+    roi: RegionOfInterest = RegionOfInterest()
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text."""
+
+    text: str
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A shape of visualization_msgs, with the fields that an obstacle has."""
+
+    frame_id: str
+    namespace: str
+    number: int
+    kind: int
+    action: int
+    position: Vector3
+    orientation: Quaternion
+    scale: Vector3
+
+
+@dataclass(frozen=True)
+class Markers:
+    """A set of markers."""
+
+    markers: tuple[Marker, ...]
+
+
+@dataclass(frozen=True)
+class Status:
+    """A DiagnosticStatus: the health of `part` of the node `source`, with key-value pairs."""
+
+    source: str
+    part: str
+    level: Level
+    text: str
+    values: dict[str, str] = field(default_factory=dict)
+
+    @staticmethod
+    def of(source: str, part: str, diagnostic: Diagnostic) -> Status:
+        """Return a component's diagnostic as a message."""
+        return Status(source, part, diagnostic.level, diagnostic.message, diagnostic.values)
+
+
+@dataclass(frozen=True)
+class Diagnostics:
+    """Health of a node's parts, as on /diagnostics."""
+
+    stamp_ns: int
+    statuses: tuple[Status, ...]
+
+
+@dataclass(frozen=True)
+class LogLine:
+    """A line of /rosout."""
+
+    stamp_ns: int
+    severity: str
+    source: str
+    text: str

@@ -1,0 +1,167 @@
+"""A parameter dataclass, declared on a node and kept valid while it runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import sys
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import SetParametersResult as Result
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from needle_core.errors import UserError
+from needle_core.settings.parameter_fields import ParameterSpec, specs, unknown_parameter
+from needle_core.settings.parameter_files import check_command_line
+
+P = TypeVar("P")
+
+_SIM_TIME = "use_sim_time"
+_TYPES = frozenset(kind.value for kind in Parameter.Type)
+_LONGEST_NAME = 100
+OF_EVERY_NODE = (_SIM_TIME, "start_type_description_service", "qos_overrides.")
+"""Beginnings of the names of parameters that every rclpy node declares for itself."""
+
+
+class NodeParameters(Generic[P]):
+    """The parameters of one node: declared, checked as a whole, changed only to valid wholes.
+
+    Parameters
+    ----------
+    node : Node
+        The node that gets the parameters.
+    parameters : type
+        Frozen dataclass whose fields come from `parameter_fields.parameter`.
+    on_change : callable, optional
+        Called with the new instance after an accepted change.
+
+    Raises
+    ------
+    UserError
+        A given parameter that is unknown, of the wrong type, or out of bounds, or that is meant for
+        the node and does not reach it.
+    """
+
+    def __init__(
+        self, node: Node, parameters: type[P], on_change: Callable[[P], None] | None = None
+    ) -> None:
+        self._on_change = on_change
+        known = {name: (spec, default) for name, spec, default in specs(parameters)}
+        for line in check_command_line(sys.argv, node.get_fully_qualified_name()):
+            node.get_logger().warning(line)
+        _refuse_unknown(node, list(known))
+        values: dict[str, Any] = {}
+        for name, (spec, default) in known.items():
+            value = list(default) if isinstance(default, tuple) else default
+            # An empty list has no type of its own in ROS: one of texts takes what is given.
+            empty = value == [] and not spec.texts
+            if empty:
+                value = Parameter.Type.DOUBLE_ARRAY
+            try:
+                declared = node.declare_parameter(name, value, _descriptor(spec, default))
+                if empty and declared.value is None:
+                    node.set_parameters([Parameter(name, Parameter.Type.DOUBLE_ARRAY, [])])
+            except InvalidParameterTypeException as error:
+                given = node._parameter_overrides[name].value
+                whole = isinstance(default, float) and type(given) is int
+                raise UserError(
+                    f"{node.get_fully_qualified_name()}: {name} = {given!r} is not of type "
+                    f"{type(default).__name__}" + (f" (write {given}.0)" if whole else "")
+                ) from error
+            except InvalidParameterValueException as error:
+                given = node._parameter_overrides[name].value
+                sign = "" if spec.unit == "-" else f" {spec.unit}"
+                raise UserError(
+                    f"{node.get_fully_qualified_name()}: {name} = {given!r} is outside "
+                    f"[{spec.lower:g}, {spec.upper:g}]{sign}"
+                ) from error
+            values[name] = _plain(node.get_parameter(name).value)
+        try:
+            self.values: P = parameters(**values)
+        except UserError as error:
+            raise UserError(f"{node.get_fully_qualified_name()}: {error}") from error
+        self._sim_time = bool(node.get_parameter(_SIM_TIME).value)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._apply)
+        for service in node.services:
+            if service.srv_type in (SetParameters, SetParametersAtomically):
+                service.callback = partial(_answer_if_typed, service.callback)
+
+    def _changed(self, changes: list[Parameter]) -> P:
+        own = {field.name for field in dataclasses.fields(self.values)}  # type: ignore[arg-type]
+        update = {p.name: _plain(p.value) for p in changes if p.name in own}
+        return dataclasses.replace(self.values, **update)  # type: ignore[type-var]
+
+    def _check(self, changes: list[Parameter]) -> Result:
+        for change in changes:
+            if change.name == _SIM_TIME and change.value is not self._sim_time:
+                return Result(successful=False, reason=f"{_SIM_TIME} is fixed at start")
+        try:
+            self._changed(changes)
+        except UserError as error:
+            return Result(successful=False, reason=str(error))
+        return Result(successful=True)
+
+    def _apply(self, changes: list[Parameter]) -> None:
+        changed = self._changed(changes)
+        if changed != self.values:
+            self.values = changed
+            if self._on_change is not None:
+                self._on_change(changed)
+
+
+def _answer_if_typed(answer: Callable[[Any, Any], Any], request: Any, response: Any) -> Any:
+    """Refuse a request whole that holds a value of no type; rclpy would end the node."""
+    for given in request.parameters:
+        if given.value.type not in _TYPES:
+            name = given.name[:_LONGEST_NAME]
+            refusal = Result(
+                successful=False, reason=f"{name}: there is no parameter type {given.value.type}"
+            )
+            if isinstance(response, SetParametersAtomically.Response):
+                response.result = refusal
+            else:
+                response.results = [refusal] * len(request.parameters)
+            return response
+    return answer(request, response)
+
+
+def _plain(value: Any) -> Any:
+    """Return lists (rclpy's arrays among them) as tuples, all else as it is."""
+    return value if isinstance(value, (str, int, float, bool)) else tuple(value)
+
+
+def _refuse_unknown(node: Node, known: list[str]) -> None:
+    # rclpy drops overrides that nobody declares without a word: a misspelt gain would do nothing.
+    for name in node._parameter_overrides:
+        if name in known or name.startswith(OF_EVERY_NODE):
+            continue
+        raise UserError(f"{node.get_fully_qualified_name()}: {unknown_parameter(name, known)}")
+
+
+def _descriptor(spec: ParameterSpec, default: Any) -> ParameterDescriptor:
+    descriptor = ParameterDescriptor(
+        description=spec.description,
+        additional_constraints=f"unit: {spec.unit}"
+        + (f"; one of {', '.join(spec.choices)}" if spec.choices else ""),
+        read_only=spec.read_only,
+        dynamic_typing=spec.texts,
+    )
+    bounded = math.isfinite(spec.lower) and math.isfinite(spec.upper)
+    if isinstance(default, bool) or not bounded:
+        return descriptor
+    if isinstance(default, int):
+        descriptor.integer_range = [
+            IntegerRange(from_value=int(spec.lower), to_value=int(spec.upper), step=0)
+        ]
+    elif isinstance(default, float):
+        descriptor.floating_point_range = [
+            FloatingPointRange(from_value=float(spec.lower), to_value=float(spec.upper), step=0.0)
+        ]
+    return descriptor

@@ -1,0 +1,139 @@
+"""Node parameters as frozen dataclasses: one declaration gives default, unit, range and text."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any, TypeVar, cast
+
+from needle_core.errors import UserError
+from needle_core.settings.bounds import check_bounds
+
+P = TypeVar("P")
+_METADATA_KEY = "needle_parameter"
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterSpec:
+    """Description of a parameter, beside its value.
+
+    Attributes
+    ----------
+    unit : str
+        SI unit, "-" for none.
+    description : str
+        One sentence for `--help` and `ros2 param describe`.
+    lower, upper : float
+        Inclusive bounds of a number, or of each element of a list.
+    choices : tuple of str
+        The allowed texts; empty: any text.
+    read_only : bool
+        Whether the value is fixed once the node runs.
+    texts : bool
+        Whether the elements of a list are texts; numbers otherwise.
+    """
+
+    unit: str
+    description: str
+    lower: float = -math.inf
+    upper: float = math.inf
+    choices: tuple[str, ...] = ()
+    read_only: bool = False
+    texts: bool = False
+
+
+def parameter(default: Any, **spec: Any) -> Any:
+    """Declare a field of a parameter dataclass; the keywords are those of `ParameterSpec`."""
+    return dataclasses.field(default=default, metadata={_METADATA_KEY: ParameterSpec(**spec)})
+
+
+def fixed_parameter(default: Any, *spec: Any, **more: Any) -> Any:
+    """Declare a field whose value is fixed once the node runs, by the arguments of the spec."""
+    fixed = dataclasses.replace(ParameterSpec(*spec, **more), read_only=True)
+    return dataclasses.field(default=default, metadata={_METADATA_KEY: fixed})
+
+
+def specs(parameters: Any) -> Iterator[tuple[str, ParameterSpec, Any]]:
+    """Yield (name, spec, default) of each parameter of a parameter dataclass or instance."""
+    for field in dataclasses.fields(parameters):
+        yield field.name, cast(ParameterSpec, field.metadata[_METADATA_KEY]), field.default
+
+
+def check_fields(parameters: Any) -> None:
+    """Check every field of a parameter dataclass; call it first in `__post_init__`.
+
+    Raises
+    ------
+    OutOfBoundsError
+        A number that is outside its bounds.
+    UserError
+        A number that is not finite, a text that is not one of the choices, or another type than
+        the default's.
+    """
+    for name, spec, default in specs(parameters):
+        value = getattr(parameters, name)
+        if type(value) is not type(default):
+            raise UserError(
+                f"{name} = {value!r} is of type {type(value).__name__}, "
+                f"wants {type(default).__name__}"
+            )
+        for element in value if isinstance(value, tuple) else (value,):
+            if isinstance(element, (int, float)) and not isinstance(element, bool):
+                check_bounds(name, element, spec.lower, spec.upper, spec.unit)
+            elif spec.choices and element not in spec.choices:
+                raise UserError(f"{name} = {element!r} is not one of {', '.join(spec.choices)}")
+
+
+def from_values(kind: type[P], values: Mapping[str, Any], node: str) -> P:
+    """Return a parameter dataclass from the values of a file or a command line.
+
+    Parameters
+    ----------
+    kind : type
+        The dataclass.
+    values : mapping of str to object
+        Parameter to value; lists stand for tuples.
+    node : str
+        Whose parameters they are, for errors.
+
+    Raises
+    ------
+    UserError
+        An unknown parameter, or a value that the dataclass refuses.
+    """
+    known = {name: default for name, _, default in specs(kind)}
+    for name, value in values.items():
+        if name not in known:
+            raise UserError(f"{node}: {unknown_parameter(name, known)}")
+        if isinstance(known[name], float) and type(value) is int:
+            raise UserError(f"{node}: {name} = {value} is not of type float (write {value}.0)")
+    plain = {name: tuple(v) if isinstance(v, list) else v for name, v in values.items()}
+    try:
+        return kind(**plain)
+    except UserError as error:
+        raise UserError(f"{node}: {error}") from error
+
+
+def unknown_parameter(name: str, known: Collection[str]) -> str:
+    """Return what is said of a parameter that a node does not have."""
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{close[0]}'?" if close else f"known: {', '.join(known)}"
+    return f"unknown parameter '{name}' ({hint})"
+
+
+def describe(parameters: type) -> str:
+    """Return the parameter table of a dataclass as `--help` shows it, one parameter a line."""
+    lines = []
+    for name, spec, default in specs(parameters):
+        shown = list(default) if isinstance(default, tuple) else default
+        unit = "" if spec.unit == "-" else f" {spec.unit}"
+        bounds = ""
+        if math.isfinite(spec.lower) or math.isfinite(spec.upper):
+            bounds = f" [{spec.lower:g}, {spec.upper:g}]"
+        elif spec.choices:
+            bounds = f" [{', '.join(spec.choices)}]"
+        fixed = " (fixed at start)" if spec.read_only else ""
+        lines.append(f"  {name}: {shown!r}{unit}{bounds}{fixed}\n      {spec.description}")
+    return "\n".join(lines)

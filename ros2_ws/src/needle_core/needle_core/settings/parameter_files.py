@@ -1,0 +1,244 @@
+"""Parameter files: which of their sections reach a node, as ROS matches them with its full name."""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from needle_core.errors import UserError
+from needle_core.files.plain_yaml import read_yaml
+
+NODES = (
+    *("recorder", "sim_rig", "drive_emulator", "device_driver", "stereo_camera", "stereo_tracker"),
+    *("plane_controller", "operator", "simulated_operator", "live_view", "openigtlink", "player"),
+    "console",
+)
+"""Names of the rig's nodes."""
+_SECTION = "ros__parameters"
+_FORM = "NODE: {ros__parameters: ...}"
+_WILDCARDS = ("*", "**")
+_OVERRIDE = "-p "
+_CLOSE = 0.7  # names that have so much in common are one, misspelt
+
+Parameters = dict[str, dict[str, Any]]
+"""Node -> parameter -> value."""
+Sections = dict[str, dict[str, Any]]
+"""Section as the file names it -> parameter -> value."""
+T = TypeVar("T")
+
+
+def read_sections(path: Path) -> Sections:
+    """Return the sections of a ROS parameter file.
+
+    Raises
+    ------
+    UserError
+        If it cannot be read, is no such file, or has a section or a parameter twice.
+    """
+    document = read_yaml(path)
+    if not isinstance(document or {}, Mapping):
+        raise UserError(f"{path}: not a ROS parameter file ({_FORM})")
+    sections = list(_sections(path, document or {}))
+    _unique(path, ((_absolute(name), None) for name, _ in sections))
+    return {name: _unique(f"{path}: {name}", _flat(values)) for name, values in sections}
+
+
+def sections_for(source: object, sections: Sections, node: str, kind: str) -> Sections:
+    """Return the sections that reach a node; none where none is meant for a node of its kind.
+
+    Parameters
+    ----------
+    source : object
+        Where they stand, for errors.
+    sections : mapping
+        All that stand there.
+    node : str
+        Full name of the node, after remapping.
+    kind : str
+        Name of its executable, which is its own name without remapping.
+
+    Raises
+    ------
+    UserError
+        If some are meant for such a node but none of them reaches this one, which would run on its
+        defaults, or if one has a name that is close to a node of this rig.
+    """
+    own = (kind, _last(node))
+    for name in sections:
+        if _last(name) not in (*NODES, *own, *_WILDCARDS):
+            close = difflib.get_close_matches(_last(name), NODES, n=1, cutoff=_CLOSE)
+            if close:
+                raise UserError(f"{source}: unknown node '{name}', did you mean '{close[0]}'?")
+    meant = [name for name in sections if _last(name) in own]
+    meant = meant or [name for name in sections if _last(name) in _WILDCARDS]
+    reached = {name: values for name, values in sections.items() if _matches(name, node)}
+    if meant and reached.keys().isdisjoint(meant):
+        raise UserError(
+            f"{source}: section '{meant[0]}' is for {_absolute(meant[0])}, this node is {node}: "
+            f"write '{node}', '/**/{_last(node)}' or '/**'"
+        )
+    return reached
+
+
+def values_for(source: object, sections: Sections, node: str, kind: str) -> dict[str, Any] | None:
+    """Return what sections set in a node; arguments and errors as of `sections_for`.
+
+    None where no section is meant for a node of its kind.
+    """
+    reached = sections_for(source, sections, node, kind)
+    if not reached:
+        return None
+    return {name: value for values in reached.values() for name, value in values.items()}
+
+
+def none_for(source: object, sections: Sections, node: str) -> str:
+    """Return the warning that a source has no section for a node of its kind."""
+    return f"{source}: no section for {node}: it has {', '.join(sections) or 'none'}"
+
+
+def given_sections(words: Sequence[str]) -> list[tuple[str, Sections]]:
+    """Return what a node's command line has of parameters: (file or `-p` as given, sections).
+
+    Raises
+    ------
+    UserError
+        As `read_sections`.
+    """
+    given: list[tuple[str, Sections]] = []
+    ros = words[words.index("--ros-args") :] if "--ros-args" in words else []
+    for option, text in itertools.pairwise(ros):
+        if option == "--params-file":
+            given.append((text, read_sections(Path(text))))
+        elif option in ("-p", "--param"):
+            *of, name = text.partition(":=")[0].split(":")
+            given.append((f"{_OVERRIDE}{text}", {of[0] if of else "/**": {name: None}}))
+    return given
+
+
+def check_command_line(words: Sequence[str], node: str) -> list[str]:
+    """Check that the parameters on a node's command line reach it.
+
+    Parameters
+    ----------
+    words : sequence of str
+        The command line, with the executable.
+    node : str
+        Full name of the node, after remapping.
+
+    Returns
+    -------
+    list of str
+        A warning for each file or `-p` that has nothing for a node of this kind.
+
+    Raises
+    ------
+    UserError
+        As `read_sections` and `sections_for`, and if a section of a file wins over a `-p`.
+    """
+    warnings = []
+    overrides: dict[str, str] = {}
+    # As rcl keeps them: a section stays where it is first named, and the last section wins.
+    kept: dict[str, dict[str, str]] = {}
+    for source, sections in given_sections(words):
+        reached = sections_for(source, sections, node, Path(words[0]).stem)
+        if not reached:
+            warnings.append(none_for(source, sections, node))
+        for section, values in reached.items():
+            setter = source
+            if source.startswith(_OVERRIDE):
+                overrides.update(dict.fromkeys(values, source))
+            else:
+                setter = f"section '{section}' of {source}"
+            kept.setdefault(section, {}).update(dict.fromkeys(values, setter))
+    winners = {name: setter for values in kept.values() for name, setter in values.items()}
+    for name, source in overrides.items():
+        if winners[name] != source:
+            raise UserError(
+                f"{source} does not reach {node}, {winners[name]} wins: "
+                "write '/**' behind all other sections, and -p behind all files"
+            )
+    return warnings
+
+
+def read_parameters(path: Path, nodes: Sequence[str], namespace: str = "") -> Parameters:
+    """Return what a ROS parameter file sets in nodes that are started together.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    nodes : sequence of str
+        The nodes that are started: the file may name no other.
+    namespace : str
+        Theirs.
+
+    Returns
+    -------
+    dict
+        Node -> parameter -> value, without nodes that the file has nothing for.
+
+    Raises
+    ------
+    UserError
+        As `read_sections` and `sections_for`, and for a section of another node.
+    """
+    sections = read_sections(path)
+    if not sections:
+        raise UserError(f"{path}: not a ROS parameter file ({_FORM})")
+    parameters: Parameters = {}
+    for node in nodes:
+        full_name = "/".join(["", *filter(None, namespace.split("/")), node])
+        values = values_for(path, sections, full_name, node)
+        if values is not None:
+            parameters[node] = values
+    for name in sections:
+        if _last(name) not in (*nodes, *_WILDCARDS):
+            raise UserError(f"{path}: '{name}' is not started here, only {', '.join(nodes)}")
+    return parameters
+
+
+def _sections(path: Path, content: Mapping[Any, Any], above: str = "") -> Iterator[Any]:
+    """Yield (section, what is below ros__parameters)."""
+    for key, value in content.items():
+        name = f"{above}/{key}".replace("//", "/") if above else str(key)
+        # rcl compares no more of the key.
+        is_section = str(key).startswith(_SECTION)
+        if not isinstance(value, Mapping):
+            wrong = "wants NAME: VALUE pairs" if is_section else f"stands outside {_SECTION}"
+            raise UserError(f"{path}: '{name}' {wrong}")
+        yield from [(above, value)] if is_section else _sections(path, value, name)
+
+
+def _flat(values: Mapping[Any, Any], above: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _flat(value, f"{above}{name}.")
+        else:
+            yield f"{above}{name}", value
+
+
+def _unique(where: object, pairs: Iterable[tuple[str, T]]) -> dict[str, T]:
+    found: dict[str, T] = {}
+    for name, value in pairs:
+        if name in found:
+            raise UserError(f"{where}: '{name}' stands there twice")
+        found[name] = value
+    return found
+
+
+def _matches(section: str, node: str) -> bool:
+    # rcl's pattern: /* is one name, /** any number of them.
+    pattern = re.escape(_absolute(section)).replace(r"/\*", r"(/\w+)").replace(r"\*", "*")
+    return re.fullmatch(pattern, node) is not None
+
+
+def _absolute(section: str) -> str:
+    return section if section.startswith("/") else f"/{section}"
+
+
+def _last(name: str) -> str:
+    return name.rpartition("/")[2]

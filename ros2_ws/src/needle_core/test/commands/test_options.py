@@ -1,0 +1,88 @@
+"""What all command lines understand, and what they refuse in one line."""
+
+import math
+from pathlib import Path
+
+import pytest
+
+from needle_core.commands.options import (
+    CommandParser,
+    join_start,
+    number,
+    output_file,
+    start,
+    whole_number,
+)
+from needle_core.errors import OutOfBoundsError, UserError
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (["--see"], "unrecognized arguments: --see; see --help"),
+        (["--seed"], "argument --seed: expected one argument; see --help"),
+    ],
+)
+def test_words_that_are_not_understood_are_a_users_error(words: list[str], complaint: str) -> None:
+    parser = CommandParser("study", "Runs.", "example:\n  study --seed 1")
+    parser.add_argument("--seed")
+    with pytest.raises(UserError) as raised:
+        parser.parse_args(words)
+    assert str(raised.value) == complaint
+
+
+def test_help_keeps_its_lines() -> None:
+    parser = CommandParser("study", "Runs,\nand says so.", "example:\n  study --seed 1")
+    assert "Runs,\nand says so." in parser.format_help()
+    assert parser.format_help().endswith("example:\n  study --seed 1\n")
+
+
+def test_a_number_lies_within_its_bounds() -> None:
+    assert number("--depth-mm", "120", 1.0, 120.0, "mm") == 120.0
+    assert number("--until-mm", "inf", 0.0, math.inf, "mm") == math.inf
+    with pytest.raises(OutOfBoundsError, match=r"--depth-mm = 121 mm is outside \[1, 120\] mm"):
+        number("--depth-mm", "121", 1.0, 120.0, "mm")
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("deep", "'deep' is not a number"),
+        ("nan", "= nan mm is not finite"),
+        ("-inf", "= -inf mm is not finite"),
+    ],
+)
+def test_what_is_no_number_is_refused(text: str, complaint: str) -> None:
+    with pytest.raises(UserError, match=f"--depth-mm {complaint}"):
+        number("--depth-mm", text, 1.0, 120.0, "mm")
+
+
+def test_a_whole_number_is_whole() -> None:
+    assert whole_number("--draws", "10", 1, 10) == 10
+    with pytest.raises(UserError, match="is not a whole number"):
+        whole_number("--draws", "1.5", 1, 10)
+    with pytest.raises(OutOfBoundsError):
+        whole_number("--draws", "11", 1, 10)
+
+
+def test_a_file_is_written_where_a_folder_is(tmp_path: Path) -> None:
+    assert output_file("--json", None) is None
+    assert output_file("--json", tmp_path / "new.json") == tmp_path / "new.json"
+    assert output_file("--json", "new.json") == Path("new.json")
+    for bad in (tmp_path, tmp_path / "missing" / "new.json"):
+        with pytest.raises(UserError, match="--json"):
+            output_file("--json", bad)
+
+
+@pytest.mark.parametrize("text", ["-3,2,15", "-.5,2,15", "3,-2,-15"])
+def test_a_start_may_begin_with_a_minus(text: str) -> None:
+    parser = CommandParser("study", "", "")
+    parser.add_argument("--initial")
+    given = parser.parse_args(join_start(["--initial", text])).initial
+    assert start(given, 50.0, 45.0) == tuple(float(part) for part in text.split(","))
+
+
+@pytest.mark.parametrize("text", ["-3,2", "-51,0,0", "0,46,0", "0,0,181", "-inf,0,0", "x,0,0"])
+def test_a_start_that_cannot_be_is_refused(text: str) -> None:
+    with pytest.raises(UserError, match="--initial"):
+        start(text, 50.0, 45.0)

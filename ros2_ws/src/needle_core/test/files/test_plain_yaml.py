@@ -1,0 +1,70 @@
+"""YAML is read once a key, and from outside without what grows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from needle_core.errors import UserError
+from needle_core.files.plain_yaml import load_plain, read_yaml
+
+KEYS = st.text("ab1", min_size=1, max_size=2)
+VALUES = st.recursive(
+    st.none() | st.integers() | st.text(max_size=3),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(KEYS, inner, max_size=3),
+    max_leaves=12,
+)
+
+
+@settings(deadline=None)
+@given(VALUES, st.sampled_from([None, True, False]))
+def test_what_has_no_key_twice_is_read_as_it_was_written(value: object, flow: bool | None) -> None:
+    assert load_plain(yaml.safe_dump(value, default_flow_style=flow)) == value
+
+
+@pytest.mark.parametrize(
+    ("text", "line"),
+    [
+        ("a: 1\na: 2", 2),
+        ("b:\n  - {a: 1}\n  - a: 1\n    c: [a, a]\n    a: 2", 5),
+        ("b: {a: {a: 1}, c: {a: 1}}\nc: a\n'b': 1", 3),
+        ("? [a]\n: 1\nb: 2\n? b\n: 3", 4),
+    ],
+)
+def test_a_key_that_stands_twice_is_named_with_its_line(text: str, line: int) -> None:
+    key = "b" if "b: 2" in text or "'b'" in text else "a"
+    with pytest.raises(ValueError, match=f"^duplicate key '{key}' in line {line}$"):
+        load_plain(text)
+
+
+def test_aliases_are_for_files_of_the_users_own(tmp_path: Path) -> None:
+    shared = [640, 480]
+    path = tmp_path / "file.yaml"
+    path.write_text(yaml.safe_dump({"left": shared, "right": shared}))
+    assert read_yaml(path) == {"left": shared, "right": shared}
+    with pytest.raises(ValueError, match="aliases"):
+        load_plain(path.read_text())
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"[1, 2", "not YAML in line 2"),
+        (b"a: !!opencv-matrix {}", "not YAML in line 1"),
+        (b"a: 2024-13-45", "month must be in"),
+        (b"\xff\xfe\xff", "cannot be read: not a text file"),
+        (b"[" * 200, "nests more than 100 deep"),
+    ],
+)
+def test_what_cannot_be_read_is_one_line(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "file.yaml"
+    path.write_bytes(content)
+    with pytest.raises(UserError) as caught:
+        read_yaml(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)

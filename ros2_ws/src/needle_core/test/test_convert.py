@@ -1,0 +1,87 @@
+"""Every message there and back, through rosbags' CDR and through rclpy's."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from rclpy.serialization import deserialize_message, serialize_message
+from rosbags.typesys import Stores, get_typestore
+
+from needle_core import messages as m
+from needle_core.convert import TABLE, Converter, from_ros, ros_type
+from needle_core.diagnostics import Level
+from needle_core.message_types import rclpy_types, rosbags_types
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+STAMP = 1_234_567_890_123
+TURN = (0.0, 0.6, 0.0, 0.8)
+POINT = m.TrajectoryPoint((0.001, -0.5), 0.5, (1.0, 2.0))
+MESSAGES = (
+    m.JointState(STAMP, ("insertion_joint", "rotation_joint"), (0.01, -2.5), (0.002, 0.0)),
+    m.Trajectory(STAMP, ("insertion_joint", "rotation_joint"), (POINT,)),
+    m.CommandResult(STAMP, "aborted: hold released"),
+    m.HoldState(STAMP, "person", True, 0.5, 0.125),
+    m.HoldState(STAMP, "person", False, 0.0),
+    m.EmergencyStop(True),
+    m.Point(STAMP, "rig", (0.1, -0.2, 0.3)),
+    m.Vector(STAMP, "target_plane", (0.1, -0.2, 0.3)),
+    m.Pose(STAMP, "rig", (0.1, -0.2, 0.3), TURN),
+    m.PoseWithCovariance(STAMP, "rig", (0.1, -0.2, math.inf), TURN, tuple(np.arange(36.0))),
+    m.Image(STAMP, "left_camera_optical", 2, 3, "mono8", 4, bytes(range(8))),
+    m.CameraInfo(
+        stamp_ns=STAMP,
+        frame_id="left_camera_optical",
+        height=768,
+        width=1024,
+        distortion_model="plumb_bob",
+        d=(0.1, 0.2, 0.0, 0.0, 0.3),
+        k=tuple(np.arange(9.0)),
+        r=tuple(np.arange(9.0, 18.0)),
+        p=tuple(np.arange(12.0)),
+        binning_x=2,
+        binning_y=4,
+        roi=m.RegionOfInterest(10, 20, 30, 40),
+    ),
+    m.Text("a calibration"),
+    m.Markers((m.Marker("rig", "bone", 4, 2, 0, (0.1, 0.2, 0.3), TURN, (0.6, 0.6, 0.6)),)),
+    m.Status("rig1/device_driver", "device", Level.WARN, "text", {"state": "MOVING"}),
+    m.Diagnostics(STAMP, (m.Status("sim_rig", "simulation", Level.OK, "runs", {"a": "1"}),)),
+    m.LogLine(STAMP, "warning", "plane_controller", "a line"),
+)
+
+
+def test_every_kind_of_message_is_tried() -> None:
+    assert {type(message) for message in MESSAGES} == set(TABLE)
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
+def test_there_and_back_without_ros(message: Any) -> None:
+    kind = ros_type(type(message))
+    data = STORE.serialize_cdr(Converter(rosbags_types(STORE)).to_ros(message), kind)
+    assert from_ros(type(message), STORE.deserialize_cdr(data, kind)) == message
+
+
+@pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
+def test_there_and_back_with_ros_and_across(message: Any) -> None:
+    types = rclpy_types()
+    kind = ros_type(type(message))
+    data = serialize_message(Converter(types).to_ros(message))
+    assert from_ros(type(message), deserialize_message(data, types.make(kind))) == message
+    written = STORE.serialize_cdr(Converter(rosbags_types(STORE)).to_ros(message), kind)
+    heard = deserialize_message(bytes(written), types.make(kind))
+    assert from_ros(type(message), heard) == message
+
+
+def test_a_hold_without_button_or_axis_is_a_release() -> None:
+    joy = rclpy_types().make("sensor_msgs/msg/Joy")()
+    hold = from_ros(m.HoldState, joy)
+    assert not hold.pressed
+    assert math.isnan(hold.speed_scale)
+    assert hold.lifetime == math.inf
+
+
+def test_a_stamp_beyond_what_ros_can_tell_is_the_nearest() -> None:
+    types = rclpy_types()
+    assert types.time(2**40 * 10**9).sec == 2**31 - 1
+    assert types.time(-(2**40) * 10**9).sec == -(2**31)
