@@ -116,15 +116,24 @@ def _trajectory(message: Any) -> m.Trajectory:
     return m.Trajectory(stamp_ns, tuple(message.joint_names), tuple(points))
 
 
-def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
-    axes = [message.speed_scale]
-    if math.isfinite(message.lifetime):
-        axes.append(message.lifetime)
+def _joystick_fields(message: m.Joystick, t: MessageTypes, frame_id: str = "") -> dict[str, Any]:
     return {
-        "header": t.header(message.stamp_ns, message.source),
-        "axes": t.array(np.float32, axes),
-        "buttons": t.array(np.int32, [int(message.pressed)]),
+        "header": t.header(message.stamp_ns, frame_id),
+        "axes": t.array(np.float32, message.axes),
+        "buttons": t.array(np.int32, message.buttons),
     }
+
+
+def _joystick(message: Any) -> m.Joystick:
+    buttons = tuple(int(button) for button in message.buttons)
+    return m.Joystick(to_nanoseconds(message.header.stamp), _floats(message.axes), buttons)
+
+
+def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
+    promise = (message.lifetime,) if math.isfinite(message.lifetime) else ()
+    axes = (message.speed_scale, *promise)
+    buttons = (int(message.pressed),)
+    return _joystick_fields(m.Joystick(message.stamp_ns, axes, buttons), t, message.source)
 
 
 def _hold(message: Any) -> m.HoldState:
@@ -140,20 +149,16 @@ def _hold(message: Any) -> m.HoldState:
 
 
 def _pose_fields(message: m.Pose, t: MessageTypes) -> dict[str, Any]:
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "pose": t.pose(message.position, message.orientation),
-    }
+    pose = t.pose(message.position, message.orientation)
+    return {"header": t.header(message.stamp_ns, message.frame_id), "pose": pose}
 
 
 def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[str, Any]:
-    make = t.make("geometry_msgs/msg/PoseWithCovariance")
-    pose = t.pose(message.position, message.orientation)
-    covariance = t.array(np.float64, message.covariance)
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "pose": make(pose=pose, covariance=covariance),
-    }
+    pose = t.make("geometry_msgs/msg/PoseWithCovariance")(
+        pose=t.pose(message.position, message.orientation),
+        covariance=t.array(np.float64, message.covariance),
+    )
+    return {"header": t.header(message.stamp_ns, message.frame_id), "pose": pose}
 
 
 def _image_fields(message: m.Image, t: MessageTypes) -> dict[str, Any]:
@@ -327,6 +332,7 @@ TABLE: dict[type[Any], Row] = {
         lambda r: m.CommandResult(to_nanoseconds(r.stamp), r.frame_id),
     ),
     m.HoldState: Row("sensor_msgs/msg/Joy", _hold_fields, _hold),
+    m.Joystick: Row("sensor_msgs/msg/Joy", _joystick_fields, _joystick),
     m.EmergencyStop: Row(
         "std_msgs/msg/Bool",
         lambda message, t: {"data": message.pressed},
