@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_controller.controller_status import steering_diagnostic
+from needle_controller.controller_status import controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
@@ -24,7 +24,6 @@ from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
-    DeviceReport,
     PublishUpdate,
     SendPath,
     SendStep,
@@ -54,6 +53,7 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.rotations import quaternion_from_rotation
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
@@ -98,11 +98,11 @@ class PlaneController(Component):
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._heard = HeardMessages()
         self._logged: dict[str, float] = {}
-        self._published: Diagnostic | None = None
+        self._published: ControllerStatus | None = None
         rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
         rows = (
             ("joint_states", m.JointState, self._on_joints, JOINT_STATES),
-            ("device/status", m.Status, self._on_device, LATCHED),
+            ("device/status", DeviceStatus, self._on_device, LATCHED),
             ("device/result", m.CommandResult, self._on_result, RELIABLE),
             ("needle/tip", m.Point, self._on_tip, RELIABLE),
             ("needle/tip_pose", m.PoseWithCovariance, self._on_tip_pose, RELIABLE),
@@ -120,7 +120,7 @@ class PlaneController(Component):
             Output("needle/reduced_state", m.Vector),
             Output("needle/linearized_state", m.Vector),
             Output("needle/control_input", m.Vector),
-            Output(STATUS, m.Status, LATCHED),
+            Output(STATUS, ControllerStatus, LATCHED),
         )
         self.services = (
             Service("plane_controller/start", self._on_start),
@@ -179,8 +179,8 @@ class PlaneController(Component):
     def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
         return self.steering.on_joints(joint_sample(message, at.sent_ns))
 
-    def _on_device(self, message: m.Status, at: Moment) -> Iterable[Action]:
-        return self.steering.on_device(device_report(message))
+    def _on_device(self, message: DeviceStatus, at: Moment) -> Iterable[Action]:
+        return self.steering.on_device(message)
 
     def _on_result(self, message: m.CommandResult, at: Moment) -> Iterable[Action]:
         return self.steering.on_result(message.stamp_ns, message.outcome, at.sent_ns)
@@ -263,13 +263,11 @@ class PlaneController(Component):
         yield Diagnose("joint_states", _health(complaint, joints))
         for topic in TARGETS:
             yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
-        diagnostic = steering_diagnostic(self.steering, self.settings.preset)
-        yield Diagnose("steering", diagnostic)
-        if diagnostic != self._published or self._heard.is_full:
-            self._published = diagnostic
-            values = {**diagnostic.values, "heard": self._heard.take_text()}
-            told = dataclasses.replace(diagnostic, values=values)
-            yield Publish(STATUS, m.Status.of(self._signature, "steering", told))
+        status = controller_status(self.steering, self.settings.preset, self._signature)
+        yield Diagnose("steering", status.diagnostic)
+        if status != self._published or self._heard.is_full:
+            self._published = status
+            yield Publish(STATUS, dataclasses.replace(status, heard=self._heard.take_text()))
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
@@ -296,28 +294,8 @@ def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
     return TipCovariance(message.stamp_ns, message.frame_id, matrix)
 
 
-def device_report(message: m.Status) -> DeviceReport:
-    """Return what the protocol needs of device/status."""
-    values = message.values
-    return DeviceReport(
-        state=values.get("state", ""),
-        homed=values.get("homed", "").lower() == "true",
-        hold_owner=values.get("hold_owner", ""),
-        reason=values.get("fault", "") or values.get("reason", "") or message.text,
-        insertion=_number(values.get("insertion_m", "")),
-        rotation=_number(values.get("rotation_rad", "")),
-    )
-
-
 def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
     return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
 
 
 def _trajectory(command: SendStep | SendPath) -> m.Trajectory:

@@ -30,6 +30,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.status_messages import DeviceStatus
 
 HOLD, INPUT_DEVICE = "device/hold", "input device"
 PERIOD = 0.02
@@ -74,7 +75,7 @@ class Operator(Component):
         self._press_again = False
         self._told = ""
         self._last_stamp = 0
-        self.inputs = (Input("device/status", m.Status, self._on_device, LATCHED),)
+        self.inputs = (Input("device/status", DeviceStatus, self._on_device, LATCHED),)
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
         if settings.source == JOY:
             # The newest alone: what waited behind a stall is no hand of now.
@@ -139,11 +140,9 @@ class Operator(Component):
             yield Call(call)
         yield from self._report()
 
-    def _on_device(self, message: m.Status, at: Moment) -> Actions:
-        values = message.values
-        self._press_again = values.get("press_again") == self.name
-        owner, activity = values.get("hold_owner", ""), values.get("activity", "")
-        self._retraction.see_device(owner, activity, at.steady)
+    def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
+        self._press_again = message.press_again == self.name
+        self._retraction.see_device(message.hold_owner, message.activity, at.steady)
         return ()
 
     def _report(self) -> Actions:

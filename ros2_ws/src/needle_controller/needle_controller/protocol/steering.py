@@ -21,7 +21,6 @@ from needle_controller.protocol.start_conditions import Situation, is_out, obsta
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceReport,
     Log,
     PublishUpdate,
     SendStep,
@@ -33,6 +32,7 @@ from needle_controller.protocol.tip_covariance import TipCovariance
 from needle_controller.protocol.tip_gate import AcceptedTip, RefusedTip, TipMeasurement
 from needle_controller.protocol.tip_intake import TipIntake
 from needle_controller.protocol.trust import Trust, trust_of
+from needle_core.status_messages import DeviceStatus
 
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
 _DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
@@ -87,7 +87,7 @@ class Steering:
         self.trust = Trust()
         self.intake = TipIntake()
         self._retraction = RetractionWatch()
-        self._device: DeviceReport | None = None
+        self._device: DeviceStatus | None = None
         self._ready_step: SendStep | None = None
         self._sent: SendStep | None = None
         self._followed: StepWatch | None = None
@@ -178,7 +178,7 @@ class Steering:
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
-    def on_device(self, status: DeviceReport) -> list[Action]:
+    def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
         if not status.hold_owner:
             # Who lets go has not made a command fail, and who presses anew has looked.
@@ -188,7 +188,7 @@ class Steering:
         if not self._steering:
             return actions
         if status.state in _STOPPED_DEVICE:
-            why = f"device is {status.state}: {status.reason}"
+            why = f"device is {status.state}: {status.why}"
             return actions + self._leave(SteeringState.FAULT, why, "error")
         if status.state in _DISABLED_DEVICE:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")

@@ -29,26 +29,6 @@ class Awaiting(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True)
-class DeviceReport:
-    """The driver's report on itself.
-
-    Attributes
-    ----------
-    state, homed, hold_owner, reason : str, bool, str, str
-        As in `device/status`.
-    insertion, rotation : float or None
-        Where it has the joints [m], [rad]; None where it does not say.
-    """
-
-    state: str
-    homed: bool
-    hold_owner: str
-    reason: str = ""
-    insertion: float | None = None
-    rotation: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
 class SendStep:
     """Send one trajectory point.
 

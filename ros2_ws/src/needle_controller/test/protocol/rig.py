@@ -10,17 +10,24 @@ from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceReport,
     Log,
     SendStep,
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core.status_messages import DeviceStatus
 
 TICK = 20_000_000
-HELD = DeviceReport("HOLDING", True, "operator")
-MOVING = DeviceReport("MOVING", True, "operator")
-FREE = DeviceReport("HOLDING", True, "")
+
+
+def device(state: str, homed: bool, hold_owner: str, reason: str = "") -> DeviceStatus:
+    """Return a device/status."""
+    return DeviceStatus(state=state, homed=homed, hold_owner=hold_owner, reason=reason)
+
+
+HELD = device("HOLDING", True, "operator")
+MOVING = device("MOVING", True, "operator")
+FREE = device("HOLDING", True, "")
 
 
 class Rig:

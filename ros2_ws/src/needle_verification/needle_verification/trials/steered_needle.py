@@ -19,12 +19,12 @@ from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
-    DeviceReport,
     SendPath,
     SendStep,
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.supervisor.command import (
     INSERTION_JOINT,
     ROTATION_JOINT,
@@ -209,7 +209,12 @@ class SteeredNeedle:
         status = self.device.status(self.time_ns * 1e-9)
         self._do(
             self.steering.on_device(
-                DeviceReport(status.state.value, status.homed, status.hold_owner, status.reason)
+                DeviceStatus(
+                    state=status.state.value,
+                    homed=status.homed,
+                    hold_owner=status.hold_owner,
+                    reason=status.reason,
+                )
             )
         )
 
