@@ -114,8 +114,8 @@ def _trajectory(message: Any) -> m.Trajectory:
         )
         for point in message.points
     ]
-    stamp_ns = to_nanoseconds(message.header.stamp)
-    return m.Trajectory(stamp_ns, tuple(message.joint_names), tuple(points))
+    names = tuple(message.joint_names)
+    return m.Trajectory(to_nanoseconds(message.header.stamp), names, tuple(points))
 
 
 def _joystick_fields(message: m.Joystick, t: MessageTypes, frame_id: str = "") -> dict[str, Any]:
@@ -132,10 +132,9 @@ def _joystick(message: Any) -> m.Joystick:
 
 
 def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
-    promise = (message.lifetime,) if math.isfinite(message.lifetime) else ()
-    axes = (message.speed_scale, *promise)
-    buttons = (int(message.pressed),)
-    return _joystick_fields(m.Joystick(message.stamp_ns, axes, buttons), t, message.source)
+    axes = (message.speed_scale, *filter(math.isfinite, (message.lifetime,)))
+    joystick = m.Joystick(message.stamp_ns, axes, (int(message.pressed),))
+    return _joystick_fields(joystick, t, message.source)
 
 
 def _hold(message: Any) -> m.HoldState:
@@ -234,10 +233,6 @@ def _marker(message: Any) -> m.Marker:
     )
 
 
-def _markers_fields(message: m.Markers, t: MessageTypes) -> dict[str, Any]:
-    return {"markers": [_ros_marker(marker, t) for marker in message.markers]}
-
-
 def _ros_marker(marker: m.Marker, t: MessageTypes) -> Any:
     color = t.make("std_msgs/msg/ColorRGBA")(r=0.8, g=0.2, b=0.2, a=0.5)
     image = t.make("sensor_msgs/msg/CompressedImage")
@@ -322,10 +317,7 @@ TABLE: dict[type[Any], Row] = {
         "sensor_msgs/msg/JointState",
         _joint_state_fields,
         lambda r: m.JointState(
-            to_nanoseconds(r.header.stamp),
-            tuple(r.name),
-            _floats(r.position),
-            _floats(r.velocity),
+            to_nanoseconds(r.header.stamp), tuple(r.name), _floats(r.position), _floats(r.velocity)
         ),
     ),
     m.Trajectory: Row("trajectory_msgs/msg/JointTrajectory", _trajectory_fields, _trajectory),
@@ -390,7 +382,7 @@ TABLE: dict[type[Any], Row] = {
     ),
     m.Markers: Row(
         "visualization_msgs/msg/MarkerArray",
-        _markers_fields,
+        lambda message, t: {"markers": [_ros_marker(marker, t) for marker in message.markers]},
         lambda r: m.Markers(tuple(_marker(marker) for marker in r.markers)),
     ),
     m.Status: Row(_STATUS, _status_fields, _status),
