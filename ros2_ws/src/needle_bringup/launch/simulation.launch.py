@@ -3,7 +3,7 @@
     ros2 launch needle_bringup simulation.launch.py level:=tip simulated_operator:=true
 
 `scripts/simulate` does the same without `launch`, and reports. Without
-`simulated_operator:=true` time starts when somebody else sends device/hold. The launch ends with
+`simulated_operator:=true` the needle moves when somebody else sends device/hold. The launch ends with
 the operator, and with any other node.
 """
 
@@ -18,7 +18,6 @@ def generate_launch_description() -> LaunchDescription:
     arguments = {
         "level": ("camera", "what is simulated"),
         "seed": ("1", "seed of all noise"),
-        "real_time_factor": ("1.0", "0.0: lock step"),
         "controller": ("best", "how the needle is turned"),
         "simulated_operator": ("false", "let the stand-in keep the hold"),
         "bag": ("", "new bag; empty: none"),

@@ -74,8 +74,8 @@ class PlaneController(Component):
     ----------
     settings : SteeringSettings
         The node's parameters.
-    signature : str
-        Full name of the node, by which its status names itself.
+    name : str
+        Full name of the node.
 
     Attributes
     ----------
@@ -85,13 +85,10 @@ class PlaneController(Component):
         By topic what is wrong with its latest message; only topics with something wrong.
     """
 
-    name = "plane_controller"
-
-    def __init__(self, settings: SteeringSettings, signature: str = "plane_controller") -> None:
-        self.settings = settings
+    def __init__(self, settings: SteeringSettings, name: str = "plane_controller") -> None:
+        self.name, self.settings = name, settings
         self.steering: Steering = make_steering(settings)
         self.complaints: dict[str, str] = {}
-        self._signature = signature
         self._bad_joints = 0
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._heard = HeardMessages()
@@ -146,7 +143,8 @@ class PlaneController(Component):
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note whether anybody receives commands: a first step to nobody would be lost."""
-        receivers = set(peers.subscribers.get(COMMANDS, ())) - {self.name}
+        names = peers.subscribers.get(COMMANDS, ())
+        receivers = [name for name in names if name.rpartition("/")[2] != "recorder"]
         self._missing = [] if receivers else [f"subscriber of {COMMANDS}"]
         return ()
 
@@ -261,7 +259,7 @@ class PlaneController(Component):
         yield Diagnose("joint_states", _health(complaint, joints))
         for topic in TARGETS:
             yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
-        status = controller_status(self.steering, self.settings.preset, self._signature)
+        status = controller_status(self.steering, self.settings.preset, self.name)
         if status != self._published or self._heard.is_full:
             self._published = status
             yield Diagnose("steering", status.diagnostic)

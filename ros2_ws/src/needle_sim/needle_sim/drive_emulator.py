@@ -18,12 +18,15 @@ from needle_core.component import (
     Send,
     Timer,
 )
+from needle_core.errors import UserError
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.bus_health import bus_health
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.fault_commands import obey
 from needle_sim.drives.power_state import PowerState
 
 POSITIONS = "sim/drive_positions"
+ADAPTER, COMMAND_LINES = "adapter", "command lines"
 # How often the drives look at their clocks, and tell where their motors are [s].
 _LOOK, _PERIOD = 0.005, 0.02
 
@@ -35,6 +38,8 @@ class DriveEmulator(Component):
     ----------
     settings : DriveEmulatorParameters
         The node's parameters.
+    name : str
+        Full name of the node.
 
     Attributes
     ----------
@@ -42,21 +47,35 @@ class DriveEmulator(Component):
         The drives; faults are planted there.
     """
 
-    name = "drive_emulator"
-
-    def __init__(self, settings: DriveEmulatorParameters) -> None:
-        self.settings = settings
-        clock = MotionClock(settings.motion_clock)
+    def __init__(self, settings: DriveEmulatorParameters, name: str = "drive_emulator") -> None:
+        self.name, self.settings = name, settings
+        clock = MotionClock.STEADY
         self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, 0.0)
         self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
         self.outputs = (Output(POSITIONS, m.JointState),)
-        self.ports = (Port(CAN, self._on_frames),)
+        self.ports = (Port(CAN, self._on_frames), Port(COMMAND_LINES, self._on_commands))
         self.timers = (Timer(_LOOK, self._look), Timer(_PERIOD, self._tell_positions))
 
     def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
         for frame in frames:
             self.bus.receive(frame, at.steady)
         return self._send(self.bus.take_sent())
+
+    def _on_commands(self, lines: Sequence[str], at: Moment) -> Actions:
+        """Carry out faults on command, and say where they came; complain about what is none."""
+        for line in lines:
+            axes = self.bus.axes(at.steady)
+            try:
+                order = obey(line, self.bus, at.steady)
+            except UserError as error:
+                yield Log("error", str(error))
+                continue
+            places = [axes[name].position for name in ("insertion", "rotation")]
+            where = f"{places[0] * 1e3:.6f} mm, {places[1]:.6f} rad"
+            yield Log("warning", f"on command: {line.strip()}, at {where}")
+            if order is not None:
+                yield Send(ADAPTER, (order,))
+            yield Diagnose("drives", bus_health(self.bus))
 
     def _look(self, at: Moment) -> Actions:
         yield from self._send(self.bus.poll(at.steady))

@@ -9,7 +9,6 @@ from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
-from needle_sim.drives.emulated_bus import MotionClock
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
@@ -26,12 +25,6 @@ class DriveEmulatorParameters:
 
     pty: str = fixed_parameter(
         "", "-", "Link to the serial port that appears; empty: the port's own name is logged."
-    )
-    motion_clock: str = fixed_parameter(
-        MotionClock.STEADY.value,
-        "-",
-        "steady: motors move as time goes by; sync: one SYNC period with every SYNC.",
-        choices=tuple(clock.value for clock in MotionClock),
     )
     limit_action: str = fixed_parameter(
         LimitAction.CLAMP.value,

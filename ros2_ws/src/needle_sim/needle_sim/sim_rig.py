@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 
 from needle_core import messages as m
+from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import (
     LATCHED,
     Actions,
     Component,
     Diagnose,
+    Exit,
     Input,
     Moment,
     Output,
@@ -36,12 +38,12 @@ class SimRig(Component):
     ----------
     settings : SimRigParameters
         The node's parameters.
+    name : str
+        Full name of the node.
     """
 
-    name = "sim_rig"
-
-    def __init__(self, settings: SimRigParameters) -> None:
-        self.settings = settings
+    def __init__(self, settings: SimRigParameters, name: str = "sim_rig") -> None:
+        self.name, self.settings = name, settings
         self._bench = SimulatedBench(
             curvature=settings.curvature,
             pitch=settings.initial_pitch,
@@ -75,6 +77,11 @@ class SimRig(Component):
     def close(self) -> None:
         """Complete what the cameras write."""
         self._sensor.close()
+
+    def on_stop(self, at: Moment) -> Actions:
+        """Complete what the cameras write, and exit."""
+        self.close()
+        yield Exit(EXIT_DONE)
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note who else is a device here."""

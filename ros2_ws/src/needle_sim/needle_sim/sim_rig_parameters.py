@@ -10,7 +10,6 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.supervisor.limits import (
     SafetyLimits,
     limit_parameter,
-    path_delay_parameter,
 )
 from needle_sim.camera.scenarios import CLEAN, SCENARIOS
 from needle_sim.needle.needle_shape import NeedleShape
@@ -29,14 +28,7 @@ class SimRigParameters:
         choices=LEVELS,
     )
     seed: int = fixed_parameter(
-        0, "-", "Keys all chance; the same seed gives the same run in lock step.", 0, 2**31 - 1
-    )
-    real_time_factor: float = fixed_parameter(
-        0.0,
-        "-",
-        "Simulated over real time; 0 is lock step, as fast as the graph answers.",
-        0.0,
-        100.0,
+        0, "-", "Keys all chance; the same seed gives the same run.", 0, 2**31 - 1
     )
     curvature: float = fixed_parameter(
         1.0 / 0.122, "1/m", "Curvature of the needle's path in this tissue.", 0.0, 100.0
@@ -79,7 +71,7 @@ class SimRigParameters:
     camera_rate: float = fixed_parameter(
         10.0,
         "Hz",
-        "Exposures per simulated second; lock step exposes when one is due instead.",
+        "Exposures per second while a tip is awaited or the needle goes in continuously.",
         0.1,
         50.0,
     )
@@ -91,23 +83,6 @@ class SimRigParameters:
     )
     images: str = fixed_parameter(
         "", "-", "New folder for every image, calibration, insertions and truth; empty: none."
-    )
-    wait_for_recorder: bool = fixed_parameter(
-        False,
-        "-",
-        "Time starts only when a node named recorder listens to everything and all "
-        "partners know this node.",
-    )
-    reexpose_after: float = fixed_parameter(
-        5.0,
-        "s",
-        "Lock step: expose again when a steered, held needle hears nothing so long.",
-        0.1,
-        60.0,
-    )
-    path_delay: float = path_delay_parameter()
-    tick_timeout: float = fixed_parameter(
-        0.5, "s", "Level drive: how long driver and drives may leave a tick unanswered.", 0.02, 60.0
     )
     max_depth: float = limit_parameter("max_depth")
     max_step_length: float = limit_parameter("max_step_length")

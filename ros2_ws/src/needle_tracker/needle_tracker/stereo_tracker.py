@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
+from pathlib import Path
 
 from needle_core import messages as m
 from needle_core.component import (
@@ -23,6 +24,8 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.files.calibration_text import read_calibration
+from needle_core.files.installed import find_shared
 from needle_tracker.answers.annotation import annotate
 from needle_tracker.answers.health import Health
 from needle_tracker.answers.pair_answers import Answer, PairAnswers
@@ -37,7 +40,7 @@ from needle_tracker.answers.tracker_messages import (
     tip_pose_message,
 )
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
-from needle_tracker.optics.calibration import SIDES, StereoCalibration
+from needle_tracker.optics.calibration import SIDES, StereoCalibration, calibration_from
 from needle_tracker.tracking.refusals import TrackState
 
 TIP, TIP_POSE = "needle/tip", "needle/tip_pose"
@@ -61,6 +64,8 @@ class StereoTipTracker(Component):
         The stereo rig.
     calibration_text : str
         Text of its file, for whoever records.
+    name : str
+        Full name of the node.
 
     Attributes
     ----------
@@ -70,15 +75,14 @@ class StereoTipTracker(Component):
         Whether anybody receives the annotated images.
     """
 
-    name = "stereo_tracker"
-
     def __init__(
         self,
         settings: StereoTrackerParameters,
         calibration: StereoCalibration,
         calibration_text: str = "",
+        name: str = "stereo_tracker",
     ) -> None:
-        self.settings = settings
+        self.name, self.settings = name, settings
         self.is_annotation_wanted = False
         self._cameras = {"left": calibration.left, "right": calibration.right}
         self._calibration_text = calibration_text
@@ -203,6 +207,22 @@ class StereoTipTracker(Component):
         if kind != self._told.get(part) and diagnostic.level >= Level.WARN:
             yield Log("warning", f"{part}: {diagnostic.message}")
         self._told[part] = kind
+
+
+def make_tracker(
+    settings: StereoTrackerParameters, name: str = "stereo_tracker"
+) -> StereoTipTracker:
+    """Return the tracker with the calibration of its settings, the installed one by default.
+
+    Raises
+    ------
+    UserError
+        A bad calibration file.
+    """
+    installed = partial(find_shared, "needle_tracker", "config/calibration.yaml")
+    path = Path(settings.calibration_file or installed())
+    text = read_calibration(path)
+    return StereoTipTracker(settings, calibration_from(text, path), text, name)
 
 
 def image_topic(side: str) -> str:

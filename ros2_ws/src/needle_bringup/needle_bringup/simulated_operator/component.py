@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from needle_bringup.simulated_operator.operator_sequence import (
     DISABLE,
     PREPARATION,
@@ -9,6 +11,7 @@ from needle_bringup.simulated_operator.operator_sequence import (
     ServiceCall,
 )
 from needle_bringup.simulated_operator.parameters import SimulatedOperatorParameters
+from needle_bringup.simulated_operator.progress import Shown
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE, EXIT_INTERRUPTED, EXIT_MISSED
 from needle_core.component import (
@@ -25,12 +28,14 @@ from needle_core.component import (
     Output,
     Peers,
     Publish,
+    Send,
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-HOLD = "device/hold"
+HOLD, PROGRESS = "device/hold", "progress"
+RECORDER, PARAMETERS_OF = "recorder", "parameters_of"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
 # The hold is best effort: a release worth sending is worth sending again.
 _RELEASES = 3
@@ -43,12 +48,16 @@ class SimulatedOperator(Component):
     ----------
     settings : SimulatedOperatorParameters
         The node's parameters.
+    name : str
+        Full name of the node, by which the device knows whose hold it is.
     """
 
-    name = "simulated_operator"
-
-    def __init__(self, settings: SimulatedOperatorParameters) -> None:
-        self.settings = settings
+    def __init__(
+        self, settings: SimulatedOperatorParameters, name: str = "simulated_operator"
+    ) -> None:
+        self.name, self.settings = name, settings
+        self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
+        self._nodes: frozenset[str] = frozenset()
         self._sequence = OperatorSequence(
             0.0,
             self.name,
@@ -57,10 +66,13 @@ class SimulatedOperator(Component):
         )
         self._pending: ServiceCall | None = None
         self._is_finished = False
+        self._missing: list[str] = ["everything"]
         self.inputs = (
             Input(_CONTROLLER, ControllerStatus, self._on_controller, LATCHED),
             Input(_DEVICE, DeviceStatus, self._on_device, LATCHED),
         )
+        if settings.wait_for_recorder:
+            self.inputs += (Input("/diagnostics", m.Diagnostics, self._on_health),)
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
         self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
 
@@ -75,7 +87,8 @@ class SimulatedOperator(Component):
                 missing.append(f"publisher of {topic}")
         if HOLD not in peers.subscribers:
             missing.append(f"subscriber of {HOLD}")
-        self._sequence.see_missing(missing)
+        self._missing, self._nodes = missing, peers.nodes
+        self._sequence.see_missing([*self._missing, *self._unrecorded])
         return ()
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
@@ -94,12 +107,26 @@ class SimulatedOperator(Component):
         return self._advance(at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
-        self._sequence.see_controller(message, at.steady)
-        return self._advance(at)
+        sequence = self._sequence
+        sequence.see_controller(message, at.steady)
+        if sequence.steering and sequence.depth:
+            shown = Shown(sequence.insertion, sequence.depth, sequence.waits_because)
+            yield Send(PROGRESS, (shown,))
+        yield from self._advance(at)
 
     def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
         self._sequence.see_device(message, at.steady)
         return self._advance(at)
+
+    def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
+        """Note whose parameters are not in the bag yet: without them no run can be repeated."""
+        for status in message.statuses:
+            if status.part == PARAMETERS_OF and status.source.rpartition("/")[2] == RECORDER:
+                recorded = {name.lstrip("/") for name in status.text.split(", ")}
+                missing = sorted(self._nodes - recorded)
+                self._unrecorded = [f"recorder of {name}'s parameters" for name in missing]
+                self._sequence.see_missing([*self._missing, *self._unrecorded])
+        return ()
 
     def _on_timer(self, at: Moment) -> Actions:
         if self._sequence.steering:

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TextIO
 
 from tqdm import tqdm
 
 # Environment variable: number of an open file that takes the progress instead of stderr.
 PROGRESS_FD = "NEEDLE_PROGRESS_FD"
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """How far the needle is in [m], and why it does not go on; empty: it does."""
+
+    insertion: float
+    depth: float
+    waits_because: str
 
 
 class Progress:

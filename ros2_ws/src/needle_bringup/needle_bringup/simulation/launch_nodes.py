@@ -27,8 +27,6 @@ _NOT_FOR_RIGS = ("target_plane", "target_point")
 _OF_SIMULATION = {
     "level": "level",
     "seed": "seed",
-    "real_time_factor": "real_time_factor",
-    "lock_step": "real_time_factor",
     "preset": "controller",
     "bag": "bag",
     "pty": "can",
@@ -67,7 +65,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     Parameters
     ----------
     arguments : mapping
-        Launch argument -> text: level, seed, real_time_factor, controller, simulated_operator, bag,
+        Launch argument -> text: level, seed, controller, simulated_operator, bag,
         can, params and namespace.
 
     Returns
@@ -80,9 +78,9 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
     UserError
         If an argument cannot be meant so, a file is missing, or the bag is there already.
     """
-    words = []
-    for name in ("level", "seed", "real_time_factor", "controller"):
-        words += [f"--{name.replace('_', '-')}", arguments[name]]
+    words = ["--graph"]
+    for name in ("level", "seed", "controller"):
+        words += [f"--{name}", arguments[name]]
     bag = _new_bag(arguments["bag"])
     given = [f"{name}:={value}" for name, value in arguments.items() if value and name != "bag"]
     command = shlex.join(["ros2", "launch", "needle_bringup", "simulation.launch.py", *given])
@@ -94,8 +92,7 @@ def simulated_nodes(arguments: Mapping[str, str]) -> Parameters:
         del parameters["simulated_operator"]
     if bag is None:
         del parameters["recorder"]
-        for values in parameters.values():
-            values.pop("wait_for_recorder", None)
+        parameters.get("simulated_operator", {}).pop("wait_for_recorder", None)
     return _with_file(parameters, arguments, _OF_SIMULATION)
 
 

@@ -49,8 +49,6 @@ OPTIONS = {
     "target_offset": "--initial",
     "torsion_play": "--play-deg",
     "torsion_lag": "--lag-mm",
-    "real_time_factor": "--real-time-factor",
-    "lock_step": "--real-time-factor",
     "tip_noise": "--noise-mm",
     "tip_covariance": "--noise-mm",
     "tip_noise_bound": "--noise-mm",
@@ -74,11 +72,8 @@ OPTIONS = {
     "obstacles": "--obstacles",
 }
 
-# How long driver and drives wait for each other in lock step, where motors stand still meanwhile:
-# seven processes that start on two cores keep one waiting for a second [s].
-PATIENT_WATCHDOG = 5.0
-# The same in real time: as long as on a rig whose motors turn by themselves it may be [s].
-REAL_TIME_WATCHDOG = 0.5
+# Seven processes share the cores: drives and driver wait for each other longer than by default [s].
+GRAPH_WATCHDOG = 0.5
 
 # Parameters of the recorder that leave something out of the bag.
 _CHOICES = ("topics", "regex", "exclude_regex", "snapshot_seconds")
@@ -119,8 +114,6 @@ def command_line_parameters(
         "initial_roll": math.radians(options.initial_roll_deg),
         "torsion_play": math.radians(options.play_deg),
         "torsion_lag": options.lag_mm * 1e-3,
-        "real_time_factor": options.real_time_factor,
-        "wait_for_recorder": True,
     }
     if options.noise_mm is not None:
         sim_rig["tip_noise"] = options.noise_mm * 1e-3
@@ -128,27 +121,22 @@ def command_line_parameters(
         "link": "slcan",
         "channel": str(can_adapter()),
         "autostart": True,
-        "lock_step": options.real_time_factor == 0.0,
-        "wait_for_recorder": True,
     }
-    driver["watchdog"] = driver["reply_age_limit"] = (
-        PATIENT_WATCHDOG if driver["lock_step"] else REAL_TIME_WATCHDOG
-    )
+    if options.graph:
+        driver["watchdog"] = driver["reply_age_limit"] = GRAPH_WATCHDOG
     information = {**run_info(options), "command": command or command_of(options)}
     parameters: Parameters = {
         "recorder": {"bag": str(bag), "run_info": json.dumps(information)},
         "sim_rig": sim_rig,
-        # Motors that move by a SYNC period with every SYNC repeat a run to the count.
-        "drive_emulator": {"pty": str(can_adapter()), "motion_clock": "sync"},
+        "drive_emulator": {"pty": str(can_adapter())},
         "device_driver": driver,
-        "stereo_tracker": {"wait_for_recorder": True},
+        "stereo_tracker": {},
         "plane_controller": {
             "preset": options.controller,
             "depth": options.depth_mm * 1e-3,
             "target_offset": -options.initial_x_mm * 1e-3,
-            "wait_for_recorder": True,
         },
-        "simulated_operator": {"wait_for_recorder": True},
+        "simulated_operator": {"wait_for_recorder": options.graph},
     }
     own = {"estimator": options.estimator, "law": options.law, "planner": options.planner}
     parameters["plane_controller"].update({kind: name for kind, name in own.items() if name})
@@ -175,8 +163,6 @@ def command_line_parameters(
         None if options.pre_bend_deg is None else math.radians(options.pre_bend_deg),
     )
     parameters = merge(parameters, needle)
-    for node, values in parameters.items():
-        values["use_sim_time"] = node != "recorder"
     return {node: parameters[node] for node in nodes_of(options)}
 
 

@@ -130,7 +130,12 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
     if given.planner and target is None:
         raise UserError("--planner goes with --target only")
     depth = given.depth_mm or (DEPTH_MM if target is None else f"{LARGEST_DEPTH_MM:g}")
-    factor = number("--real-time-factor", given.real_time_factor, 0.0, 100.0, "-")
+    factor = number("--real-time-factor", given.real_time_factor or "0", 0.0, 100.0, "-")
+    if given.graph and given.real_time_factor is not None and factor != 1.0:
+        raise UserError(
+            f"--real-time-factor {given.real_time_factor} does not go with --graph: processes run "
+            "in real time"
+        )
     return SimulateOptions(
         level=given.level,
         controller=given.controller,
@@ -150,7 +155,7 @@ def parse(arguments: Sequence[str]) -> SimulateOptions:
         pre_bend_deg=_optional("--pre-bend-deg", given.pre_bend_deg, 0.0, 25.0, "deg"),
         play_deg=number("--play-deg", given.play_deg, 0.0, 90.0, "deg"),
         lag_mm=number("--lag-mm", given.lag_mm, 0.0, 100.0, "mm"),
-        real_time_factor=factor,
+        real_time_factor=1.0 if given.graph else factor,
         graph=given.graph,
         component=_components(given),
         seed=whole_number("--seed", given.seed, 0, 2**31 - 1),
@@ -280,7 +285,6 @@ def _parser() -> CommandParser:
     )
     add(
         "--real-time-factor",
-        default="0",
         metavar="F",
         help="1: as slow as the real rig; 0: as fast as the computer allows, repeatable "
         "(default: 0)",
@@ -288,7 +292,7 @@ def _parser() -> CommandParser:
     add(
         "--graph",
         action="store_true",
-        help="each component as a ROS node in a process of its own, over DDS",
+        help="each component as a ROS node in a process of its own, over DDS, in real time",
     )
     add(
         "--component",

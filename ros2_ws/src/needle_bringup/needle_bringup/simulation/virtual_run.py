@@ -19,8 +19,6 @@ from needle_core.can_frame import CAN
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_core.component import Action, Component, Exit, Output, Publish
 from needle_core.errors import UserError
-from needle_core.files.calibration_text import read_calibration
-from needle_core.files.installed import find_shared
 from needle_core.runners.process import Compute, uniform
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.settings.parameter_fields import from_values
@@ -34,9 +32,8 @@ _FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
 _SLICE = 1.0
 _WIND_UP = 5.0
 """What the rest of the rig may take to end after the operator [s]."""
-# Parameters of a graph of processes; drives and driver there wait for each other in lock step.
-_OF_GRAPH = ("use_sim_time", "wait_for_recorder", "lock_step", "real_time_factor")
-_OF_GRAPHS_DRIVES = ("motion_clock", "pty", "watchdog", "reply_age_limit", "autostart")
+# The virtual bus stands in for them.
+_OF_ADAPTER = ("pty",)
 
 
 def make_components(parameters: Parameters) -> list[Component]:
@@ -60,15 +57,9 @@ def make_components(parameters: Parameters) -> list[Component]:
 def _make_tracker(parameters: Parameters) -> Component:
     # It brings OpenCV along: not where there are no images.
     from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
-    from needle_tracker.optics.calibration import calibration_from  # noqa: PLC0415
-    from needle_tracker.stereo_tracker import StereoTipTracker  # noqa: PLC0415
+    from needle_tracker.stereo_tracker import make_tracker  # noqa: PLC0415
 
-    settings = _settings(StereoTrackerParameters, parameters, "stereo_tracker")
-    path = Path(
-        settings.calibration_file or find_shared("needle_tracker", "config/calibration.yaml")
-    )
-    text = read_calibration(path)
-    return StereoTipTracker(settings, calibration_from(text, path), text)
+    return make_tracker(_settings(StereoTrackerParameters, parameters, "stereo_tracker"))
 
 
 def _make_drives(parameters: Parameters) -> list[Component]:
@@ -80,7 +71,7 @@ def _make_drives(parameters: Parameters) -> list[Component]:
 
     def settings(kind: type[Any], node: str, **own: str) -> Any:
         given = parameters.get(node, {}).items()
-        values = {k: v for k, v in given if k not in _OF_GRAPHS_DRIVES}
+        values = {k: v for k, v in given if k not in _OF_ADAPTER}
         return _settings(kind, {node: {**values, **own}}, node)
 
     driver = settings(DeviceDriverParameters, "device_driver", link="virtual", channel=CAN)
@@ -147,7 +138,7 @@ def run_virtually(
         taps=(tap, progress),
         real_time_factor=real_time_factor,
     )
-    operator = SimulatedOperator.name
+    operator = "simulated_operator"
     try:
         while not runner.run(_SLICE):
             check()
@@ -172,8 +163,7 @@ def _judge(exits: Mapping[str, Exit], operator: str) -> None:
 
 
 def _settings(kind: type[Any], parameters: Parameters, node: str) -> Any:
-    values = {k: v for k, v in parameters.get(node, {}).items() if k not in _OF_GRAPH}
-    return from_values(kind, values, node)
+    return from_values(kind, parameters.get(node, {}), node)
 
 
 class _ProgressTap:

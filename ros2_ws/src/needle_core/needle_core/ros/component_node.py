@@ -39,7 +39,7 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.message_types import rclpy_types
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_core.ros.conversions import to_qos
-from needle_core.ros.discovery import publishers_of, signature, subscribers_of
+from needle_core.ros.discovery import full_name, publishers_of, signature, subscribers_of
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 
@@ -74,8 +74,8 @@ class ComponentNode(WholeNode):
         The component's settings dataclass, the node's parameters.
     make : callable
         Makes the component from its settings and the node's full name.
-    ports : mapping of str to RealPort
-        Of the component's ports.
+    ports : callable
+        Returns the real ports of the component for its settings, by name.
     node_arguments : dict
         Passed on to rclpy's Node (a context of its own, parameter overrides).
 
@@ -83,6 +83,10 @@ class ComponentNode(WholeNode):
     ----------
     component : Component
         What runs here.
+    outputs : dict of str to Publisher
+        By topic.
+    peers : Peers
+        What is known of other nodes.
     exit : Exit or None
         The component's wish to end.
 
@@ -97,10 +101,11 @@ class ComponentNode(WholeNode):
         name: str,
         parameters: type[Any],
         make: Callable[[Any, str], Component],
-        ports: Mapping[str, RealPort] | None = None,
+        ports: Callable[[Any], Mapping[str, RealPort]] = lambda _: {},
         **node_arguments: Any,
     ) -> None:
         super().__init__(name, **node_arguments)
+        self._own, self._begun = name, time.monotonic()
         # A service that answers later keeps no other callback from running.
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
@@ -111,15 +116,15 @@ class ComponentNode(WholeNode):
         self._diagnostics = DiagnosticsPublisher(self)
         self._failures = 0
         self._logged: dict[str, float] = {}
-        self._peers = Peers()
+        self.peers = Peers()
         self._requests: dict[int, Future[Reply]] = {}
         self._calls: dict[int, tuple[Call, float, Future[Any] | None]] = {}
         self._numbers = 0
         self._service_clients: dict[str, Client[Any, Any]] = {}
-        self._ports = dict(ports or {})
+        self._ports = dict(ports(settings))
         self._arrived: deque[tuple[str, Any]] = deque()
         self._bell = self.create_guard_condition(self._take_arrived)
-        self._publishers_of_rows = {row.topic: self._advertise(row) for row in self.component.outputs}
+        self.outputs = {row.topic: self._advertise(row) for row in self.component.outputs}
         for row in self.component.inputs:
             self._hear(row)
         for service in self.component.services:
@@ -141,11 +146,13 @@ class ComponentNode(WholeNode):
             port.close()
 
     def _moment(self, sent_ns: int = 0) -> Moment:
-        return Moment(time.monotonic(), self.get_clock().now().nanoseconds, sent_ns)
+        steady = time.monotonic() - self._begun
+        return Moment(steady, self.get_clock().now().nanoseconds, sent_ns)
 
     def _name_of(self, topic: str) -> str:
         """Return a row's name as rclpy resolves it: below the node's own where it says so."""
-        return topic.replace(f"{self.component.name}/", "~/", 1)
+        prefix = f"{self._own}/"
+        return f"~/{topic.removeprefix(prefix)}" if topic.startswith(prefix) else topic
 
     # ---- rows ---------------------------------------------------------------------------------
 
@@ -187,7 +194,11 @@ class ComponentNode(WholeNode):
         self._handle(lambda: row.handler(message, self._moment(sent_ns)))
 
     def _repeat(self, timer: Timer) -> None:
-        run = partial(self._handle, lambda: timer.handler(self._moment()))
+        def run() -> None:
+            # What has come at a port came before the time that goes by now.
+            self._take_arrived()
+            self._handle(lambda: timer.handler(self._moment()))
+
         self.create_timer(timer.period, run, clock=STEADY_CLOCK, callback_group=self._group)
 
     def _offer(self, service: Service) -> None:
@@ -243,7 +254,7 @@ class ComponentNode(WholeNode):
     def _do(self, action: Action) -> None:
         match action:
             case Publish(topic, message):
-                self._publishers_of_rows[topic].publish(self._converter.to_ros(message))
+                self.outputs[topic].publish(self._converter.to_ros(message))
             case Send(port, batch):
                 self._ports[port].send(batch)
             case Call():
@@ -318,7 +329,7 @@ class ComponentNode(WholeNode):
 
     def _look_around(self) -> None:
         self._give_up_calls()
-        rows = (*self.component.inputs, *self.component.outputs)
+        rows: list[Input | Output] = [*self.component.inputs, *self.component.outputs]
         topics = {row.topic: self._name_of(row.topic) for row in rows}
         namespace = self.get_namespace().rstrip("/") + "/"
         services = {name for name, _ in self.get_service_names_and_types()}
@@ -326,10 +337,16 @@ class ComponentNode(WholeNode):
             _known({topic: publishers_of(self, name) for topic, name in topics.items()}),
             _known({topic: subscribers_of(self, name) for topic, name in topics.items()}),
             frozenset(name.removeprefix(namespace) for name in services),
+            frozenset(full_name(space, name).lstrip("/") for name, space in self._nodes()),
         )
-        if peers != self._peers:
-            self._peers = peers
+        if peers != self.peers:
+            self.peers = peers
             self._handle(lambda: self.component.on_peers(peers, self._moment()))
+
+    def _nodes(self) -> list[tuple[str, str]]:
+        """Return names and namespaces of all nodes but hidden ones."""
+        known = self.get_node_names_and_namespaces()
+        return [(name, space) for name, space in known if not name.startswith("_")]
 
     def _on_parameters(self, settings: Any) -> None:
         self._handle(lambda: self.component.on_settings(settings, self._moment()))

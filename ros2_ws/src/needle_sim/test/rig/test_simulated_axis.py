@@ -8,7 +8,6 @@ import pytest
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.procedure import run_at_once
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.rig.pace import Pace
 from needle_sim.rig.simulated_axis import SimulatedAxis
 
 PERIOD = 0.02
@@ -110,19 +109,3 @@ def test_noise_is_keyed_by_seed_and_exposure_and_by_nothing_else() -> None:
     assert np.abs(errors).max(axis=0) == pytest.approx(1e-3, rel=0.1)
     quiet = make_bench(tip_noise=0.0)
     np.testing.assert_array_equal(quiet.measure_tip(1), quiet.tip)
-
-
-def test_pace_ticks_on_time_and_does_not_make_up_for_a_long_pause() -> None:
-    pace = Pace(PERIOD, 2.0)
-    assert pace.wait(5.0) == 0.0
-    pace.tick(5.0)
-    assert pace.wait(5.0) == pytest.approx(0.01)
-    ticks = 0
-    for now in np.arange(5.0, 6.0, 0.001):
-        if pace.wait(now) == 0.0:
-            pace.tick(now)
-            ticks += 1
-    assert ticks == pytest.approx(100, abs=1)
-    pace.tick(60.0)
-    assert pace.wait(60.0) > 0.0 or pace.lost_ticks > 5000
-    assert pace.lost_ticks > 5000

@@ -24,8 +24,10 @@ from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 from visualization_msgs.msg import MarkerArray
 
-from needle_controller.ros.plane_controller import PlaneControllerNode
+from needle_controller.plane_controller import PlaneController
+from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.conversions import (
     JOINT_STATES,
     LATCHED,
@@ -46,7 +48,10 @@ class Bench:
     def __init__(self, context: Context, **parameters: Any) -> None:
         # most tests send tips alone
         given = {"tip_covariance": "configured", **parameters}
-        self.node = PlaneControllerNode(
+        self.node = ComponentNode(
+            "plane_controller",
+            SteeringSettings,
+            PlaneController,
             context=context,
             parameter_overrides=[Parameter(name, value=v) for name, v in given.items()],
         )
@@ -83,8 +88,7 @@ class Bench:
             self._points,
         )
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        commands = self.node._outputs["device/joint_trajectory"]
-        self.until(lambda: commands.get_subscription_count() > 0)
+        self.until(lambda: "device/joint_trajectory" in self.node.peers.subscribers)
         self.until(lambda: bool(self.received["needle/controller_status"]))
 
     def close(self) -> None:
@@ -137,7 +141,7 @@ class Bench:
     def start(self) -> None:
         self.device()
         self.joints()
-        steering = self.node._component.steering
+        steering = self.node.component.steering
         self.until(
             lambda: steering.intake.joints.latest is not None and steering._device is not None
         )

@@ -17,13 +17,15 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, JointState
 
+from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.conversions import (
     IMAGES,
     JOINT_STATES,
     RELIABLE,
     to_stamp,
 )
-from needle_tracker.ros.stereo_tracker import StereoTrackerNode
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.stereo_tracker import make_tracker
 
 LIMIT = 20.0
 INSERTION = 0.05
@@ -36,7 +38,10 @@ class Bench:
     """The node under test and everything around it, on one executor."""
 
     def __init__(self, context: Context, **parameters: Any) -> None:
-        self.node = StereoTrackerNode(
+        self.node = ComponentNode(
+            "stereo_tracker",
+            StereoTrackerParameters,
+            make_tracker,
             context=context,
             parameter_overrides=[Parameter(name, value=v) for name, v in parameters.items()],
         )
@@ -63,7 +68,7 @@ class Bench:
         self._infos = outside.create_publisher(CameraInfo, "stereo/left/camera_info", IMAGES)
         publishers = [self._joints, self._infos, *self._images.values()]
         self.until(lambda: all(p.get_subscription_count() for p in publishers))
-        answers = [self.node._outputs[topic] for topic in ("needle/tip", "needle/tip_pose")]
+        answers = [self.node.outputs[topic] for topic in ("needle/tip", "needle/tip_pose")]
         self.until(lambda: all(p.get_subscription_count() for p in answers))
 
     def close(self) -> None:
