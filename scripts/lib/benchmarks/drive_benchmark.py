@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import select
 import subprocess
 import sys
 import tempfile
@@ -40,7 +41,6 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 
 PERIOD = 0.02
@@ -253,8 +253,8 @@ def serve(channel: str) -> None:
     values = DriveEmulatorParameters(boot_time=0.0)
     now = time.monotonic()
     bus = EmulatedBus(values.insertion, values.rotation, MotionClock.SYNC, now)
-    server = DriveServer(bus, PtyPort(Path(channel)))
-    server.turn(0.0)
+    bus.poll(now)
+    port = PtyPort(Path(channel))
     print("ready", flush=True)
     ended = threading.Event()
 
@@ -265,10 +265,13 @@ def serve(channel: str) -> None:
     threading.Thread(target=wait_for_line, daemon=True).start()
     arrived: list[float] = []
     while not ended.is_set():
-        server.turn(0.005)
+        select.select(port.filenos, [], [], 0.005)
+        for frame in port.receive():
+            bus.receive(frame, time.monotonic())
+        port.send(bus.poll(time.monotonic()))
         while len(arrived) < bus.syncs:
             arrived.append(time.monotonic())
-    server.close()
+    port.unplug()
     print(json.dumps(arrived))
 
 

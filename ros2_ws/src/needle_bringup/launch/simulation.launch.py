@@ -3,8 +3,8 @@
     ros2 launch needle_bringup simulation.launch.py level:=tip simulated_operator:=true
 
 `scripts/simulate` does the same without `launch`, and reports. Without
-`simulated_operator:=true` the needle moves when somebody else sends device/hold. The launch ends with
-the operator, and with any other node.
+`simulated_operator:=true` the needle moves when somebody else sends device/hold. The launch ends
+with the operator, and with any other node.
 """
 
 from launch import LaunchDescription

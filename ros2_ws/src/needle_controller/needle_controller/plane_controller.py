@@ -85,7 +85,9 @@ class PlaneController(Component):
         By topic what is wrong with its latest message; only topics with something wrong.
     """
 
-    def __init__(self, settings: SteeringSettings, name: str = "plane_controller") -> None:
+    name = "plane_controller"
+
+    def __init__(self, settings: SteeringSettings, name: str = name) -> None:
         self.name, self.settings = name, settings
         self.steering: Steering = make_steering(settings)
         self.complaints: dict[str, str] = {}

@@ -47,7 +47,9 @@ class DriveEmulator(Component):
         The drives; faults are planted there.
     """
 
-    def __init__(self, settings: DriveEmulatorParameters, name: str = "drive_emulator") -> None:
+    name = "drive_emulator"
+
+    def __init__(self, settings: DriveEmulatorParameters, name: str = name) -> None:
         self.name, self.settings = name, settings
         clock = MotionClock.STEADY
         self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, 0.0)

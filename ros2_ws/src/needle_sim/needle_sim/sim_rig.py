@@ -42,7 +42,9 @@ class SimRig(Component):
         Full name of the node.
     """
 
-    def __init__(self, settings: SimRigParameters, name: str = "sim_rig") -> None:
+    name = "sim_rig"
+
+    def __init__(self, settings: SimRigParameters, name: str = name) -> None:
         self.name, self.settings = name, settings
         self._bench = SimulatedBench(
             curvature=settings.curvature,

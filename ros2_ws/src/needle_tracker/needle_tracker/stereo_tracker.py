@@ -75,12 +75,14 @@ class StereoTipTracker(Component):
         Whether anybody receives the annotated images.
     """
 
+    name = "stereo_tracker"
+
     def __init__(
         self,
         settings: StereoTrackerParameters,
         calibration: StereoCalibration,
         calibration_text: str = "",
-        name: str = "stereo_tracker",
+        name: str = name,
     ) -> None:
         self.name, self.settings = name, settings
         self.is_annotation_wanted = False

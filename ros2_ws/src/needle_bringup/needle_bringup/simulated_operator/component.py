@@ -52,9 +52,9 @@ class SimulatedOperator(Component):
         Full name of the node, by which the device knows whose hold it is.
     """
 
-    def __init__(
-        self, settings: SimulatedOperatorParameters, name: str = "simulated_operator"
-    ) -> None:
+    name = "simulated_operator"
+
+    def __init__(self, settings: SimulatedOperatorParameters, name: str = name) -> None:
         self.name, self.settings = name, settings
         self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
         self._nodes: frozenset[str] = frozenset()

@@ -138,7 +138,7 @@ def run_virtually(
         taps=(tap, progress),
         real_time_factor=real_time_factor,
     )
-    operator = "simulated_operator"
+    operator = SimulatedOperator.name
     try:
         while not runner.run(_SLICE):
             check()

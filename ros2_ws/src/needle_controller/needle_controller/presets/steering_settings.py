@@ -229,13 +229,6 @@ class SteeringSettings:
         lower=0.0,
         upper=1.0,
     )
-    wait_for_recorder: bool = parameter(
-        False,
-        unit="-",
-        read_only=True,
-        description="Steering starts only when a node named recorder listens to everything and all "
-        "partners know this node.",
-    )
     state_weights: tuple[float, ...] = parameter(
         (1.0e6, 280.0, 0.0),
         unit="1/m^2, -, m^2",

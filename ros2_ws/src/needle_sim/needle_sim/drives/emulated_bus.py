@@ -59,7 +59,7 @@ class EmulatedBus:
         if insertion.node_id == rotation.node_id:
             raise ValueError(f"both drives have node id {insertion.node_id}")
         self.drives = {"insertion": EmulatedDrive(insertion), "rotation": EmulatedDrive(rotation)}
-        self._clock = clock
+        self.clock = clock
         self._moved_until = now
         self.syncs = 0
         self.is_cut = False
@@ -74,7 +74,7 @@ class EmulatedBus:
         if frame.identifier == SYNC and not frame.remote:
             self.syncs += 1
             for drive in self.drives.values():
-                if self._clock is MotionClock.SYNC:
+                if self.clock is MotionClock.SYNC:
                     drive.advance(round(drive.sync_period / MOTION_STEP))
                 drive.sync()
             return
@@ -134,7 +134,7 @@ class EmulatedBus:
                 drive.tick(now)
 
     def _move_until(self, now: float) -> None:
-        if self._clock is not MotionClock.STEADY:
+        if self.clock is not MotionClock.STEADY:
             return
         # Times are rounded; what is a whole number of steps but for that is one.
         steps = int((now - self._moved_until) / MOTION_STEP + 1e-6)

@@ -79,7 +79,7 @@ class Emulator:
 @pytest.fixture
 def emulator(tmp_path: Path) -> Iterator[Emulator]:
     with own_domain() as domain:
-        emulator = Emulator(domain, tmp_path, "insertion_start:=0.001", "motion_clock:=sync")
+        emulator = Emulator(domain, tmp_path, "insertion_start:=0.001")
         try:
             yield emulator
         finally:
@@ -92,13 +92,9 @@ def test_tells_where_the_motors_are_and_leaves_nothing(emulator: Emulator) -> No
     network = canopen.Network()
     network.connect(interface="slcan", channel=str(emulator.link), sleep_after_open=0)
 
-    def positions() -> bool:
-        network.sync.transmit()
-        return len(emulator.heard) > 0
-
     try:
         emulator.until(lambda: _answers(network.add_node(1, None)))
-        emulator.until(positions)
+        emulator.until(lambda: len(emulator.heard) > 0)
         heard = emulator.heard[-1]
         assert list(heard.name) == ["insertion_joint", "rotation_joint"]
         assert list(heard.position) == [0.001, 0.0]
@@ -125,7 +121,6 @@ def _answers(node: Any) -> bool:
     "bad",
     [
         {"insertion_node_id": 2},
-        {"motion_clock": "moon"},
         {"limit_action": "ignore"},
         {"insertion_start": 0.3},
     ],

@@ -51,12 +51,6 @@ class StereoTrackerParameters:
         0.0,
         60.0,
     )
-    wait_for_recorder: bool = fixed_parameter(
-        False,
-        "-",
-        "Take images only when a node named recorder listens to what is found, and "
-        "those who publish joints and estimates know this node.",
-    )
     needle_width: float = fixed_parameter(0.7e-3, "m", "Diameter of the needle.", 0.2e-3, 3e-3)
     bevel_length: float = fixed_parameter(
         0.0, "m", "Length of the needle's ground face, along the shaft; 0: unknown.", 0.0, 0.01

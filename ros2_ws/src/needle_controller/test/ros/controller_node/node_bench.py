@@ -119,6 +119,13 @@ class Bench:
                     return status.level[0], status.message
         return -1, ""
 
+    def health_values(self, part: str) -> dict[str, str]:
+        for array in reversed(self.received["/diagnostics"]):
+            for status in array.status:
+                if status.name == f"plane_controller: {part}":
+                    return values_of(status)
+        return {}
+
     def device(self, state: str = "HOLDING", owner: str = "operator") -> None:
         values = {"state": state, "homed": "true", "hold_owner": owner}
         health = Diagnostic(Level.OK, state, values)

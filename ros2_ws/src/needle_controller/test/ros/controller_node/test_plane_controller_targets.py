@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
-import pytest
 from geometry_msgs.msg import (
     PointStamped,
     PoseStamped,
@@ -72,23 +69,10 @@ def test_obstacles_given_at_run_time_and_obstacles_refused(bench: Bench) -> None
     bench.until(lambda: bench.status["obstacles"] == "0")
 
 
-def test_a_plane_from_a_plain_publisher_is_taken_and_each_plane_once(
-    bench: Bench, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_plain_publisher_of_planes_is_named_with_the_cure(bench: Bench) -> None:
     plain = bench.outside.create_publisher(PoseStamped, "target_plane", RELIABLE)
-    bench.until(lambda: plain.get_subscription_count() == 1)
-    message = PoseStamped()
-    message.header.frame_id = "rig"
-    message.pose.orientation.w = 1.0
-    # Of the latched publisher both subscriptions hear: a plane that came before must not come back.
-    for offset, publisher in ((0.001, bench._planes), (0.002, plain), (0.004, bench._planes)):
-        message.pose.position.x = offset
-        publisher.publish(message)
-        bench.until(partial(at_offset, bench, offset))
-    message.pose.position.x = 0.005
-    plain.publish(message)
-    bench.until(partial(at_offset, bench, 0.005))
-    said = capfd.readouterr().err
-    assert said.count("target_plane at offset") == 4
-    ours = [line for line in said.splitlines() if "[plane_controller]" in line]
-    assert not any("incompatible" in line for line in ours)
+    bench.until(lambda: bench.health("input")[0] == Level.WARN)
+    assert bench.health("input")[1] == "target_plane: refused: incompatible QoS"
+    values = bench.health_values("input")
+    assert "--qos-durability transient_local" in values["last"]
+    bench.outside.destroy_publisher(plain)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,24 +10,20 @@ from typing import Any
 import numpy as np
 import pytest
 from ament_index_python.packages import get_package_share_directory
-from geometry_msgs.msg import PointStamped, PoseWithCovarianceStamped
 from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from needle_core.errors import UserError
+from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.conversions import (
-    JOINT_STATES,
     LATCHED,
-    RELIABLE,
     to_nanoseconds,
 )
-from needle_tracker.ros.stereo_tracker import StereoTrackerNode
+from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
+from needle_tracker.stereo_tracker import make_tracker
 
-from .node_bench import INSERTION, LIMIT, Bench, Drawer, Images, found
+from .node_bench import INSERTION, Bench, Drawer, Images, found
 
 
 def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
@@ -52,47 +47,6 @@ def test_a_pair_gives_tip_and_pose_with_the_exposures_stamp(
     bench.until(lambda: bench.health["images"][:2] == (0, "pairs complete"))
 
 
-def test_no_image_is_taken_before_the_recorder_listens(context: Context) -> None:
-    node = StereoTrackerNode(
-        context=context, parameter_overrides=[Parameter("wait_for_recorder", value=True)]
-    )
-    recorder = Node("recorder", context=context)
-    executor = SingleThreadedExecutor(context=context)
-    executor.add_node(node)
-    executor.add_node(recorder)
-
-    def spin_until(condition: Callable[[], bool]) -> None:
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, "waited in vain"
-            executor.spin_once(timeout_sec=0.05)
-
-    try:
-        recorder.create_subscription(PointStamped, "needle/tip", lambda _: None, RELIABLE)
-        spin_until(lambda: node._outputs["needle/tip"].get_subscription_count() == 1)
-        node._check()
-        assert node.count_subscribers("stereo/left/image_raw") == 0
-        recorder.create_subscription(
-            PoseWithCovarianceStamped, "needle/tip_pose", lambda _: None, RELIABLE
-        )
-        spin_until(lambda: node._outputs["needle/tip_pose"].get_subscription_count() == 1)
-        node._check()
-        # Nor before those who publish joints and estimates know this node.
-        assert node.count_subscribers("stereo/left/image_raw") == 0
-        recorder.create_publisher(JointState, "joint_states", JOINT_STATES)
-        recorder.create_publisher(PoseWithCovarianceStamped, "needle/estimate", RELIABLE)
-        spin_until(
-            lambda: all(
-                node.count_subscribers(f"stereo/{side}/image_raw") for side in ("left", "right")
-            )
-        )
-    finally:
-        for each in (node, recorder):
-            executor.remove_node(each)
-            each.destroy_node()
-        executor.shutdown()
-
-
 def test_late_joiners_are_told_the_calibration_in_use(bench: Bench) -> None:
     told: list[String] = []
     bench.outside.create_subscription(String, "stereo_tracker/calibration", told.append, LATCHED)
@@ -106,7 +60,7 @@ def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None
     bench.image("left", 1_020_000_000, images[0])
     bench.image("right", 1_020_000_000, images[1])
     # In between only the needle's length says that this is no needle: so it was waited for.
-    bench.until(lambda: len(bench.node._component.answers._queue) == 1)
+    bench.until(lambda: len(bench.node.component.answers._queue) == 1)
     bench.joints(1_010_000_000)
     bench.joints(1_030_000_000, INSERTION + 0.04)
     assert not found(bench.answer())
@@ -173,4 +127,10 @@ def test_one_camera_alone_is_said(bench: Bench, images: Images) -> None:
 )
 def test_bad_parameters_are_one_line(context: Context, name: str, value: Any, said: str) -> None:
     with pytest.raises(UserError, match=said):
-        StereoTrackerNode(context=context, parameter_overrides=[Parameter(name, value=value)])
+        ComponentNode(
+            "stereo_tracker",
+            StereoTrackerParameters,
+            make_tracker,
+            context=context,
+            parameter_overrides=[Parameter(name, value=value)],
+        )

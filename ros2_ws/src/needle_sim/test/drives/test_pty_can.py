@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
+import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,9 +16,9 @@ import pytest
 
 from needle_core.can_frame import CanFrame
 from needle_core.errors import UserError
+from needle_sim.bus.pty_can import PtyCan
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.drive_server import DriveServer
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
 from needle_sim.drives.fault_commands import PlugOrder, obey
 
@@ -37,17 +39,16 @@ def make_bus() -> EmulatedBus:
 
 
 class Served:
-    """A server on a thread of its own."""
+    """A bus behind an adapter, served by a thread of its own."""
 
-    def __init__(self, port: PtyPort) -> None:
-        self.server = DriveServer(make_bus(), port)
-        self._orders: list[str] = []
+    def __init__(self, link: Path) -> None:
+        self.bus = make_bus()
+        self.adapter = PtyCan(link)
+        self._arrived: deque[tuple[CanFrame, ...]] = deque()
         self._end = threading.Event()
+        self.adapter.open(self._arrived.append)
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
-
-    def obey(self, line: str) -> None:
-        self._orders.append(line)
 
     def until(self, condition: Callable[[], bool]) -> None:
         for _ in range(2000):
@@ -59,18 +60,20 @@ class Served:
     def close(self) -> None:
         self._end.set()
         self._thread.join()
-        self.server.close()
+        self.adapter.close()
 
     def _run(self) -> None:
-        while not self._end.is_set():
-            self.server.turn(0.005)
-            while self._orders:
-                self.server.obey(self._orders.pop(0))
+        while not self._end.wait(0.002):
+            now = time.monotonic()
+            while self._arrived:
+                for frame in self._arrived.popleft():
+                    self.bus.receive(frame, now)
+            self.adapter.send(tuple(self.bus.poll(now)))
 
 
 @pytest.fixture
 def served(tmp_path: Path) -> Iterator[Served]:
-    served = Served(PtyPort(tmp_path / "can"))
+    served = Served(tmp_path / "can")
     yield served
     served.close()
     assert list(tmp_path.iterdir()) == []
@@ -95,9 +98,9 @@ def test_stock_slcan_and_canopen_reach_both_drives(served: Served, tmp_path: Pat
         network.nmt.send_command(1)
         for word in (0x06, 0x07, 0x0F):
             network.nodes[INSERTION].sdo.download(0x6040, 0, word.to_bytes(2, "little"))
-        served.until(lambda: served.server.bus.drives["insertion"].state.value == 0x27)
+        served.until(lambda: served.bus.drives["insertion"].state.value == 0x27)
         network.sync.transmit()
-        served.until(lambda: served.server.bus.syncs == 1)
+        served.until(lambda: served.bus.syncs == 1)
     finally:
         network.disconnect()
 
@@ -105,7 +108,7 @@ def test_stock_slcan_and_canopen_reach_both_drives(served: Served, tmp_path: Pat
 def test_unplugged_adapter_is_an_error_and_comes_back(served: Served, tmp_path: Path) -> None:
     link = tmp_path / "can"
     bus: Any = can.Bus(interface="slcan", channel=str(link), bitrate=500_000, sleep_after_open=0)
-    served.obey("unplug")
+    served.adapter.plug(plugged_in=False)
     served.until(lambda: not link.exists())
     with pytest.raises((can.CanError, OSError)):
         for _ in range(100):
@@ -113,7 +116,7 @@ def test_unplugged_adapter_is_an_error_and_comes_back(served: Served, tmp_path: 
             bus.send(can.Message(arbitration_id=0x80, is_extended_id=False))
     bus.serialPortOrig.close()
     bus._is_shutdown = True
-    served.obey("restore")
+    served.adapter.plug(plugged_in=True)
     served.until(link.exists)
     network = canopen.Network()
     network.connect(interface="slcan", channel=str(link), bitrate=500_000, sleep_after_open=0)
@@ -149,41 +152,6 @@ def test_closing_the_channel_throws_away_what_waits_and_opening_it_nothing(tmp_p
     finally:
         os.close(computer)
         port.unplug()
-
-
-class LatePort(PtyPort):
-    """Has frames that came while nobody looked."""
-
-    def __init__(self, frames: list[CanFrame]) -> None:
-        self.sent: list[CanFrame] = []
-        self._frames = frames
-
-    @property
-    def filenos(self) -> list[int]:
-        return []
-
-    def receive(self) -> tuple[CanFrame, ...]:
-        frames, self._frames = self._frames, []
-        return tuple(frames)
-
-    def send(self, frames: list[CanFrame]) -> None:
-        self.sent += frames
-
-
-def test_heartbeat_that_was_not_read_yet_is_not_missed() -> None:
-    # Long ago on the steady clock: both watchdogs heard the last heartbeat then.
-    watch = b"\x23\x16\x10\x01\x64\x00\x7f\x00"
-    port = LatePort([CanFrame(0x080), CanFrame(0x77F, b"\5")])
-    server = DriveServer(make_bus(), port)
-    for node in (INSERTION, ROTATION):
-        server.bus.receive(CanFrame(0x600 + node, watch), 1.0)
-    server.bus.receive(CanFrame(0x77F, b"\5"), 1.0)
-    server.turn(0.0)
-    assert [frame for frame in port.sent if frame.identifier in (0x81, 0x82)] == []
-    port.sent.clear()
-    threading.Event().wait(0.11)
-    server.turn(0.0)
-    assert [frame.identifier for frame in port.sent] == [0x81, 0x82]
 
 
 def test_what_is_not_ours_is_left_alone(tmp_path: Path) -> None:

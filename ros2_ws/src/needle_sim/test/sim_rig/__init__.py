@@ -1,1 +1,0 @@
-"""The node sim_rig beside scripted partners."""
