@@ -23,7 +23,7 @@ import latency_rig
 import needle_tracker
 from needle_analysis.run.stage_timing import stage_timings
 from needle_bags.reading.bag_reader import read_run
-from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG, can_adapter
+from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG, can_adapter
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import own_domain
@@ -120,7 +120,7 @@ def _run(folder: Path, depth: float) -> None:
         # Emulated drives are processes: on a busy machine they answer as late as others.
         "device_driver": {
             "channel": adapter,
-            **dict.fromkeys(("watchdog", "reply_age_limit", "hold_timeout"), REAL_TIME_WATCHDOG),
+            **dict.fromkeys(("watchdog", "reply_age_limit", "hold_timeout"), GRAPH_WATCHDOG),
         },
         "stereo_tracker": {},
         "plane_controller": {

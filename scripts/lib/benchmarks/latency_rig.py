@@ -18,10 +18,12 @@ import rclpy
 from sensor_msgs.msg import CameraInfo, Image, JointState
 from std_srvs.srv import Trigger
 
+from needle_core.convert import Converter
 from needle_core.errors import UserError
-from needle_core.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds, to_stamp
+from needle_core.message_types import rclpy_types
+from needle_core.ros.conversions import IMAGES, NANOSECONDS, to_nanoseconds
 from needle_sim.camera.stereo_rig import load_stereo_rig
-from needle_sim.ros.conversions import to_camera_info, to_image
+from needle_sim.camera_sensor import camera_info_message, image_message
 from needle_verification.ros.drive_hand import DriveHand
 
 IMAGES_FILE, INSERTIONS_FILE = "images.npy", "insertions.npy"
@@ -50,6 +52,7 @@ class LatencyRig(DriveHand):
         super().__init__(steers=False)
         self._images = np.load(folder / IMAGES_FILE)
         self._insertions = np.load(folder / INSERTIONS_FILE)
+        self._converter = Converter(rclpy_types())
         rig = load_stereo_rig(calibration)
         self._views = [
             (
@@ -106,10 +109,10 @@ class LatencyRig(DriveHand):
         times, insertions = (np.array(column) for column in zip(*self._told, strict=True))
         insertion = np.interp(exposed_ns - times[0], times - times[0], insertions)
         pair = self._images[int(np.argmin(np.abs(self._insertions - insertion)))]
-        stamp = to_stamp(exposed_ns)
         for pixels, (camera, frame, image, info) in zip(pair, self._views, strict=True):
-            info.publish(to_camera_info(camera, frame, stamp))
-            image.publish(to_image(pixels, frame, stamp))
+            told = camera_info_message(camera, frame, exposed_ns)
+            info.publish(self._converter.to_ros(told))
+            image.publish(self._converter.to_ros(image_message(pixels, frame, exposed_ns)))
         self.shown += 1
 
     def _on_joints(self, message: JointState) -> None:

@@ -69,8 +69,10 @@ class CameraSensor:
         for side, image, frame, camera in zip(
             ("left", "right"), images, _FRAMES, self._cameras, strict=True
         ):
-            yield Publish(f"stereo/{side}/camera_info", _camera_info(camera, frame, stamp_ns))
-            yield Publish(f"stereo/{side}/image_raw", _image(image, frame, stamp_ns))
+            yield Publish(
+                f"stereo/{side}/camera_info", camera_info_message(camera, frame, stamp_ns)
+            )
+            yield Publish(f"stereo/{side}/image_raw", image_message(image, frame, stamp_ns))
 
     def close(self) -> None:
         """End the folder's files."""
@@ -78,12 +80,12 @@ class CameraSensor:
             self._folder.close()
 
 
-def _image(pixels: NDArray[np.uint8], frame: str, stamp_ns: int) -> m.Image:
+def image_message(pixels: NDArray[np.uint8], frame: str, stamp_ns: int) -> m.Image:
     height, width = pixels.shape
     return m.Image(stamp_ns, frame, height, width, "mono8", width, pixels.tobytes())
 
 
-def _camera_info(camera: SimulatedCamera, frame: str, stamp_ns: int) -> m.CameraInfo:
+def camera_info_message(camera: SimulatedCamera, frame: str, stamp_ns: int) -> m.CameraInfo:
     """Return a camera's calibration; the images are not rectified."""
     matrix = camera.camera_matrix
     return m.CameraInfo(

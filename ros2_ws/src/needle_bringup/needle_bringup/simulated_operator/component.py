@@ -104,6 +104,10 @@ class SimulatedOperator(Component):
     def on_stop(self, at: Moment) -> Actions:
         """Release, disable, and exit as interrupted."""
         self._sequence.interrupt()
+        outcome = self._sequence.outcome
+        if self._is_finished and outcome is not None:
+            # Nobody answers any more; others end on the same signal.
+            return (Exit(EXIT_INTERRUPTED, outcome.reason),)
         return self._advance(at)
 
     def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:

@@ -24,7 +24,6 @@ def simulated(**arguments: str) -> Parameters:
     default = {
         "level": "camera",
         "seed": "1",
-        "real_time_factor": "1.0",
         "controller": "best",
         "simulated_operator": "false",
         "bag": "",
@@ -147,7 +146,7 @@ def test_images_that_are_sent_best_effort_are_heard() -> None:
     assert beside_rig()["stereo_tracker"]["reliable_images"] is False
 
 
-@pytest.mark.parametrize(("name", "text"), [("seed", "x"), ("real_time_factor", "-1")])
+@pytest.mark.parametrize(("name", "text"), [("seed", "x"), ("seed", "-1")])
 def test_a_number_that_cannot_be_meant_starts_nothing(name: str, text: str) -> None:
     with pytest.raises(UserError, match=text):
         simulated(**{name: text})

@@ -56,12 +56,9 @@ def test_only_the_nodes_of_the_level_run() -> None:
     assert set(nodes_of(SimulateOptions(level="drive"))) == everywhere | {"stereo_tracker"} | drives
 
 
-@pytest.mark.parametrize("factor", [0.0, 1.0])
-def test_driver_and_drives_meet_and_a_lapse_pauses_in_lock_step_only(factor: float) -> None:
-    options = SimulateOptions(level="drive", real_time_factor=factor)
-    parameters = command_line_parameters(options, Path("bags/x"))
+def test_driver_and_drives_meet() -> None:
+    parameters = command_line_parameters(SimulateOptions(level="drive"), Path("bags/x"))
     assert parameters["device_driver"]["channel"] == parameters["drive_emulator"]["pty"]
-    assert parameters["device_driver"]["lock_step"] is (factor == 0.0)
 
 
 def test_later_layers_win_one_parameter_at_a_time() -> None:
@@ -125,16 +122,9 @@ def test_the_controller_knows_the_sensor_of_its_level() -> None:
 
 def test_by_hand_is_the_rig_that_simulate_runs() -> None:
     # What simulate tells the nodes beyond their defaults is said on the command line, or concerns
-    # time, recording and the emulated adapter: nothing of it describes the rig.
+    # recording and the emulated adapter: nothing of it describes the rig.
     set_by_simulate = command_line_parameters(SimulateOptions(level="drive"), Path("bag"))
-    of_run = {
-        "use_sim_time",
-        "wait_for_recorder",
-        "level",
-        "seed",
-        "real_time_factor",
-        "preset",
-    }
+    of_run = {"level", "seed", "preset"}
     of_needle = {"initial_pitch", "initial_roll", "torsion_play", "torsion_lag"}
     told = {node: set(values) - of_run for node, values in set_by_simulate.items()}
     assert told["sim_rig"] == of_needle

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
@@ -57,14 +58,14 @@ def run_component(
         lambda: ComponentNode(name, parameters, make, ports),
         help_text=help_text,
         parameters=parameters,
-        spin=_spin,
+        spin=partial(_spin, interrupted),
         grace=grace,
         interrupted=interrupted,
         shared_memory=shared_memory,
     )
 
 
-def _spin(node: Node, end: EndRequest) -> int:
+def _spin(interrupted: int, node: Node, end: EndRequest) -> int:
     assert isinstance(node, ComponentNode)
     executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
@@ -80,4 +81,5 @@ def _spin(node: Node, end: EndRequest) -> int:
         executor.shutdown()
     if node.exit.text:
         print(f"{node.get_name()}: {node.exit.text}", file=sys.stderr)
-    return node.exit.code
+    # Others end on the same signal: what failed for want of them was interrupted.
+    return interrupted if end.wanted and node.exit.code else node.exit.code

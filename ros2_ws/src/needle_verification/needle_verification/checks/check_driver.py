@@ -91,15 +91,15 @@ def many_steps(_: Workbench, count: int = STEPS) -> Iterator[Finding]:
         f"{seen['retractions']} retractions",
         max(map(abs, off)) <= 1.0,
     )
-    lost = seen["ticks"] - min(seen["joint_states_of_ticks"], seen["drive_positions"])
+    lost = seen["cycles"] - min(seen["joint_states"], seen["drive_positions"])
     yield Finding(
         "steps_messages",
         f"{count:,} random steps: results, joint_states and positions of each cycle",
-        "every one, all steps succeeded",
+        "every one but those under way at both ends, all steps succeeded",
         f"{seen['results']} results, {seen['not_succeeded']} not succeeded"
         f"{''.join(f' ({text})' for text in seen['not_succeeded_for'])}; {lost} of "
-        f"{seen['ticks']} cycles without joints or positions",
-        seen["results"] == count and seen["not_succeeded"] == 0 and lost == 0,
+        f"{seen['cycles']} cycles without joints or positions",
+        seen["results"] == count and seen["not_succeeded"] == 0 and lost <= 2,
     )
     yield Finding(
         "steps_memory",

@@ -13,13 +13,13 @@ from pathlib import Path
 
 from needle_core.commands.options import CommandParser
 from needle_verification.ros.drive_faults import FAULTS, fault_trials
-from needle_verification.ros.drive_steps import random_steps
 from needle_verification.ros.fuzz_trials import fuzz_trials
 from needle_verification.ros.graph_kills import KILLED, kill_trials
 from needle_verification.ros.listening_node import ros
 from needle_verification.ros.nuisance import NUISANCE_KINDS
 from needle_verification.ros.nuisance_trials import nuisance_trials
 from needle_verification.ros.two_rigs import two_rigs_trials
+from needle_verification.trials.drive_steps import random_steps
 from needle_verification.trials.trial_runner import Outcomes, run_trials, trials_of
 
 KINDS = {
@@ -41,7 +41,7 @@ def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Outcomes:
     trials = trials_of(KINDS[given.trial], given.kinds, 1 if timed else given.count, given.seed)
     with ros(domain):
         if given.trial == "steps":
-            yield random_steps(folder, domain, given.count, given.seed)
+            yield random_steps(given.count, given.seed)
         elif given.trial == "faults":
             yield from fault_trials(folder, domain, trials, given.watchdog)
         elif given.trial == "nuisances":

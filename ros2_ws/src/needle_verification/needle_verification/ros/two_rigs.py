@@ -89,5 +89,5 @@ def _way(positions: list[float]) -> float:
 
 
 def _parameters() -> Parameters:
-    simulation = without_recorder(SimulateOptions(level="tip", depth_mm=_DEPTH_MM))
+    simulation = without_recorder(SimulateOptions(level="tip", depth_mm=_DEPTH_MM, graph=True))
     return {**simulation, **drives_and_driver({"insertion_start": _START}, {})}

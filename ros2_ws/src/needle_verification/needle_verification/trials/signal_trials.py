@@ -96,7 +96,7 @@ def signal_trials(
 def _trial(
     folder: Path, domain: int, kind: str, moment: float, rng: random.Random
 ) -> Iterator[Ended]:
-    options = SimulateOptions(level="drive", real_time_factor=1.0, seed=rng.randrange(1000))
+    options = SimulateOptions(level="drive", graph=True, seed=rng.randrange(1000))
     bag = folder / "bag"
     parameters = command_line_parameters(options, bag)
     parameters["sim_rig"]["camera_rate"] = 30.0

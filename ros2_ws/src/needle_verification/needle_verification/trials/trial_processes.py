@@ -159,7 +159,7 @@ def graph_in_real_time(seed: int) -> Parameters:
     seed : int
         Of the simulation.
     """
-    return without_recorder(SimulateOptions(level="drive", real_time_factor=1.0, seed=seed))
+    return without_recorder(SimulateOptions(level="drive", graph=True, seed=seed))
 
 
 def without_recorder(options: SimulateOptions) -> Parameters:

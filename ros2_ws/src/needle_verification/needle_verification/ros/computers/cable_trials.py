@@ -26,7 +26,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState
 
-from needle_bringup.simulation.rig_configuration import REAL_TIME_WATCHDOG
+from needle_bringup.simulation.rig_configuration import GRAPH_WATCHDOG
 from needle_core.commands.options import CommandParser
 from needle_core.process.reach import DISCOVERY_RANGE, PROFILES, keep_to_this_machine
 from needle_core.ros.conversions import LATCHED, values_of
@@ -60,7 +60,7 @@ _TIP_CAMERA = "needle_verification.ros.computers.tip_camera"
 _BACK = 2.0
 # After so long without motion the next one is another [s]: a driver that a busy machine holds up
 # for less goes on to the end of its stop after that.
-_REST = REAL_TIME_WATCHDOG
+_REST = GRAPH_WATCHDOG
 
 
 class _DriveWitness(HoldWitness):
@@ -199,9 +199,9 @@ def _cut(rig: _Rig, cable: Cable, rng: random.Random, longest: float) -> dict[st
 
 def _parameters() -> Parameters:
     controller = fast_insertion()["plane_controller"]
-    controller |= {"use_sim_time": False, "tip_covariance": "configured"}
+    controller |= {"tip_covariance": "configured"}
     # The drives' bus is not what is tried: a machine that is busy otherwise must not cut it.
-    patient = {"watchdog": REAL_TIME_WATCHDOG, "reply_age_limit": REAL_TIME_WATCHDOG}
+    patient = {"watchdog": GRAPH_WATCHDOG, "reply_age_limit": GRAPH_WATCHDOG}
     return {**drives_and_driver({}, patient), "plane_controller": controller}
 
 

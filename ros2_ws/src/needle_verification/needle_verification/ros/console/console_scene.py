@@ -193,5 +193,5 @@ class _Console:
 
 
 def _rig() -> Parameters:
-    values = {"level": "tip", "real_time_factor": 1.0, "max_depth": 0.5, "use_sim_time": True}
+    values = {"level": "tip", "max_depth": 0.5}
     return {"sim_rig": values}

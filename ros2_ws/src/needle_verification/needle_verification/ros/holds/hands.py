@@ -187,7 +187,7 @@ def fast_insertion(seed: int = 1) -> Parameters:
         controller="paper",
         insertion="continuous",
         depth_mm=_DEPTH_MM,
-        real_time_factor=1.0,
+        graph=True,
         seed=seed,
     )
     parameters = without_recorder(options)
