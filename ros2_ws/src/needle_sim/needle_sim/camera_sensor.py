@@ -81,6 +81,7 @@ class CameraSensor:
 
 
 def image_message(pixels: NDArray[np.uint8], frame: str, stamp_ns: int) -> m.Image:
+    """Return a grey image."""
     height, width = pixels.shape
     return m.Image(stamp_ns, frame, height, width, "mono8", width, pixels.tobytes())
 

@@ -94,7 +94,7 @@ class SimulatedOperator(Component):
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
         """Take the answer to the last call, or exit after the last of all."""
         if self._is_finished:
-            return self._exit()
+            return self._exit() if answer.service == DISABLE.service else ()
         call = self._pending
         if call is None or call.service != answer.service or not answer.answered:
             return ()
