@@ -16,7 +16,7 @@ from needle_bags.recording.recording import Received, Recording
 from needle_bringup.operator.joy_source import JoySource
 from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
-from needle_controller.controller_status import steering_diagnostic
+from needle_controller.controller_status import controller_status
 from needle_controller.laws.roll_law import RollLaw
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
@@ -139,12 +139,11 @@ def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
 
 
 def _insertion_told_too_deep(patch: pytest.MonkeyPatch) -> None:
-    def scaled(steering: Any, preset: str) -> Any:
-        diagnostic = steering_diagnostic(steering, preset)
-        told = {"insertion_m": repr(1.1 * steering.insertion)}
-        return dataclasses.replace(diagnostic, values={**diagnostic.values, **told})
+    def scaled(steering: Any, preset: str, source: str) -> Any:
+        status = controller_status(steering, preset, source)
+        return dataclasses.replace(status, insertion_m=1.1 * steering.insertion)
 
-    patch.setattr("needle_controller.plane_controller.steering_diagnostic", scaled)
+    patch.setattr("needle_controller.plane_controller.controller_status", scaled)
 
 
 def _rotation_wired_the_wrong_way(patch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from needle_controller.controller_status import steering_diagnostic
+from needle_controller.controller_status import controller_status
 from needle_controller.model.arrays import Array
 from needle_controller.model.kinematics import angle_axes
 from needle_controller.model.point_reach import point_from_message
@@ -24,15 +24,12 @@ from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
-    DeviceReport,
     PublishUpdate,
     SendPath,
     SendStep,
     StartReply,
 )
-from needle_controller.protocol.steering_types import Log as SteeringLog
-from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.protocol.tip_gate import TipCovariance, TipMeasurement
 from needle_core import messages as m
 from needle_core.component import (
     LATCHED,
@@ -54,6 +51,7 @@ from needle_core.component import (
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.rotations import quaternion_from_rotation
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COMMANDS, STATUS = "device/joint_trajectory", "needle/controller_status"
 TARGET_PLANE, TARGET_POINT, OBSTACLES = "target_plane", "target_point", "obstacles"
@@ -98,11 +96,11 @@ class PlaneController(Component):
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._heard = HeardMessages()
         self._logged: dict[str, float] = {}
-        self._published: Diagnostic | None = None
+        self._published: ControllerStatus | None = None
         rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
         rows = (
             ("joint_states", m.JointState, self._on_joints, JOINT_STATES),
-            ("device/status", m.Status, self._on_device, LATCHED),
+            ("device/status", DeviceStatus, self._on_device, LATCHED),
             ("device/result", m.CommandResult, self._on_result, RELIABLE),
             ("needle/tip", m.Point, self._on_tip, RELIABLE),
             ("needle/tip_pose", m.PoseWithCovariance, self._on_tip_pose, RELIABLE),
@@ -120,7 +118,7 @@ class PlaneController(Component):
             Output("needle/reduced_state", m.Vector),
             Output("needle/linearized_state", m.Vector),
             Output("needle/control_input", m.Vector),
-            Output(STATUS, m.Status, LATCHED),
+            Output(STATUS, ControllerStatus, LATCHED),
         )
         self.services = (
             Service("plane_controller/start", self._on_start),
@@ -132,18 +130,18 @@ class PlaneController(Component):
         """Take changed parameters."""
         self.settings = settings
         self.steering.configure(settings)
-        return self.carry_out([SteeringLog("info", "parameters changed")], at)
+        return self.carry_out([Log("info", "parameters changed")], at)
 
     def carry_out(self, actions: Iterable[Action], at: Moment) -> Actions:
         """Return what the protocol's actions are on the graph, and the status if it has changed."""
         for action in actions:
             match action:
-                case SteeringLog():
+                case Log():
                     yield from self._log(action, at)
                 case PublishUpdate():
                     yield from _update(action)
                 case SendStep() | SendPath():
-                    yield Publish(COMMANDS, _trajectory(action))
+                    yield Publish(COMMANDS, trajectory(action))
         yield from self._report()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
@@ -174,13 +172,13 @@ class PlaneController(Component):
         self._bad_joints += topic == "joint_states"
         kept = _LAST_STAYS.get(topic)
         self.complaints[topic] = f"{error}; {kept}" if kept else str(error)
-        return [SteeringLog("warning", self.complaints[topic], topic)]
+        return [Log("warning", self.complaints[topic], topic)]
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
         return self.steering.on_joints(joint_sample(message, at.sent_ns))
 
-    def _on_device(self, message: m.Status, at: Moment) -> Iterable[Action]:
-        return self.steering.on_device(device_report(message))
+    def _on_device(self, message: DeviceStatus, at: Moment) -> Iterable[Action]:
+        return self.steering.on_device(message)
 
     def _on_result(self, message: m.CommandResult, at: Moment) -> Iterable[Action]:
         return self.steering.on_result(message.stamp_ns, message.outcome, at.sent_ns)
@@ -197,7 +195,7 @@ class PlaneController(Component):
         self.steering.settings.check_plane(plane)
         self.steering.control.plane = plane
         self.steering.control.target_point = None
-        return [SteeringLog("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
+        return [Log("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
 
     def _on_point(self, message: m.Point, at: Moment) -> Iterable[Action]:
         point = point_from_message(message.frame_id, message.position)
@@ -209,12 +207,12 @@ class PlaneController(Component):
             self.steering.control.target_point = point
         x, y, z = point
         text = f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m"
-        return [SteeringLog("info", text, TARGET_POINT)]
+        return [Log("info", text, TARGET_POINT)]
 
     def _on_obstacles(self, message: m.Markers, at: Moment) -> Iterable[Action]:
         obstacles = obstacles_from_markers(message)
         self.steering.control.obstacles = obstacles
-        return [SteeringLog("info", f"{len(obstacles)} obstacles", OBSTACLES)]
+        return [Log("info", f"{len(obstacles)} obstacles", OBSTACLES)]
 
     # ---- services and time --------------------------------------------------------------------
 
@@ -246,12 +244,12 @@ class PlaneController(Component):
 
     # ---- what is said -------------------------------------------------------------------------
 
-    def _log(self, log: SteeringLog, at: Moment) -> Actions:
+    def _log(self, log: Log, at: Moment) -> Actions:
         if log.kind:
             if at.steady - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
                 return
             self._logged[log.kind] = at.steady
-        yield Log(log.severity, log.text)
+        yield log
 
     def _report(self) -> Actions:
         history = self.steering.intake.joints
@@ -263,13 +261,23 @@ class PlaneController(Component):
         yield Diagnose("joint_states", _health(complaint, joints))
         for topic in TARGETS:
             yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
-        diagnostic = steering_diagnostic(self.steering, self.settings.preset)
-        yield Diagnose("steering", diagnostic)
-        if diagnostic != self._published or self._heard.is_full:
-            self._published = diagnostic
-            values = {**diagnostic.values, "heard": self._heard.take_text()}
-            told = dataclasses.replace(diagnostic, values=values)
-            yield Publish(STATUS, m.Status.of(self._signature, "steering", told))
+        status = controller_status(self.steering, self.settings.preset, self._signature)
+        if status != self._published or self._heard.is_full:
+            self._published = status
+            yield Diagnose("steering", status.diagnostic)
+            yield Publish(STATUS, dataclasses.replace(status, heard=self._heard.take_text()))
+
+
+def trajectory(command: SendStep | SendPath) -> m.Trajectory:
+    """Return a step as a trajectory of one point, a path as one of several."""
+    match command:
+        case SendStep(stamp_ns, insertion, rotation, duration):
+            points: tuple[m.TrajectoryPoint, ...] = (
+                m.TrajectoryPoint((insertion, rotation), duration),
+            )
+        case SendPath(stamp_ns, places):
+            points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in places)
+    return m.Trajectory(stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
@@ -296,37 +304,8 @@ def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
     return TipCovariance(message.stamp_ns, message.frame_id, matrix)
 
 
-def device_report(message: m.Status) -> DeviceReport:
-    """Return what the protocol needs of device/status."""
-    values = message.values
-    return DeviceReport(
-        state=values.get("state", ""),
-        homed=values.get("homed", "").lower() == "true",
-        hold_owner=values.get("hold_owner", ""),
-        reason=values.get("fault", "") or values.get("reason", "") or message.text,
-        insertion=_number(values.get("insertion_m", "")),
-        rotation=_number(values.get("rotation_rad", "")),
-    )
-
-
 def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
     return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
-
-
-def _number(text: str) -> float | None:
-    try:
-        return float(text)
-    except ValueError:
-        return None
-
-
-def _trajectory(command: SendStep | SendPath) -> m.Trajectory:
-    """Return a step as a trajectory of one point, a path as one of several."""
-    points = tuple(
-        m.TrajectoryPoint((insertion, rotation), time)
-        for insertion, rotation, time in command.points
-    )
-    return m.Trajectory(command.stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 
 def _update(action: PublishUpdate) -> Actions:

@@ -16,7 +16,9 @@ import numpy as np
 from needle_core import messages as m
 from needle_core.diagnostics import Level
 from needle_core.message_types import NANOSECONDS, MessageTypes
+from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
 
+_STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
 _LOG_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
 
 
@@ -137,13 +139,6 @@ def _hold(message: Any) -> m.HoldState:
         float(axes[0]) if len(axes) > 0 else math.nan,
         float(axes[1]) if len(axes) > 1 else math.inf,
     )
-
-
-def _pose_fields(message: m.Pose, t: MessageTypes) -> dict[str, Any]:
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "pose": t.pose(message.position, message.orientation),
-    }
 
 
 def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[str, Any]:
@@ -286,8 +281,14 @@ def _status(message: Any) -> m.Status:
     )
 
 
+def _key_values(kind: type[KeyValues]) -> Row:
+    return Row(
+        _STATUS, lambda message, t: _status_fields(message.status, t), lambda r: kind.of(_status(r))
+    )
+
+
 def _diagnostics_fields(message: m.Diagnostics, t: MessageTypes) -> dict[str, Any]:
-    make = t.make("diagnostic_msgs/msg/DiagnosticStatus")
+    make = t.make(_STATUS)
     statuses = [make(**_status_fields(status, t)) for status in message.statuses]
     return {"header": t.header(message.stamp_ns), "status": statuses}
 
@@ -304,9 +305,9 @@ def _log_fields(message: m.LogLine, t: MessageTypes) -> dict[str, Any]:
     }
 
 
-def _log(message: Any) -> m.LogLine:
-    severity = {level: name for name, level in _LOG_LEVELS.items()}[int(message.level)]
-    return m.LogLine(to_nanoseconds(message.stamp), severity, message.name, message.msg)
+def _log(r: Any) -> m.LogLine:
+    severity = {level: name for name, level in _LOG_LEVELS.items()}[int(r.level)]
+    return m.LogLine(to_nanoseconds(r.stamp), severity, r.name, r.msg)
 
 
 TABLE: dict[type[Any], Row] = {
@@ -350,7 +351,10 @@ TABLE: dict[type[Any], Row] = {
     ),
     m.Pose: Row(
         "geometry_msgs/msg/PoseStamped",
-        _pose_fields,
+        lambda message, t: {
+            "header": t.header(message.stamp_ns, message.frame_id),
+            "pose": t.pose(message.position, message.orientation),
+        },
         lambda r: m.Pose(
             to_nanoseconds(r.header.stamp),
             r.header.frame_id,
@@ -381,7 +385,9 @@ TABLE: dict[type[Any], Row] = {
         _markers_fields,
         lambda r: m.Markers(tuple(_marker(marker) for marker in r.markers)),
     ),
-    m.Status: Row("diagnostic_msgs/msg/DiagnosticStatus", _status_fields, _status),
+    m.Status: Row(_STATUS, _status_fields, _status),
+    DeviceStatus: _key_values(DeviceStatus),
+    ControllerStatus: _key_values(ControllerStatus),
     m.Diagnostics: Row(
         "diagnostic_msgs/msg/DiagnosticArray",
         _diagnostics_fields,

@@ -12,6 +12,7 @@ from needle_core import messages as m
 from needle_core.convert import TABLE, Converter, from_ros, ros_type
 from needle_core.diagnostics import Level
 from needle_core.message_types import rclpy_types, rosbags_types
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 STAMP = 1_234_567_890_123
@@ -48,6 +49,20 @@ MESSAGES = (
     m.Status("rig1/device_driver", "device", Level.WARN, "text", {"state": "MOVING"}),
     m.Diagnostics(STAMP, (m.Status("sim_rig", "simulation", Level.OK, "runs", {"a": "1"}),)),
     m.LogLine(STAMP, "warning", "plane_controller", "a line"),
+    DeviceStatus(
+        source="rig1/device_driver",
+        level=Level.WARN,
+        text="moves",
+        state="MOVING",
+        homed=True,
+        speed_scale=0.25,
+        insertion_m=0.0123,
+        command_ns=STAMP,
+        simulated=False,
+    ),
+    ControllerStatus(
+        state="STEERING", starts=2, target_point_m=(0.1, -0.2, 0.3), reachable=True, r1_low_m=-0.001
+    ),
 )
 
 

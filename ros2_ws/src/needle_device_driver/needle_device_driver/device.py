@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Callable
 
 from needle_core import messages as m
+from needle_core import status_messages as m_status
 from needle_core.component import (
     LATCHED,
     Actions,
@@ -23,7 +24,7 @@ from needle_core.component import (
     Service,
 )
 from needle_core.component import Reply as ServiceReply
-from needle_core.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Level
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
@@ -98,7 +99,7 @@ class DeviceRows:
         self.outputs = (
             Output(JOINTS, m.JointState),
             Output(RESULT, m.CommandResult),
-            Output(STATUS, m.Status, LATCHED),
+            Output(STATUS, m_status.DeviceStatus, LATCHED),
         )
         call = supervisor
         self.services = (
@@ -166,9 +167,9 @@ class DeviceRows:
         status = dataclasses.replace(status, simulated=self.simulated)
         if self._is_news(status, at.steady):
             self._told, self._told_at = status, at.steady
-            diagnostic = device_diagnostic(status)
-            yield Publish(STATUS, m.Status.of(self._name, "device", diagnostic))
-            yield Diagnose("device", diagnostic)
+            told = device_status(status, self._name)
+            yield Publish(STATUS, told)
+            yield Diagnose("device", told.diagnostic)
 
     def joint_states(self, at: Moment) -> Actions:
         """Return the measured joints, unless they are stale."""
@@ -259,29 +260,27 @@ class DeviceRows:
         return "another order is under way" if self.is_busy else ""
 
 
-def device_diagnostic(status: DeviceStatus) -> Diagnostic:
-    """Return device/status as a line of health."""
-    message = status.fault or status.reason or status.state.value
-    return Diagnostic(
-        _LEVELS.get(status.state, Level.OK),
-        message,
-        {
-            "state": status.state.value,
-            "activity": status.activity.value,
-            "homed": "true" if status.homed else "false",
-            "hold_owner": status.hold_owner,
-            "press_again": status.press_again,
-            "speed_scale": f"{status.speed_scale:.3g}",
-            "insertion_m": "" if status.insertion is None else repr(status.insertion),
-            "rotation_rad": "" if status.rotation is None else repr(status.rotation),
-            "fault": status.fault,
-            "reason": status.reason,
-            "needle_out_confirmed": "true" if status.needle_out_confirmed else "false",
-            "watchdog_trips": str(status.watchdog_trips),
-            "commands_refused": str(status.commands_refused),
-            "needs_time": "true" if status.needs_time else "false",
-            "command_ns": str(status.command_ns),
-            "rotation_owed_rad": f"{status.rotation_owed:.2f}",
-            "simulated": "" if status.simulated is None else str(status.simulated).lower(),
-        },
+def device_status(status: DeviceStatus, source: str) -> m_status.DeviceStatus:
+    """Return the supervisor's status as the node `source` says it."""
+    return m_status.DeviceStatus(
+        source=source,
+        level=_LEVELS.get(status.state, Level.OK),
+        text=status.fault or status.reason or status.state.value,
+        state=status.state.value,
+        activity=status.activity.value,
+        homed=status.homed,
+        hold_owner=status.hold_owner,
+        press_again=status.press_again,
+        speed_scale=status.speed_scale,
+        insertion_m=status.insertion,
+        rotation_rad=status.rotation,
+        fault=status.fault,
+        reason=status.reason,
+        needle_out_confirmed=status.needle_out_confirmed,
+        watchdog_trips=status.watchdog_trips,
+        commands_refused=status.commands_refused,
+        needs_time=status.needs_time,
+        command_ns=status.command_ns,
+        rotation_owed_rad=status.rotation_owed,
+        simulated=status.simulated,
     )

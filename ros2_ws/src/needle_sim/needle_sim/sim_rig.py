@@ -19,6 +19,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.rotations import quaternion_from_rotation
+from needle_core.status_messages import ControllerStatus
 from needle_sim.devices import CYCLE, make_device
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sensors import RIG, make_sensor
@@ -58,7 +59,7 @@ class SimRig(Component):
         self._is_tip_wanted = False
         self._exposures = 0
         self._exposed_at = 0.0
-        status = Input("needle/controller_status", m.Status, self._on_controller, LATCHED)
+        status = Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED)
         self.inputs = (*self._device.inputs, status)
         self.outputs = (
             *self._device.outputs,
@@ -79,11 +80,10 @@ class SimRig(Component):
         """Note who else is a device here."""
         return self._device.on_peers(peers, at)
 
-    def _on_controller(self, message: m.Status, at: Moment) -> Actions:
-        values = message.values
-        is_continuous = values.get("insertion") == "continuous"
-        is_steered = values.get("state") in ("STEERING", "WAITING_FOR_TIP")
-        self._is_tip_wanted = values.get("awaiting") == "tip" or (is_continuous and is_steered)
+    def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+        is_continuous = message.insertion == "continuous"
+        is_steered = message.state in ("STEERING", "WAITING_FOR_TIP")
+        self._is_tip_wanted = message.awaiting == "tip" or (is_continuous and is_steered)
         return ()
 
     def _cycle(self, at: Moment) -> Actions:

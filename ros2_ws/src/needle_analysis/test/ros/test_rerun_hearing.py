@@ -20,7 +20,7 @@ from needle_bags.format.bag_copy import BagCopy
 from needle_bags.reading.bag_files import read_contents
 from needle_bags.reading.bag_order import SentMessage, raw_as_sent
 from needle_bags.reading.bag_reader import read_run
-from needle_controller.controller_status import steering_diagnostic
+from needle_controller.controller_status import controller_status
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.heard_messages import HeardMessages
 
@@ -90,11 +90,11 @@ class LateController:
         self.say(time)
 
     def say(self, time: int) -> None:
-        diagnostic = steering_diagnostic(self.stage._steering, "best")
-        if diagnostic == self.said and not self.heard.is_full:
+        status = controller_status(self.stage._steering, "best")
+        if status == self.said and not self.heard.is_full:
             return
-        self.said = diagnostic
-        values = {**diagnostic.values, "heard": self.heard.take_text()}
+        self.said = status
+        values = {**status.values, "heard": self.heard.take_text()}
         pairs = [PAIR(key=key, value=value) for key, value in values.items()]
         message = STORE.types[TYPE](0, "", "", "", pairs)
         data = bytes(STORE.serialize_cdr(message, TYPE))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import os
 import sys
@@ -34,6 +35,7 @@ from needle_core.ros.hold_topic import HoldTopic
 from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HELP = """\
 simulated_operator: stands in for the person who holds the needle's switch, in simulation.
@@ -158,14 +160,15 @@ class SimulatedOperatorNode(WholeNode):
             self._advance()
 
     def _on_controller_status(self, message: DiagnosticStatus) -> None:
-        self._sequence.see_controller(values_of(message), time.monotonic())
+        self._sequence.see_controller(ControllerStatus.parse(values_of(message)), time.monotonic())
         if self._sequence.steering and self._sequence.depth is not None:
             self._progress.show(self._sequence.insertion, self._sequence.depth)
             self._progress.tell_wait(self._sequence.waits_because)
 
     def _on_device_status(self, message: DiagnosticStatus) -> None:
-        speaker = f"/{message.hardware_id}"
-        self._sequence.see_device(values_of(message), speaker, time.monotonic())
+        said = DeviceStatus.parse(values_of(message))
+        said = dataclasses.replace(said, source=f"/{message.hardware_id}")
+        self._sequence.see_device(said, time.monotonic())
         self._advance()
 
     def _on_health(self, message: DiagnosticArray) -> None:

@@ -28,6 +28,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD = "device/hold"
 _CONTROLLER, _DEVICE = "needle/controller_status", "device/status"
@@ -57,8 +58,8 @@ class SimulatedOperator(Component):
         self._pending: ServiceCall | None = None
         self._is_finished = False
         self.inputs = (
-            Input(_CONTROLLER, m.Status, self._on_controller, LATCHED),
-            Input(_DEVICE, m.Status, self._on_device, LATCHED),
+            Input(_CONTROLLER, ControllerStatus, self._on_controller, LATCHED),
+            Input(_DEVICE, DeviceStatus, self._on_device, LATCHED),
         )
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
         self.timers = (Timer(1.0 / settings.hold_rate, self._on_timer),)
@@ -92,12 +93,12 @@ class SimulatedOperator(Component):
         self._sequence.interrupt()
         return self._advance(at)
 
-    def _on_controller(self, message: m.Status, at: Moment) -> Actions:
-        self._sequence.see_controller(message.values, at.steady)
+    def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+        self._sequence.see_controller(message, at.steady)
         return self._advance(at)
 
-    def _on_device(self, message: m.Status, at: Moment) -> Actions:
-        self._sequence.see_device(message.values, message.source, at.steady)
+    def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
+        self._sequence.see_device(message, at.steady)
         return self._advance(at)
 
     def _on_timer(self, at: Moment) -> Actions:

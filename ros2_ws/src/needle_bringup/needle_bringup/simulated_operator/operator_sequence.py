@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from needle_core.process.claim import WAY_OUT
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +40,7 @@ ASK_AGAIN = 1.0
 HOMING = "homing"
 # Any other refusal may rest on news that are still under way (joints, the answer before this one).
 REFUSAL_PATIENCE = 2.0
+_NO_REASON = "no reason given"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,7 +116,7 @@ class OperatorSequence:
         self._homing_seen = False
         self._starts: int | None = None
         self._starts_before = 0
-        self._progress: tuple[str, ...] = ()
+        self._progress: tuple[str, int, float] = ("", 0, 0.0)
         self._progress_at = now
         self._must_release = False
         self.presses_again = 0
@@ -198,56 +199,56 @@ class OperatorSequence:
         if len(names) > 1 and (self._prepared or self._asked):
             self._end(f"there is more than one device: {', '.join(names)}; {WAY_OUT}")
 
-    def see_device(self, values: Mapping[str, str], speaker: str, now: float) -> None:
-        """Take the key-values of device/status, and the full name of the node that says them."""
-        self._simulated = values.get("simulated") == "true"
-        self._speaker = speaker
-        if values.get("simulated") == "false":
+    def see_device(self, status: DeviceStatus, now: float) -> None:
+        """Take device/status."""
+        self._simulated = status.simulated is True
+        self._speaker = status.source
+        if status.simulated is False:
             self._end(
-                f"{speaker} is a real device, or not in simulated time (it says simulated = "
+                f"{status.source} is a real device, or not in simulated time (it says simulated = "
                 "false): there a person holds, no stand-in"
             )
             return
-        self._moving = values.get("state") == "MOVING"
-        self._homed = values.get("homed") == "true" and not self._moving
+        self._moving = status.state == "MOVING"
+        self._homed = status.homed and not self._moving
         self._homed_since_call = self._homed
         self._homing_seen = self._homing_seen or self._moving
         if self._called(HOME) and self._homed and self._homing_seen:
             self._go_on(now)
         # A press that the device does not take, or no longer, counts again only after a release.
-        must_release = self.steering and values.get("press_again") == self._name
+        must_release = self.steering and status.press_again == self._name
         self.presses_again += self._must_release and not must_release
         self._must_release = must_release
-        if values.get("state") in ("FAULT", "ESTOPPED") and self._prepared:
-            self._end(f"device {values['state']}: {_why(values)}")
+        if status.state in ("FAULT", "ESTOPPED") and self._prepared:
+            self._end(f"device {status.state}: {status.why or _NO_REASON}")
 
-    def see_controller(self, values: Mapping[str, str], now: float) -> None:
-        """Take the key-values of needle/controller_status."""
-        self.insertion = _number(values.get("insertion_m")) or 0.0
-        self.depth = _number(values.get("depth_m"))
-        waits = values.get("state") == "WAITING_FOR_TIP"
-        self.waits_because = values.get("reason", "") if waits else ""
-        self._starts = int(_number(values.get("starts")) or 0)
+    def see_controller(self, status: ControllerStatus, now: float) -> None:
+        """Take needle/controller_status."""
+        self.insertion = status.insertion_m
+        self.depth = status.depth_m
+        waits = status.state == "WAITING_FOR_TIP"
+        self.waits_because = status.reason if waits else ""
+        self._starts = status.starts or 0
         started = self._starts > self._starts_before
         if self._called(START) and started:
             # The status can overtake the answer, which may be lost.
             self._go_on(now)
-        progress = tuple(values.get(key, "") for key in ("state", "step", "insertion_m"))
+        progress = (status.state, status.step, status.insertion_m)
         if progress != self._progress:
             self._progress, self._progress_at = progress, now
         if self.steering and started:
-            self._judge(values)
+            self._judge(status)
 
-    def _judge(self, values: Mapping[str, str]) -> None:
-        state = values.get("state", "")
-        if state == "DONE":
+    def _judge(self, status: ControllerStatus) -> None:
+        why = status.reason or _NO_REASON
+        if status.state == "DONE":
             self.outcome = Outcome(
-                True, f"inserted {self.insertion * 1e3:.1f} mm in {values.get('step')} steps"
+                True, f"inserted {self.insertion * 1e3:.1f} mm in {status.step} steps"
             )
-        elif state == "FAULT":
-            self._end(f"plane_controller FAULT: {_why(values)}")
-        elif state == "IDLE":
-            self._end(f"plane_controller stopped: {_why(values)}")
+        elif status.state == "FAULT":
+            self._end(f"plane_controller FAULT: {why}")
+        elif status.state == "IDLE":
+            self._end(f"plane_controller stopped: {why}")
 
     def _called(self, call: ServiceCall) -> bool:
         """Tell whether `call` has been made and its success is not known yet."""
@@ -266,7 +267,7 @@ class OperatorSequence:
             if now >= self._deadline:
                 self._end(f"the rig is not ready after {self._wait_timeout:g} s: {self.hangs()}")
         elif now >= self._progress_at + self._stall_timeout:
-            state = self._progress[0] if self._progress else "silent"
+            state = self._progress[0] or "silent"
             why = f": {self.waits_because}" if self.waits_because else ""
             self._end(
                 f"no progress for {self._stall_timeout:g} s at {self.insertion * 1e3:.1f} mm "
@@ -295,15 +296,3 @@ class OperatorSequence:
     def _end(self, reason: str) -> None:
         if self.outcome is None:
             self.outcome = Outcome(False, reason, prepared=self._prepared == len(PREPARATION))
-
-
-def _why(values: Mapping[str, str]) -> str:
-    return values.get("reason") or values.get("fault") or "no reason given"
-
-
-def _number(text: str | None) -> float | None:
-    try:
-        number = float(text) if text else math.nan
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None

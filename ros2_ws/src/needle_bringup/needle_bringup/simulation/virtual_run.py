@@ -21,10 +21,10 @@ from needle_core.component import Action, Component, Exit, Output, Publish
 from needle_core.errors import UserError
 from needle_core.files.calibration_text import read_calibration
 from needle_core.files.installed import find_shared
-from needle_core.messages import Status
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, Compute, VirtualRunner, uniform
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import Parameters
+from needle_core.status_messages import ControllerStatus
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
 
@@ -182,12 +182,11 @@ class _ProgressTap:
         self._progress = progress
 
     def __call__(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
-        if output.topic == STATUS and isinstance(message, Status):
-            values = message.values
-            if values["state"] in ("STEERING", "WAITING_FOR_TIP", "DONE"):
-                self._progress.show(float(values["insertion_m"]), float(values["depth_m"]))
-            waits = values["state"] == "WAITING_FOR_TIP"
-            self._progress.tell_wait(values["reason"] if waits else "")
+        if output.topic == STATUS and isinstance(message, ControllerStatus):
+            if message.state in ("STEERING", "WAITING_FOR_TIP", "DONE") and message.depth_m:
+                self._progress.show(message.insertion_m, message.depth_m)
+            waits = message.state == "WAITING_FOR_TIP"
+            self._progress.tell_wait(message.reason if waits else "")
 
     def close(self, line: str) -> None:
         self._progress.close(line)

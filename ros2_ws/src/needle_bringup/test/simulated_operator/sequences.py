@@ -1,11 +1,14 @@
 """An operator of a simulated device, and what it hears."""
 
+import dataclasses
+
 from needle_bringup.simulated_operator.operator_sequence import (
     PREPARATION,
     OperatorSequence,
     Outcome,
     ServiceCall,
 )
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 CONFIRM = PREPARATION[0]
 DISABLED = {"homed": "true", "state": "DISABLED"}
@@ -16,12 +19,13 @@ def fresh() -> OperatorSequence:
     sequence = OperatorSequence(0.0, "simulated_operator", wait_timeout=30.0, stall_timeout=60.0)
     sequence.see_devices(["/sim_rig"])
     see(sequence, {}, 0.0)
-    sequence.see_controller({"state": "IDLE", "starts": "0"}, 0.0)
+    sequence.see_controller(ControllerStatus(state="IDLE", starts=0), 0.0)
     return sequence
 
 
 def see(sequence: OperatorSequence, values: dict[str, str], now: float) -> None:
-    sequence.see_device({"simulated": "true"} | values, "/sim_rig", now)
+    status = DeviceStatus.parse({"simulated": "true"} | values)
+    sequence.see_device(dataclasses.replace(status, source="/sim_rig"), now)
 
 
 def outcome(sequence: OperatorSequence) -> Outcome | None:
@@ -46,9 +50,10 @@ def prepare(sequence: OperatorSequence, now: float = 1.0) -> list[ServiceCall]:
     return calls
 
 
-def steering(**values: str) -> dict[str, str]:
+def steering(**values: str) -> ControllerStatus:
     said = {"state": "STEERING", "step": "3", "insertion_m": "0.003", "depth_m": "0.12"}
-    return said | {"starts": "1"} | values
+    status: ControllerStatus = ControllerStatus.parse(said | {"starts": "1"} | values)
+    return status
 
 
 def reach(wanted: ServiceCall) -> OperatorSequence:

@@ -7,6 +7,7 @@ from needle_bringup.simulated_operator.operator_sequence import (
     OperatorSequence,
     ServiceCall,
 )
+from needle_core.status_messages import DeviceStatus
 
 from .sequences import CONFIRM, DISABLED, answer, fresh, outcome, prepare, reach, see, steering
 
@@ -193,7 +194,8 @@ def test_a_device_that_is_real_ends_it_whenever_it_is_heard(prepared: int) -> No
     see(sequence, {"homed": "true"}, 1.0)
     for _ in range(prepared):
         answer(sequence)
-    sequence.see_device({"homed": "true", "simulated": "false"}, "/device_driver", 1.0)
+    status = DeviceStatus(source="/device_driver", homed=True, simulated=False)
+    sequence.see_device(status, 1.0)
     assert sequence.outcome is not None
     assert "/device_driver is a real device" in sequence.outcome.reason
     assert sequence.next_call(2.0) is None

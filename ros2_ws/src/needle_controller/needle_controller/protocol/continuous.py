@@ -23,14 +23,14 @@ from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceReport,
-    Log,
     SendPath,
     SendStep,
     StartReply,
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import AcceptedTip
+from needle_core.component import Log
+from needle_core.status_messages import DeviceStatus
 
 _AS_GOOD_AS_A_STEP = 1.0 - 1e-3
 _AT_END = 1e-5
@@ -140,7 +140,7 @@ class ContinuousSteering(Steering):
     def on_recorded_step(self, stamp_ns: int, end: JointSample) -> None:
         """Do nothing: a path depends on joints, not on where the one before has led."""
 
-    def on_device(self, status: DeviceReport) -> list[Action]:
+    def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
         actions = super().on_device(status)
         if self._steering and self.awaiting is Awaiting.TIP and not status.hold_owner:

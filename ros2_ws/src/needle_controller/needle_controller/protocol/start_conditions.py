@@ -9,7 +9,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.next_step import DEPTH_TOLERANCE
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_controller.protocol.steering_types import DeviceReport
+from needle_core.status_messages import DeviceStatus
 
 _SAME_INSERTION, _SAME_ROTATION = 5e-5, 2e-2
 
@@ -22,7 +22,7 @@ class Situation:
     ----------
     steering : bool
         Whether it is steering already.
-    device : DeviceReport or None
+    device : DeviceStatus or None
         What the driver last said.
     joints : JointSample or None
         Where the joints are.
@@ -31,7 +31,7 @@ class Situation:
     """
 
     steering: bool
-    device: DeviceReport | None
+    device: DeviceStatus | None
     joints: JointSample | None
     withdrawal: str
 
@@ -64,13 +64,13 @@ def obstacle(situation: Situation, control: PlaneControl, settings: SteeringSett
     if not _agree(device, joints):
         return (
             f"waiting for joint_states to say what the device does ({joints.insertion:.4g} m, "
-            f"{joints.rotation:.4g} rad; the device {device.insertion:.4g} m, "
-            f"{device.rotation:.4g} rad)"
+            f"{joints.rotation:.4g} rad; the device {device.insertion_m:.4g} m, "
+            f"{device.rotation_rad:.4g} rad)"
         )
     return situation.withdrawal or _needle_obstacle(joints, control, settings)
 
 
-def _device_obstacle(device: DeviceReport | None) -> str:
+def _device_obstacle(device: DeviceStatus | None) -> str:
     if device is None:
         return "no device/status has come"
     if device.state == "MOVING":
@@ -82,11 +82,11 @@ def _device_obstacle(device: DeviceReport | None) -> str:
     return ""
 
 
-def _agree(device: DeviceReport, joints: JointSample) -> bool:
+def _agree(device: DeviceStatus, joints: JointSample) -> bool:
     """Return whether the joints are where the device has them: not those of a motion before."""
-    if device.insertion is None or device.rotation is None:
+    if device.insertion_m is None or device.rotation_rad is None:
         return True
-    there = JointSample(joints.stamp_ns, device.insertion, device.rotation)
+    there = JointSample(joints.stamp_ns, device.insertion_m, device.rotation_rad)
     return joints.is_at(there, _SAME_INSERTION, _SAME_ROTATION)
 
 

@@ -21,18 +21,22 @@ from needle_controller.protocol.start_conditions import Situation, is_out, obsta
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    DeviceReport,
-    Log,
     PublishUpdate,
     SendStep,
     StartReply,
     SteeringState,
 )
 from needle_controller.protocol.step_watch import FailedSteps, Followed, StepWatch
-from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import AcceptedTip, RefusedTip, TipMeasurement
+from needle_controller.protocol.tip_gate import (
+    AcceptedTip,
+    RefusedTip,
+    TipCovariance,
+    TipMeasurement,
+)
 from needle_controller.protocol.tip_intake import TipIntake
 from needle_controller.protocol.trust import Trust, trust_of
+from needle_core.component import Log
+from needle_core.status_messages import DeviceStatus
 
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
 _DISABLED_DEVICE = ("UNCONFIGURED", "DISABLED")
@@ -87,7 +91,7 @@ class Steering:
         self.trust = Trust()
         self.intake = TipIntake()
         self._retraction = RetractionWatch()
-        self._device: DeviceReport | None = None
+        self._device: DeviceStatus | None = None
         self._ready_step: SendStep | None = None
         self._sent: SendStep | None = None
         self._followed: StepWatch | None = None
@@ -148,7 +152,7 @@ class Steering:
 
     def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
         """Take what a tip's source says of how well it knows the tip of the same stamp."""
-        self.intake.covariances.add(covariance)
+        self.intake.covariances.append(covariance)
         return self._use_tip()
 
     def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:
@@ -178,7 +182,7 @@ class Steering:
         if self._sent is not None:
             self._sent = SendStep(stamp_ns, end.insertion, end.rotation, self._sent.duration)
 
-    def on_device(self, status: DeviceReport) -> list[Action]:
+    def on_device(self, status: DeviceStatus) -> list[Action]:
         """Take the driver's state."""
         if not status.hold_owner:
             # Who lets go has not made a command fail, and who presses anew has looked.
@@ -188,7 +192,7 @@ class Steering:
         if not self._steering:
             return actions
         if status.state in _STOPPED_DEVICE:
-            why = f"device is {status.state}: {status.reason}"
+            why = f"device is {status.state}: {status.why}"
             return actions + self._leave(SteeringState.FAULT, why, "error")
         if status.state in _DISABLED_DEVICE:
             return actions + self._leave(SteeringState.IDLE, f"device is {status.state}", "warning")

@@ -6,6 +6,7 @@ import dataclasses
 import enum
 
 from needle_controller.protocol.plane_control import ControlUpdate
+from needle_core.component import Log
 
 
 class SteeringState(enum.Enum):
@@ -29,26 +30,6 @@ class Awaiting(enum.Enum):
 
 
 @dataclasses.dataclass(frozen=True)
-class DeviceReport:
-    """The driver's report on itself.
-
-    Attributes
-    ----------
-    state, homed, hold_owner, reason : str, bool, str, str
-        As in `device/status`.
-    insertion, rotation : float or None
-        Where it has the joints [m], [rad]; None where it does not say.
-    """
-
-    state: str
-    homed: bool
-    hold_owner: str
-    reason: str = ""
-    insertion: float | None = None
-    rotation: float | None = None
-
-
-@dataclasses.dataclass(frozen=True)
 class SendStep:
     """Send one trajectory point.
 
@@ -66,11 +47,6 @@ class SendStep:
     insertion: float
     rotation: float
     duration: float
-
-    @property
-    def points(self) -> tuple[tuple[float, float, float], ...]:
-        """Its one point, as `SendPath` has several."""
-        return ((self.insertion, self.rotation, self.duration),)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,15 +72,6 @@ class PublishUpdate:
 
     stamp_ns: int
     update: ControlUpdate
-
-
-@dataclasses.dataclass(frozen=True)
-class Log:
-    """Say something; `severity` is info, warning or error, `kind` throttles repetitions."""
-
-    severity: str
-    text: str
-    kind: str = ""
 
 
 Action = SendStep | SendPath | PublishUpdate | Log

@@ -7,20 +7,22 @@ import numpy as np
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import (
-    Action,
-    Awaiting,
-    DeviceReport,
-    Log,
-    SendStep,
-    SteeringState,
-)
+from needle_controller.protocol.steering_types import Action, Awaiting, SendStep, SteeringState
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core.component import Log
+from needle_core.status_messages import DeviceStatus
 
 TICK = 20_000_000
-HELD = DeviceReport("HOLDING", True, "operator")
-MOVING = DeviceReport("MOVING", True, "operator")
-FREE = DeviceReport("HOLDING", True, "")
+
+
+def device(state: str, homed: bool, hold_owner: str, reason: str = "") -> DeviceStatus:
+    """Return a device/status."""
+    return DeviceStatus(state=state, homed=homed, hold_owner=hold_owner, reason=reason)
+
+
+HELD = device("HOLDING", True, "operator")
+MOVING = device("MOVING", True, "operator")
+FREE = device("HOLDING", True, "")
 
 
 class Rig:

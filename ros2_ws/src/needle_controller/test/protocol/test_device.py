@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
+from needle_controller.protocol.steering_types import Awaiting, SteeringState
 from needle_controller.protocol.step_watch import MOST_REFUSALS
+from needle_core.status_messages import DeviceStatus
 
-from .rig import FREE, HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
+from .rig import FREE, HELD, MOVING, TICK, Rig, device, logged, none_sent, sent, where
 
 
 def test_a_lost_answer_ends_in_a_fault_and_moves_nothing() -> None:
@@ -103,13 +104,13 @@ def test_stop_and_start_go_on_with_what_is_known() -> None:
 @pytest.mark.parametrize(
     ("device", "state"),
     [
-        (DeviceReport("FAULT", True, "", "following error"), SteeringState.FAULT),
-        (DeviceReport("ESTOPPED", True, "", "pressed"), SteeringState.FAULT),
-        (DeviceReport("DISABLED", True, ""), SteeringState.IDLE),
-        (DeviceReport("UNCONFIGURED", False, ""), SteeringState.IDLE),
+        (device("FAULT", True, "", "following error"), SteeringState.FAULT),
+        (device("ESTOPPED", True, "", "pressed"), SteeringState.FAULT),
+        (device("DISABLED", True, ""), SteeringState.IDLE),
+        (device("UNCONFIGURED", False, ""), SteeringState.IDLE),
     ],
 )
-def test_a_device_that_stops_ends_steering(device: DeviceReport, state: SteeringState) -> None:
+def test_a_device_that_stops_ends_steering(device: DeviceStatus, state: SteeringState) -> None:
     rig = Rig()
     step = sent(rig.expose())
     actions = rig.steering.on_device(device)

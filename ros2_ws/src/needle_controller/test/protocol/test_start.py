@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from needle_controller.protocol.steering import Steering
-from needle_controller.protocol.steering_types import Awaiting, DeviceReport, SteeringState
+from needle_controller.protocol.steering_types import Awaiting, SteeringState
+from needle_core.status_messages import DeviceStatus
 
-from .rig import HELD, MOVING, Rig, sent, where
+from .rig import HELD, MOVING, Rig, device, sent, where
+
+ELSEWHERE = replace(device("HOLDING", True, ""), insertion_m=0.0, rotation_rad=0.0)
 
 
 @pytest.mark.parametrize(
     ("device", "said"),
     [
         (None, "device/status"),
-        (DeviceReport("HOLDING", False, ""), "not homed"),
-        (DeviceReport("DISABLED", True, ""), "not enabled"),
-        (DeviceReport("ESTOPPED", True, ""), "not enabled"),
+        (device("HOLDING", False, ""), "not homed"),
+        (device("DISABLED", True, ""), "not enabled"),
+        (device("ESTOPPED", True, ""), "not enabled"),
     ],
 )
-def test_start_says_why_not(device: DeviceReport | None, said: str) -> None:
+def test_start_says_why_not(device: DeviceStatus | None, said: str) -> None:
     rig = Rig(started=False)
     rig.steering._device = device
     reply, _ = rig.steering.on_start()
@@ -77,11 +81,11 @@ def test_tips_move_nothing_while_idle() -> None:
     ("device", "said"),
     [
         (MOVING, "waiting for the device, which moves"),
-        (DeviceReport("MOVING", False, ""), "waiting for the device, which moves"),
-        (DeviceReport("HOLDING", True, "", "", 0.0, 0.0), "waiting for joint_states"),
+        (device("MOVING", False, ""), "waiting for the device, which moves"),
+        (ELSEWHERE, "waiting for joint_states"),
     ],
 )
-def test_a_start_waits_for_the_end_of_homing(device: DeviceReport, said: str) -> None:
+def test_a_start_waits_for_the_end_of_homing(device: DeviceStatus, said: str) -> None:
     """The joints lag behind the device: homing has ended there, and not here."""
     rig = Rig(started=False, insertion=0.0015)
     rig.steering.on_device(device)
@@ -90,7 +94,7 @@ def test_a_start_waits_for_the_end_of_homing(device: DeviceReport, said: str) ->
     assert reply.message.startswith(said)
     rig.insertion = 0.0
     rig.settle()
-    rig.steering.on_device(DeviceReport("HOLDING", True, "operator", "", 0.0, 0.0))
+    rig.steering.on_device(replace(ELSEWHERE, hold_owner="operator"))
     assert rig.steering.on_start()[0].success
     sent(rig.expose())
 

@@ -12,7 +12,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_core.ros.conversions import to_diagnostic_status, to_nanoseconds, to_stamp
 from needle_device_driver.axes.axis_pair import PairSnapshot
-from needle_device_driver.device import device_diagnostic
+from needle_device_driver.device import device_status
 from needle_device_driver.supervisor.command import (
     INSERTION_JOINT,
     ROTATION_JOINT,
@@ -68,4 +68,6 @@ def to_result(result: StepResult) -> Header:
 
 def to_status(status: DeviceStatus, signature: str) -> DiagnosticStatus:
     """Return the device's status as the message of device/status."""
-    return to_diagnostic_status(f"{signature}: device", signature, device_diagnostic(status))
+    return to_diagnostic_status(
+        f"{signature}: device", signature, device_status(status, signature).diagnostic
+    )

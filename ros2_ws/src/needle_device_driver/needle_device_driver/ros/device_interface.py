@@ -28,7 +28,7 @@ from needle_core.ros.conversions import (
     to_stamp,
 )
 from needle_core.ros.discovery import publishers_of, signature
-from needle_device_driver.device import device_diagnostic
+from needle_device_driver.device import device_status
 from needle_device_driver.ros.conversions import (
     to_command,
     to_hold_message,
@@ -198,7 +198,7 @@ class DeviceInterface:
         told = self._told
         self._told, self._told_at = status, now
         self.statuses.publish(to_status(status, signature(self._node)))
-        self._diagnostics.set("device", device_diagnostic(status))
+        self._diagnostics.set("device", device_status(status, "").diagnostic)
         if told is None or told.state is not status.state:
             why = f" ({status.reason})" if status.reason else ""
             self._node.get_logger().debug(f"device: {status.state.value}{why}")

@@ -14,20 +14,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from needle_controller.plane_controller import trajectory
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import (
     Action,
-    DeviceReport,
     SendPath,
     SendStep,
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core.status_messages import DeviceStatus
 from needle_device_driver.supervisor.command import (
-    INSERTION_JOINT,
-    ROTATION_JOINT,
     Command,
     CommandPoint,
 )
@@ -209,7 +208,12 @@ class SteeredNeedle:
         status = self.device.status(self.time_ns * 1e-9)
         self._do(
             self.steering.on_device(
-                DeviceReport(status.state.value, status.homed, status.hold_owner, status.reason)
+                DeviceStatus(
+                    state=status.state.value,
+                    homed=status.homed,
+                    hold_owner=status.hold_owner,
+                    reason=status.reason,
+                )
             )
         )
 
@@ -228,8 +232,6 @@ def rms_at_end(needle: SteeredNeedle, offset: float, length: float = 0.02) -> fl
 
 
 def _command(action: SendStep | SendPath) -> Command:
-    return Command(
-        action.stamp_ns,
-        (INSERTION_JOINT, ROTATION_JOINT),
-        tuple(CommandPoint((at, rotation), (), time) for at, rotation, time in action.points),
-    )
+    sent = trajectory(action)
+    points = tuple(CommandPoint(p.positions, p.others, p.time_from_start) for p in sent.points)
+    return Command(sent.stamp_ns, sent.joint_names, points)

@@ -1,0 +1,32 @@
+"""Key-values of device and controller, as foreign nodes may send them."""
+
+import pytest
+
+from needle_core.status_messages import ControllerStatus, DeviceStatus
+
+
+def test_keys_have_the_units_of_the_documents() -> None:
+    status = DeviceStatus(state="HOLDING", homed=True, insertion_m=0.01, speed_scale=1 / 3)
+    assert status.values["homed"] == "true"
+    assert status.values["insertion_m"] == "0.01"
+    assert status.values["rotation_rad"] == ""
+    assert status.values["speed_scale"] == "0.333"
+    assert "source" not in status.values
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "two", "", "1, 2", "1e999"])
+def test_what_cannot_be_read_keeps_its_default(text: str) -> None:
+    keys = ("starts", "insertion_m", "depth_m", "target_point_m", "r1_low_m", "reachable_depth_m")
+    assert ControllerStatus.parse(dict.fromkeys(keys, text)) == ControllerStatus()
+    assert DeviceStatus.parse({"insertion_m": text}) == DeviceStatus()
+
+
+def test_simulated_is_true_only_where_it_is_said() -> None:
+    said = {text: DeviceStatus.parse({"simulated": text}).simulated for text in ("true", "", "yes")}
+    assert said == {"true": True, "": None, "yes": False}
+
+
+def test_keys_of_others_are_left_out() -> None:
+    assert DeviceStatus.parse({"state": "MOVING", "text": "x", "colour": "blue"}) == DeviceStatus(
+        state="MOVING"
+    )
