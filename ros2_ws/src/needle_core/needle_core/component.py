@@ -40,7 +40,7 @@ class Delivery:
     Attributes
     ----------
     depth : int
-        Messages that wait while the receiver is busy; of an unreliable topic the oldest goes.
+        Messages that wait while the receiver is busy; where there is no room the oldest goes.
     reliable : bool
         Whether a message that is sent arrives.
     latched : bool
@@ -262,6 +262,10 @@ class Component:
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Handle a change of what is known of other components."""
+        return ()
+
+    def on_settings(self, settings: Any, at: Moment) -> Actions:
+        """Take changed settings."""
         return ()
 
     def on_stop(self, at: Moment) -> Actions:
