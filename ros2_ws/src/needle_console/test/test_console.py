@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_console.console import PAGE, Console, Hand, PageEvent, View, image_topic
+from needle_console.console import PAGE, Console, Hand, Lag, PageEvent, View, image_topic
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.page.desk import Desk
@@ -252,6 +252,19 @@ def test_targets_and_images_go_through(scene: Scene) -> None:
     assert views[-1].side == "left"
     # What pads a row is left out.
     assert views[-1].image.tolist() == [[0, 1, 2], [4, 5, 6]]
+
+
+def test_a_simulation_that_lags_is_named_while_it_does(scene: Scene) -> None:
+    for seconds in (0.0, 0.01, 1.0):
+        assert scene.page.snapshot.troubles == ()
+        scene.page.wishes = [Lag(seconds)]
+        scene.forward(0.3)
+    (text,) = scene.page.snapshot.troubles
+    assert "1.0 s behind the clock" in text
+    # It lags no more than it did.
+    scene.page.wishes = [Lag(1.0)]
+    scene.forward(5.0)
+    assert scene.page.snapshot.troubles == ()
 
 
 # ---- the desk, with its own clock ---------------------------------------------------------------

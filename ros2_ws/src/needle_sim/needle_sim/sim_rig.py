@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from needle_core import messages as m
 from needle_core.component import (
@@ -22,7 +23,7 @@ from needle_core.rotations import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus
 from needle_sim.devices import CYCLE, make_device
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.sensors import RIG, make_sensor
+from needle_sim.sensors import RIG, Sensor, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 _IDLE_EXPOSURE_PERIOD = 1.0
@@ -36,11 +37,17 @@ class SimRig(Component):
     ----------
     settings : SimRigParameters
         The node's parameters.
+    see : callable
+        Makes what sees the needle, of bench and settings.
     """
 
     name = "sim_rig"
 
-    def __init__(self, settings: SimRigParameters) -> None:
+    def __init__(
+        self,
+        settings: SimRigParameters,
+        see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+    ) -> None:
         self.settings = settings
         self._bench = SimulatedBench(
             curvature=settings.curvature,
@@ -54,7 +61,7 @@ class SimRig(Component):
         self._device = make_device(
             self._bench, self.name, level=settings.level, limits=settings.limits
         )
-        self._sensor = make_sensor(self._bench, settings)
+        self._sensor = see(self._bench, settings)
         self._ended = ""
         self._is_tip_wanted = False
         self._exposures = 0

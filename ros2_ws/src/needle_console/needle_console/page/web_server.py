@@ -114,7 +114,13 @@ class ConsoleServers:
         self._hold = HoldServer(access, settings.hold_port, desk.hold, desk.notice)
         desk.refused = self._hold.counts
         link = HoldLink(settings.hold_port, settings.token())
-        self._web = WebServer(desk, access, address=settings.address, port=settings.port, hold=link)
+        try:
+            self._web = WebServer(
+                desk, access, address=settings.address, port=settings.port, hold=link
+            )
+        except UserError:
+            self._hold.close()
+            raise
 
     def start(self) -> None:
         """Begin to serve."""
@@ -133,6 +139,8 @@ def _listen(address: str, port: int) -> socket.socket:
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listening.bind((address, port))
+        # Whoever comes before the server has begun waits, and is not refused.
+        listening.listen()
     except OSError as error:
         listening.close()
         raise UserError(f"cannot listen on {address}:{port}: {error.strerror}") from error
