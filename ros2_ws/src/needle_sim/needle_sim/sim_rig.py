@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
@@ -24,7 +25,7 @@ from needle_core.rotations import quaternion_from_rotation
 from needle_core.status_messages import ControllerStatus
 from needle_sim.devices import CYCLE, make_device
 from needle_sim.rig.bench import SimulatedBench
-from needle_sim.sensors import RIG, make_sensor
+from needle_sim.sensors import RIG, Sensor, make_sensor
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 _IDLE_EXPOSURE_PERIOD = 1.0
@@ -40,11 +41,18 @@ class SimRig(Component):
         The node's parameters.
     name : str
         Full name of the node.
+    see : callable
+        Makes what sees the needle, of bench and settings.
     """
 
     name = "sim_rig"
 
-    def __init__(self, settings: SimRigParameters, name: str = name) -> None:
+    def __init__(
+        self,
+        settings: SimRigParameters,
+        name: str = name,
+        see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+    ) -> None:
         self.name, self.settings = name, settings
         self._bench = SimulatedBench(
             curvature=settings.curvature,
@@ -58,7 +66,7 @@ class SimRig(Component):
         self._device = make_device(
             self._bench, self.name, level=settings.level, limits=settings.limits
         )
-        self._sensor = make_sensor(self._bench, settings)
+        self._sensor = see(self._bench, settings)
         self._ended = ""
         self._is_tip_wanted = False
         self._exposures = 0

@@ -239,7 +239,7 @@ def test_a_needle_that_leaves_the_phantom_ends_the_run() -> None:
     assert (left.frame_id, right.frame_id) == ("left_camera_optical", "right_camera_optical")
     assert (left.encoding, left.step, len(left.data)) == ("mono8", 1024, 1024 * 768)
     assert bytes(left.data) != bytes(right.data)
-    outcomes = []
+    outcomes: list[str] = []
     while not outcomes or outcomes[-1] == "succeeded":
         outcomes.append(bench.step(0.002, 0.0))
     assert 5 < len(outcomes) < 12

@@ -1,39 +1,29 @@
-"""A simulated rig in real time and the console's page on it: what scripts/console runs. No ROS."""
+"""A simulated rig in real time and the console's page on it, in one process: scripts/console."""
 
 from __future__ import annotations
 
+import contextlib
 import os
-import socket
 import sys
-import tempfile
+import threading
 from collections.abc import Sequence
 from pathlib import Path
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING
 
 from needle_bringup.simulation.console_options import ConsoleOptions, parse_console
-from needle_bringup.simulation.node_process import NodeProcess, stop, wait_for
-from needle_bringup.simulation.rig_configuration import (
-    PACKAGES,
-    command_line_parameters,
-    write_parameters,
-)
-from needle_bringup.simulation.simulate import ROS_ARGUMENTS
+from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
-from needle_core.errors import UserError
-from needle_core.files.installed import find_executable
 from needle_core.process.end_request import EndRequest
-from needle_core.process.reach import settle_environment
-from needle_core.process.ros_domain import own_domain
 from needle_core.settings.parameter_files import Parameters
 
+if TYPE_CHECKING:
+    from needle_core.component import Component
+    from needle_core.runners.paced import Outside
+
 LOOPBACK = "127.0.0.1"
-_POLL = 0.1
-# The rest of what `simulate` runs records, or stands in for the person.
-_RIG = ("sim_rig", "drive_emulator", "device_driver", "stereo_tracker", "plane_controller")
-_CONSOLE = "console"
-_PARAMETERS = "parameters.yaml"
-# As often as a page shows them: to draw and track more leaves two cores no time for the hold [Hz].
+# As often as a page shows them [Hz].
 _CAMERA_RATE = 10.0
+_SLICE = 0.2
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -53,101 +43,71 @@ def console(options: ConsoleOptions) -> int:
     Returns
     -------
     int
-        130 after a signal, 1 where a node ended before.
+        130 after a signal, 1 where a component ended before.
 
     Raises
     ------
     UserError
         Where something is missing or a port is taken.
     """
-    settle_environment(own_graph=True)
-    for port in (options.port, options.port + 1):
-        _refuse_taken(port)
-    parameters = console_parameters(options)
-    packages = {**PACKAGES, _CONSOLE: "needle_console"}
-    executables = {node: find_executable(packages[node], node) for node in parameters}
-    with (
-        EndRequest(None) as end,
-        own_domain() as domain,
-        tempfile.TemporaryDirectory(prefix="needle_console_") as folder,
-    ):
-        write_parameters(Path(folder, _PARAMETERS), parameters)
-        nodes: list[NodeProcess] = []
-        try:
-            for name, executable in executables.items():
-                nodes.append(_start(name, executable, Path(folder), domain))
-            return _watch(nodes, f"http://{LOOPBACK}:{options.port}/", domain, end)
-        finally:
-            _stop(nodes)
+    # Small matrices: threads only get in each other's way. It counts for what is loaded from here.
+    os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
+    from needle_console.console import PAGE, Console  # noqa: PLC0415
+    from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
+    from needle_console.page.desk import Desk  # noqa: PLC0415
+    from needle_console.page.web_server import ConsoleServers  # noqa: PLC0415
+    from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
+
+    settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
+    bell = threading.Event()
+    with EndRequest(None) as end, contextlib.ExitStack() as stack:
+        desk = Desk(settings.calibration_file, bell.set)
+        servers = ConsoleServers(desk, settings)
+        rig, outside = _rig(rig_parameters(options), bell, stack)
+        runner = PacedRunner(
+            [*rig, Console(settings)],
+            options.rig.seed,
+            outside={PAGE: desk, **outside},
+            bell=bell,
+        )
+        servers.start()
+        # First of all: nobody holds any more.
+        stack.callback(servers.close)
+        print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
+        while not end.wanted:
+            if runner.run(_SLICE):
+                (name, ended), *_ = runner.exits.items()
+                print(f"error: {name} ended: {ended.text}", file=sys.stderr)
+                return EXIT_MISSED
+            desk.note_lag(runner.lag)
+        return EXIT_INTERRUPTED
 
 
-def console_parameters(options: ConsoleOptions) -> Parameters:
-    """Return the parameters of each node that runs."""
-    rig = command_line_parameters(options.rig, Path())
-    parameters = {node: values for node, values in rig.items() if node in _RIG}
-    for values in parameters.values():
-        values.pop("wait_for_recorder", None)
+def rig_parameters(options: ConsoleOptions) -> Parameters:
+    """Return the parameters of the rig, by its nodes' names."""
+    parameters = command_line_parameters(options.rig, Path())
     parameters["sim_rig"]["camera_rate"] = _CAMERA_RATE
-    ports = {"port": options.port, "hold_port": options.port + 1}
-    return {**parameters, _CONSOLE: {"address": LOOPBACK, **ports}}
+    return parameters
 
 
-def _start(name: str, executable: str, folder: Path, domain: int) -> NodeProcess:
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(domain),
-        "PYTHONUNBUFFERED": "1",
-        # Small matrices: threads only get in the way of the other nodes.
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    return NodeProcess(
-        name,
-        [executable, *ROS_ARGUMENTS, "--params-file", str(folder / _PARAMETERS)],
-        environment=environment,
-        log=folder / f"{name}.log",
+def _rig(
+    parameters: Parameters, bell: threading.Event, stack: contextlib.ExitStack
+) -> tuple[list[Component], dict[str, Outside]]:
+    """Return the rig, and what is outside of this process; `stack` ends that."""
+    from needle_bringup.simulation.virtual_run import make_rig  # noqa: PLC0415
+
+    if parameters["sim_rig"]["level"] == "tip":
+        return make_rig(parameters), {}
+    from needle_bringup.simulation.vision import (  # noqa: PLC0415
+        EYES,
+        DistantTracker,
+        EyesProcess,
     )
+    from needle_sim.camera_sensor import DistantCameras  # noqa: PLC0415
 
-
-def _watch(nodes: Sequence[NodeProcess], address: str, domain: int, end: EndRequest) -> int:
-    """Print the address once somebody answers there; return when a signal or a node's end comes."""
-    port = urlsplit(address).port or 0
-    told = False
-    while not end.wanted:
-        if not told and _answers(port):
-            told = True
-            print(f"{address}   (ROS_DOMAIN_ID {domain}; Ctrl-C ends all)", flush=True)
-        dead = next((node for node in nodes if node.exit_code is not None), None)
-        # Others may end on the same signal.
-        if dead is not None and not end.wanted:
-            print(f"error: {dead.describe_end()}", file=sys.stderr)
-            return EXIT_MISSED
-        wait_for(nodes[:1], _POLL)
-    return EXIT_INTERRUPTED
-
-
-def _stop(nodes: Sequence[NodeProcess]) -> None:
-    """End the page, so that nobody holds; the driver before its drives; the rest."""
-    by_name = {node.name: node for node in nodes}
-    first = [by_name.pop(name) for name in (_CONSOLE, "device_driver") if name in by_name]
-    warnings = [line for node in first for line in stop([node])] + stop(by_name.values())
-    for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
-
-
-def _refuse_taken(port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((LOOPBACK, port))
-        except OSError as error:
-            raise UserError(f"port {port}: {error.strerror}; --port takes another") from error
-
-
-def _answers(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.settimeout(_POLL)
-        return probe.connect_ex((LOOPBACK, port)) == 0
+    eyes = EyesProcess(parameters, bell.set)
+    stack.callback(eyes.close)
+    return make_rig(parameters, DistantCameras, lambda _: DistantTracker()), {EYES: eyes}
 
 
 if __name__ == "__main__":

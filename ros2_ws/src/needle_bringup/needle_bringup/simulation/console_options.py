@@ -11,9 +11,9 @@ from needle_core.commands.options import CommandParser, join_start, whole_number
 DESCRIPTION = """\
 Steer a simulated needle by hand, in a browser, in real time.
 
-Starts sim_rig, stereo_tracker, plane_controller (at level drive also drive_emulator and
-device_driver) and the console as processes of their own, and prints the address to open. Nothing
-moves before you have pressed the buttons in their order; Ctrl-C ends all.
+Runs sim_rig, plane_controller (at level drive also drive_emulator and device_driver) and the
+console in one process, cameras and stereo_tracker in a second one, and prints the address to open.
+Nothing moves before you have pressed the buttons in their order; Ctrl-C ends all.
 """
 
 EPILOG = """\
@@ -25,7 +25,7 @@ examples:
   scripts/console --level drive --port 9000
       the device driver moves two emulated CANopen drives; page and hold on ports 9000 and 9001
 
-exit codes: 130 ended by Ctrl-C, 1 a node ended before, 2 bad input or something missing.
+exit codes: 130 ended by Ctrl-C, 1 a part of the rig ended before, 2 bad input or something missing.
 """
 
 # Options that mean what they mean for `simulate`.

@@ -6,8 +6,9 @@ import math
 import random
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from needle_bags.recording.bag_tap import BagTap
 from needle_bringup.simulated_operator.component import SimulatedOperator
@@ -19,13 +20,19 @@ from needle_core.can_frame import CAN
 from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
 from needle_core.component import Action, Component, Exit, Output, Publish
 from needle_core.errors import UserError
+from needle_core.runners.paced import PacedRunner
 from needle_core.runners.process import Compute, uniform
 from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import Parameters
 from needle_core.status_messages import ControllerStatus
+from needle_sim.rig.bench import SimulatedBench
+from needle_sim.sensors import Sensor, make_sensor
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
+
+if TYPE_CHECKING:
+    from needle_tracker.stereo_tracker import StereoTipTracker
 
 _FOLLOWING, _SEARCH = (0.03, 0.05), (0.3, 0.9)
 """Time that the tracker takes for a pair, with and without a tip, on two shared cores [s]."""
@@ -37,29 +44,48 @@ _OF_ADAPTER = ("pty",)
 
 
 def make_components(parameters: Parameters) -> list[Component]:
+    """Return the rig of a level and who operates it; errors as of `make_rig`."""
+    operator = settings_of(SimulatedOperatorParameters, parameters, "simulated_operator")
+    return [*make_rig(parameters), SimulatedOperator(operator)]
+
+
+def make_tracker(parameters: Parameters) -> StereoTipTracker:
+    """Return the tracker."""
+    # It brings OpenCV along: not where there are no images.
+    from needle_tracker import stereo_tracker  # noqa: PLC0415
+    from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
+
+    settings = settings_of(StereoTrackerParameters, parameters, "stereo_tracker")
+    return stereo_tracker.make_tracker(settings)
+
+
+def make_rig(
+    parameters: Parameters,
+    see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+    track: Callable[[Parameters], Component] = make_tracker,
+) -> list[Component]:
     """Return the rig of a level.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Node to its parameters.
+    see, track : callable
+        Make what sees the needle, and the tracker where there are images.
 
     Raises
     ------
     UserError
         A parameter that a component does not have, or that is out of its bounds.
     """
-    rig = SimRig(_settings(SimRigParameters, parameters, "sim_rig"))
+    rig = SimRig(settings_of(SimRigParameters, parameters, "sim_rig"), see=see)
+    level = rig.settings.level
     return [
         rig,
-        *(_make_drives(parameters) if rig.settings.level == "drive" else []),
-        *([] if rig.settings.level == "tip" else [_make_tracker(parameters)]),
-        PlaneController(_settings(SteeringSettings, parameters, "plane_controller")),
-        SimulatedOperator(_settings(SimulatedOperatorParameters, parameters, "simulated_operator")),
+        *(_make_drives(parameters) if level == "drive" else []),
+        *([] if level == "tip" else [track(parameters)]),
+        PlaneController(settings_of(SteeringSettings, parameters, "plane_controller")),
     ]
-
-
-def _make_tracker(parameters: Parameters) -> Component:
-    # It brings OpenCV along: not where there are no images.
-    from needle_tracker.answers.tracker_parameters import StereoTrackerParameters  # noqa: PLC0415
-    from needle_tracker.stereo_tracker import make_tracker  # noqa: PLC0415
-
-    return make_tracker(_settings(StereoTrackerParameters, parameters, "stereo_tracker"))
 
 
 def _make_drives(parameters: Parameters) -> list[Component]:
@@ -72,7 +98,7 @@ def _make_drives(parameters: Parameters) -> list[Component]:
     def settings(kind: type[Any], node: str, **own: str) -> Any:
         given = parameters.get(node, {}).items()
         values = {k: v for k, v in given if k not in _OF_ADAPTER}
-        return _settings(kind, {node: {**values, **own}}, node)
+        return settings_of(kind, {node: {**values, **own}}, node)
 
     driver = settings(DeviceDriverParameters, "device_driver", link="virtual", channel=CAN)
     return [
@@ -131,13 +157,8 @@ def run_virtually(
     """
     tap = BagTap(bag, components, (DIAGNOSTICS, LOG), run_info)
     progress = _ProgressTap(Progress(sys.stderr))
-    runner = VirtualRunner(
-        components,
-        seed,
-        compute=COMPUTE,
-        taps=(tap, progress),
-        real_time_factor=real_time_factor,
-    )
+    kind = partial(PacedRunner, pace=real_time_factor) if real_time_factor else VirtualRunner
+    runner = kind(components, seed, compute=COMPUTE, taps=(tap, progress))
     operator = SimulatedOperator.name
     try:
         while not runner.run(_SLICE):
@@ -162,7 +183,8 @@ def _judge(exits: Mapping[str, Exit], operator: str) -> None:
             raise UserError(f"{name} ended with exit code {ended.code}: {ended.text}")
 
 
-def _settings(kind: type[Any], parameters: Parameters, node: str) -> Any:
+def settings_of(kind: type[Any], parameters: Parameters, node: str) -> Any:
+    """Return a component's settings from the parameters of its node."""
     return from_values(kind, parameters.get(node, {}), node)
 
 

@@ -1,4 +1,4 @@
-"""The command line of `console`, and the nodes that it starts."""
+"""The command line of `console`, and the rig that it runs."""
 
 from __future__ import annotations
 
@@ -6,26 +6,15 @@ import socket
 
 import pytest
 
-from needle_bringup.simulation.console import console, console_parameters
+from needle_bringup.simulation.console import console, rig_parameters
 from needle_bringup.simulation.console_options import ConsoleOptions, parse_console
 from needle_core.errors import UserError
 
 
-def test_a_rig_runs_in_real_time_without_a_stand_in_or_a_recorder() -> None:
-    parameters = console_parameters(parse_console(["--level", "drive", "--port", "9000"]))
-    assert list(parameters) == [
-        "sim_rig",
-        "drive_emulator",
-        "device_driver",
-        "stereo_tracker",
-        "plane_controller",
-        "console",
-    ]
+def test_a_rig_is_steered_without_a_stop_and_seen_as_often_as_a_page_shows_it() -> None:
+    parameters = rig_parameters(parse_console(["--level", "drive"]))
     assert parameters["sim_rig"]["camera_rate"] == 10.0
     assert parameters["plane_controller"]["insertion"] == "continuous"
-    assert parameters["console"] == {"address": "127.0.0.1", "port": 9000, "hold_port": 9001}
-    for values in parameters.values():
-        assert "wait_for_recorder" not in values
 
 
 def test_options_of_the_rig_mean_what_they_mean_for_simulate() -> None:
@@ -51,11 +40,11 @@ def test_what_cannot_be_run_is_refused_in_one_line(words: list[str], complaint: 
 
 
 @pytest.mark.parametrize("which", [0, 1])
-def test_a_port_that_is_taken_is_told_before_a_node_starts(which: int) -> None:
+def test_a_port_that_is_taken_is_told_in_one_line(which: int) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = int(taken.getsockname()[1])
         options = ConsoleOptions(port - which, parse_console([]).rig)
-        with pytest.raises(UserError, match=f"port {port}: "):
+        with pytest.raises(UserError, match=f"{port}: Address already in use"):
             console(options)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 import itertools
 import random
-import time
 from collections.abc import Callable
 
 from needle_core.component import Moment
@@ -66,7 +65,9 @@ class Timeline:
         """Stamp of now [ns]."""
         return START_NS + self.clock_offset_ns + round(self.now * 1e9)
 
-    def run(self, seconds: float, ended: Callable[[], bool], real_time_factor: float) -> bool:
+    def run(
+        self, seconds: float, ended: Callable[[], bool], reach: Callable[[float], bool]
+    ) -> bool:
         """Run what is due, for some time [s] or until `ended`; return whether it has ended.
 
         Parameters
@@ -75,16 +76,14 @@ class Timeline:
             How long at most [s].
         ended : callable
             Asked after each event.
-        real_time_factor : float
-            Virtual over real time; 0: as fast as possible.
+        reach : callable
+            Takes the time of the next event [s], may wait for it, and returns False where another
+            may have come before it.
         """
-        end, wall, begin = self.now + seconds, time.monotonic(), self.now
-        heap = self._heap
+        end, heap = self.now + seconds, self._heap
         while heap and heap[0][0] <= end:
-            if real_time_factor > 0.0:
-                ahead = (heap[0][0] - begin) / real_time_factor - (time.monotonic() - wall)
-                if ahead > 0.0:
-                    time.sleep(ahead)
+            if not reach(heap[0][0]):
+                continue
             self.now, _, event = heapq.heappop(heap)
             event()
             if ended():

@@ -73,8 +73,6 @@ class VirtualRunner:
         Applied to each delivery, in order.
     taps : sequence of Tap
         Told of every publication.
-    real_time_factor : float
-        Virtual over real time; 0: as fast as possible.
 
     Attributes
     ----------
@@ -92,13 +90,11 @@ class VirtualRunner:
         compute: Mapping[str, Compute] | None = None,
         faults: Sequence[Fault] = (),
         taps: Sequence[Tap] = (),
-        real_time_factor: float = 0.0,
     ) -> None:
         self.timeline = Timeline(seed)
         self.exits: dict[str, Exit] = {}
         self._has_exited = False
         self._compute, self._taps = compute or {}, taps
-        self._real_time_factor = real_time_factor
         self._transport = Transport(self.timeline, faults)
         self._serial = itertools.count(1)
         self._calls: dict[int, tuple[Process, str]] = {}
@@ -114,7 +110,11 @@ class VirtualRunner:
     def run(self, seconds: float) -> bool:
         """Run until another component exits, or for `seconds`; return whether one did."""
         self._has_exited = False
-        return self.timeline.run(seconds, lambda: self._has_exited, self._real_time_factor)
+        return self.timeline.run(seconds, lambda: self._has_exited, self._reach)
+
+    def _reach(self, due: float) -> bool:
+        """Return whether the time of the next event has come: at once, in virtual time."""
+        return True
 
     # ---- what befalls components ----------------------------------------------------------------
 

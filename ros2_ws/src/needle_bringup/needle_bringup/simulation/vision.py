@@ -1,0 +1,167 @@
+"""Cameras and tracker of a simulated rig in a process of their own, behind a port."""
+
+from __future__ import annotations
+
+import ctypes
+import multiprocessing
+import signal
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from typing import Any, ClassVar
+
+from needle_bringup.simulation.virtual_run import make_tracker, settings_of
+from needle_core import messages as m
+from needle_core.component import (
+    LATCHED,
+    Action,
+    Actions,
+    Component,
+    Input,
+    Moment,
+    Output,
+    Port,
+    Send,
+    Timer,
+)
+from needle_core.errors import UserError
+from needle_core.settings.parameter_files import Parameters
+from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
+from needle_sim.sim_rig_parameters import SimRigParameters
+from needle_tracker.stereo_tracker import CALIBRATION, JOINT_STATES, TIP, TIP_POSE
+
+EYES = "eyes"
+"""Name of the port between the tracker's stand-in and the process that works."""
+_MOST_EXPOSURES = 2
+_CHECK_PERIOD = 0.05
+_PR_SET_PDEATHSIG = 1
+
+Item = Exposure | m.JointState | None
+"""What is handed on; None: time alone."""
+Done = Future[list[Action]]
+
+
+class Eyes:
+    """Cameras and tracker, in the process that works: what comes in, and what comes of it.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Node to its parameters.
+    """
+
+    here: ClassVar[Eyes]
+    """Those of this process."""
+
+    def __init__(self, parameters: Parameters) -> None:
+        self._cameras = StereoCameras(settings_of(SimRigParameters, parameters, "sim_rig"))
+        self._tracker = make_tracker(parameters)
+        self._handlers = {row.topic: row.handler for row in self._tracker.inputs}
+
+    @staticmethod
+    def open(parameters: Parameters) -> None:
+        """Make those of this process, which ends with its parent and not by a signal."""
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        Eyes.here = Eyes(parameters)
+
+    @staticmethod
+    def work(item: Item, at: Moment) -> list[Action]:
+        """Return what comes of an exposure, of joints, or of time alone."""
+        return list(Eyes.here.handle(item, at))
+
+    def handle(self, item: Item, at: Moment) -> Iterable[Action]:
+        """Return what comes of an exposure, of joints, or of time alone."""
+        match item:
+            case Exposure():
+                for image in self._cameras.render(item):
+                    yield image
+                    yield from self._handlers[image.topic](image.message, at)
+            case m.JointState():
+                yield from self._handlers["joint_states"](item, at)
+            case _:
+                yield from self._tracker.check(at)
+
+
+class EyesProcess:
+    """The process of `Eyes`: the outside of the port `eyes`.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Node to its parameters.
+    ring : callable
+        Called by any thread when something is done.
+    """
+
+    def __init__(self, parameters: Parameters, ring: Callable[[], None]) -> None:
+        self._ring = ring
+        self._done: deque[Done] = deque()
+        self._pool = ProcessPoolExecutor(
+            1, multiprocessing.get_context("spawn"), Eyes.open, (parameters,)
+        )
+
+    def take(self) -> Sequence[Done]:
+        """Return what is done."""
+        return [self._done.popleft() for _ in range(len(self._done))]
+
+    def send(self, batch: Sequence[Any]) -> None:
+        """Take work to do.
+
+        Raises
+        ------
+        UserError
+            The process has ended.
+        """
+        try:
+            for item, at in batch:
+                self._pool.submit(Eyes.work, item, at).add_done_callback(self._take)
+        except BrokenProcessPool as error:
+            raise UserError("the process that renders and tracks has ended") from error
+
+    def close(self) -> None:
+        """End it, whatever it does."""
+        self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def _take(self, done: Done) -> None:
+        self._done.append(done)
+        self._ring()
+
+
+class DistantTracker(Component):
+    """Stands for the tracker where that works in a process of its own, and for its images.
+
+    It hands on exposures, joint states and time, and sends what comes back. Exposures that come
+    faster than they are worked off are lost, as a camera loses frames.
+    """
+
+    name = "stereo_tracker"
+
+    def __init__(self) -> None:
+        # Of what is under way, in order: whether it is an exposure.
+        self._under_way: deque[bool] = deque()
+        self.inputs = (Input("joint_states", m.JointState, self._hand_on, JOINT_STATES),)
+        self.outputs = (
+            *StereoCameras.outputs,
+            Output(TIP, m.Point),
+            Output(TIP_POSE, m.PoseWithCovariance),
+            Output(CALIBRATION, m.Text, LATCHED),
+        )
+        self.ports = (Port(CAMERAS, self._on_exposures), Port(EYES, self._on_done))
+        self.timers = (Timer(_CHECK_PERIOD, partial(self._hand_on, None)),)
+
+    def _hand_on(self, item: Item, at: Moment) -> Actions:
+        self._under_way.append(isinstance(item, Exposure))
+        yield Send(EYES, ((item, at),))
+
+    def _on_exposures(self, batch: Sequence[Exposure], at: Moment) -> Actions:
+        for exposure in batch:
+            if sum(self._under_way) < _MOST_EXPOSURES:
+                yield from self._hand_on(exposure, at)
+
+    def _on_done(self, batch: Sequence[Done], at: Moment) -> Actions:
+        for done in batch:
+            self._under_way.popleft()
+            yield from done.result()
