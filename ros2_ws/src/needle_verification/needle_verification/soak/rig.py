@@ -1,0 +1,228 @@
+"""The rig on the virtual runner: the rig's own components, the bench, the person in front of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from needle_bringup.operator.component import Operator
+from needle_bringup.operator.parameters import OperatorParameters
+from needle_controller.plane_controller import PlaneController
+from needle_controller.presets.steering_settings import SteeringSettings
+from needle_core.can_frame import CAN
+from needle_core.component import Component, Output
+from needle_core.messages import HoldState, LogLine
+from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_core.runners.process import uniform
+from needle_core.runners.virtual import LOG, VirtualRunner
+from needle_device_driver.device import HOLD
+from needle_device_driver.device_driver import DeviceDriver
+from needle_device_driver.parameters import DeviceDriverParameters
+from needle_sim.drive_emulator import DriveEmulator
+from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_verification.soak.link_faults import LinkFaults
+from needle_verification.soak.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
+from needle_verification.soak.parts.person import (
+    INSERT,
+    RETRACT,
+    STOP,
+    Hand,
+    Joystick,
+    Person,
+)
+
+NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
+SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
+_SECOND_JOY = "second_joy"
+_DEPTHS = (0.003, 0.008)
+_LATEST_START = 0.2
+# A node that ended is started again by whoever sees it [s].
+_RESTART = 1.0
+# What a handler takes of its component's time, but for the tracker's [s].
+_COMPUTE = (0.02e-3, 0.2e-3)
+_INTERNAL = "internal error"
+
+Watcher = Callable[[str, Any], None]
+
+
+class SoakRig:
+    """The rig from the needle to the person.
+
+    Parameters
+    ----------
+    seed : int
+        Of all that is drawn.
+    depth : float, optional
+        How far the needle goes in [m]; drawn if none is given.
+
+    Attributes
+    ----------
+    faults : LinkFaults
+        What is wrong with topics, services and bus.
+    runner : VirtualRunner
+        Runs all of it.
+    bench : Bench
+        The needle.
+    drives : DriveEmulator
+        What moves it.
+    hand, second_hand : Hand
+        The person's, and that of a second one.
+    steering : SteeringSettings
+        The controller's.
+    watchers : dict of str to list of Watcher
+        By topic, who is called with the sender and the message of each publication.
+    hears_hold : callable
+        Called with each hold as the driver takes it, and when [s].
+    frames_sent, adapter_opened : list of callable
+        Called with each batch of frames that the driver sends, and when it sends its first.
+    log : list of str
+        What was logged, one line each.
+    crashes : list of str
+        Errors that nothing foresaw.
+    digest : hash
+        Of who published what and when.
+    """
+
+    def __init__(self, seed: int, depth: float | None = None) -> None:
+        self.faults = LinkFaults()
+        self.watchers: dict[str, list[Watcher]] = {}
+        self.hears_hold: Callable[[HoldState, float], None] = lambda *_: None
+        self.frames_sent: list[Callable[[Any], None]] = []
+        self.adapter_opened: list[Callable[[], None]] = []
+        self._adapter_is_open = False
+        self.log: list[str] = []
+        self.crashes: list[str] = []
+        self.digest = hashlib.sha256()
+        names = (*NODES, "person", "bench", DriveEmulator.name, SECOND_OPERATOR, SECOND_JOYSTICK)
+        self.runner = VirtualRunner(
+            (),
+            seed,
+            compute={
+                **dict.fromkeys(names, uniform(*_COMPUTE)),
+                "stereo_tracker": uniform(*ANSWER),
+            },
+            faults=(self._see_sent, self.faults),
+            taps=(self._see_published,),
+        )
+        timeline = self.runner.timeline
+        draw = timeline.stream("rig")
+        self.steering = SteeringSettings(
+            depth=draw.uniform(*_DEPTHS) if depth is None else depth,
+            preset=draw.choice(("best", "paper")),
+            insertion=draw.choice(("stepwise", "continuous")),
+            nominal_speed=0.005,
+            tip_noise_bound=TIP_NOISE,
+        )
+        self.hand, self.second_hand = Hand(), Hand()
+        self.drives = DriveEmulator(DriveEmulatorParameters(boot_time=0.1))
+        self.bench = Bench(self.drives.bus, timeline.stream("needle"))
+        self.person = Person(self.hand, lambda: self.bench.motors.insertion, "operator")
+        self.tracker = self._make_tracker()
+        self._makers: dict[str, Callable[[], Component]] = {
+            "device_driver": self._make_driver,
+            "plane_controller": lambda: PlaneController(self.steering),
+            "operator": lambda: Operator(_operator_settings()),
+            "stereo_tracker": self._make_tracker,
+            "joy_node": lambda: Joystick(self.hand),
+            SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),
+            SECOND_JOYSTICK: lambda: Joystick(self.second_hand, SECOND_JOYSTICK, _SECOND_JOY),
+        }
+        for component in (self.drives, self.bench, self.person):
+            self.runner.start(component)
+        for name in NODES:
+            late = timeline.draw(f"start of {name}", (0.0, _LATEST_START))
+            timeline.call_after(late, partial(self.start, name))
+
+    @property
+    def now(self) -> float:
+        """Virtual time since the begin [s]."""
+        return self.runner.now
+
+    @property
+    def hand_node(self) -> str:
+        """Name of the node by which the person holds."""
+        return "operator"
+
+    @property
+    def hand_presses(self) -> bool:
+        """Whether the hand presses what could move the needle, where it holds."""
+        return self.hand.holds
+
+    def watch(self, topic: str, watcher: Watcher) -> None:
+        """Call `watcher` with sender and message whenever one is published on a topic."""
+        self.watchers.setdefault(topic, []).append(watcher)
+
+    def start(self, name: str) -> None:
+        """Make and start a node that does not run."""
+        if not self.runner.runs(name):
+            self.runner.start(self._makers[name]())
+
+    def kill(self, name: str) -> None:
+        """Kill a node as SIGKILL does."""
+        if self.runner.runs(name):
+            self.runner.kill(name)
+
+    def run(self, seconds: float) -> None:
+        """Run for some time; who ends is started again."""
+        end = self.now + seconds
+        while self.now < end:
+            if self.runner.run(end - self.now):
+                for name, ended in tuple(self.runner.exits.items()):
+                    del self.runner.exits[name]
+                    self._see_exit(name, ended.text)
+
+    def _see_exit(self, name: str, why: str) -> None:
+        if why.startswith(_INTERNAL):
+            self.crashes.append(f"{name}: {why}")
+        if name in self._makers:
+            self.runner.timeline.call_after(_RESTART, partial(self.start, name))
+
+    def _make_driver(self) -> Component:
+        self._adapter_is_open = False
+        driver = DeviceDriver(DeviceDriverParameters(link="virtual", channel="soak"))
+        driver.inputs = tuple(
+            dataclasses.replace(row, handler=partial(self._take_hold, row.handler))
+            if row.topic == HOLD
+            else row
+            for row in driver.inputs
+        )
+        return driver
+
+    def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
+        self.hears_hold(message, at.steady)
+        return handler(message, at)
+
+    def _make_tracker(self) -> TrackerStandIn:
+        self.tracker = TrackerStandIn(self.bench, self.runner.timeline.stream("tips"))
+        return self.tracker
+
+    # ---- what is seen -----------------------------------------------------------------------------
+
+    def _see_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+        topic = output.topic
+        self.digest.update(f"{stamp_ns} {sender} {topic}\n".encode())
+        for watcher in self.watchers.get(topic, ()):
+            watcher(sender, message)
+        if output is LOG:
+            self._see_log(message)
+
+    def _see_log(self, line: LogLine) -> None:
+        self.log.append(f"{self.now:9.3f} {line.source}: {line.severity}: {line.text}")
+        if line.text.startswith(_INTERNAL):
+            self.crashes.append(f"{line.source}: {line.text}")
+
+    def _see_sent(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals:
+        if link.topic == CAN and link.sender == "device_driver":
+            for see in () if self._adapter_is_open else self.adapter_opened:
+                see()
+            self._adapter_is_open = True
+            for take in self.frames_sent:
+                take(message)
+        return (Arrival(0.0, message),)
+
+
+def _operator_settings() -> OperatorParameters:
+    return OperatorParameters(source="joy", key=INSERT, retract_key=RETRACT, stop_key=STOP)
