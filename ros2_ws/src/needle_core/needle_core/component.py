@@ -147,14 +147,33 @@ class Output:
 
 
 @dataclass(frozen=True)
+class PortChange:
+    """A port is lost, or open again: its runner opens it by itself.
+
+    Attributes
+    ----------
+    lost : str
+        Why nothing passes: not there, unplugged, its send buffer is full; empty: it is open.
+    """
+
+    lost: str = ""
+
+
+def _ignore(change: PortChange, at: Moment) -> Actions:
+    return ()
+
+
+@dataclass(frozen=True)
 class Port:
     """An edge to the world other than topics, such as a CAN bus; the handler gets whole batches.
 
     Ports of one name are wired together: what goes out of one arrives at the others, in order.
+    A port is open until `on_change` hears that it is not.
     """
 
     name: str
     handler: Callable[[Sequence[Any], Moment], Actions]
+    on_change: Callable[[PortChange, Moment], Actions] = _ignore
 
 
 @dataclass(frozen=True)

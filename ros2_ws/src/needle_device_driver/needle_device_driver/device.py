@@ -45,17 +45,16 @@ _HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
 # Positions alone change device/status so often at most [s]; joint_states has them all.
 _STATUS_PERIOD = 0.5
-_STOPPED = (State.FAULT, State.ESTOPPED)
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
 
 
 @dataclasses.dataclass(frozen=True)
 class _Order:
-    """An order under way, what follows it, and whether the device was stopped when it began."""
+    """An order under way, what follows it, and how many stops there were before it."""
 
     running: Running[Reply]
     then: Callable[[Reply, Moment], Actions]
-    was_stopped: bool
+    stops: int
 
 
 class DeviceRows:
@@ -72,6 +71,13 @@ class DeviceRows:
     refuse : callable
         Returns why services are not ready yet, empty when they are; a stop and a disabling are
         never refused.
+
+    Attributes
+    ----------
+    simulated : bool or None
+        As given; a component may change it.
+    others : str
+        Who else is a device on these topics; empty: nobody.
     """
 
     def __init__(
@@ -83,6 +89,7 @@ class DeviceRows:
         refuse: Callable[[], str] = lambda: "",
     ) -> None:
         self.simulated = simulated
+        self.others = ""
         self._supervisor = supervisor
         self._name = name
         self._refuse = refuse
@@ -123,7 +130,7 @@ class DeviceRows:
 
         A stop, an emergency stop and a fault call it off, and so does disabling.
         """
-        self._order = _Order(Running(order), then, self._supervisor.state in _STOPPED)
+        self._order = _Order(Running(order), then, self._supervisor.stops)
         yield from self.advance(at)
 
     def advance(self, at: Moment) -> Actions:
@@ -131,9 +138,15 @@ class DeviceRows:
         order = self._order
         if order is None:
             return
-        if self._supervisor.state in _STOPPED and not order.was_stopped:
-            yield from self.call_off("stopped", at)
-        elif order.running.advance(at.steady):
+        if self._supervisor.stops > order.stops:
+            yield from self.call_off(self._supervisor.status(at.steady).fault, at)
+            return
+        try:
+            has_ended = order.running.advance(at.steady)
+        except Exception:
+            yield from self.call_off("internal error", at)
+            raise
+        if has_ended:
             self._order = None
             yield from self.report(at)
             yield from order.then(order.running.result[0], at)
@@ -149,8 +162,9 @@ class DeviceRows:
         """Note who else is a device on these topics, and how many send commands."""
         self._command_publishers = len(peers.publishers.get(COMMANDS, ()))
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
-        text = f"another device is there: {', '.join(others)} publishes {STATUS}" if others else ""
-        self._supervisor.see_others(text)
+        names = ", ".join(others)
+        self.others = f"another device is there: {names} publishes {STATUS}" if others else ""
+        self._supervisor.see_others(self.others)
         return self.report(at)
 
     def report(self, at: Moment) -> Actions:
@@ -211,9 +225,8 @@ class DeviceRows:
         return self.report(at)
 
     def _on_emergency_stop(self, message: m.EmergencyStop, at: Moment) -> Actions:
-        if message.pressed:
-            yield from self.call_off("emergency stop", at)
         self._supervisor.receive_estop(message.pressed)
+        yield from self.advance(at)
         yield from self.report(at)
 
     def _trigger(

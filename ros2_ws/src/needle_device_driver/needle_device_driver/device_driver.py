@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -17,6 +18,7 @@ from needle_core.component import (
     Moment,
     Peers,
     Port,
+    PortChange,
     Send,
     Timer,
 )
@@ -70,9 +72,11 @@ class DeviceDriver(Component):
         self._device = DeviceRows(
             self._supervisor, self.name, simulated=None, refuse=lambda: self._waiting
         )
-        self._waiting = "waiting for the drives"
+        self._waiting = "waiting for the driver to be activated"
+        self._searches = settings.autostart
+        self._refusal = ""
         self._is_set_up = self._is_ending = False
-        self._retry_at = 0.0
+        self._retry_at, self._give_up_at = 0.0, math.inf
         self._cycle: tuple[Running[Any], Moment] | None = None
         self.inputs = tuple(
             dataclasses.replace(row, handler=self._guarded(row.handler))
@@ -83,15 +87,19 @@ class DeviceDriver(Component):
             for row in self._device.services
         )
         self.outputs = self._device.outputs
-        self.ports = (Port(CAN, self._guarded(self._on_frames)),)
+        self.ports = (
+            Port(CAN, self._guarded(self._on_frames), self._guarded(self._on_port_change)),
+        )
         self.timers = (
             Timer(PERIOD, self._guarded(self._on_cycle, ends=True)),
             Timer(1.0, self._guarded(self._tell_health)),
         )
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        """Note who else is a device here."""
-        return self._guarded(self._device.on_peers)(peers, at)
+        """Note who else is a device here; with another one nothing begins."""
+        yield from self._guarded(self._device.on_peers)(peers, at)
+        if self._searches and self._device.others:
+            yield Exit(EXIT_BAD_INPUT, self._device.others)
 
     def on_stop(self, at: Moment) -> Actions:
         """Stop both axes, switch them off, and exit."""
@@ -138,6 +146,12 @@ class DeviceDriver(Component):
         self._link.receive(frames)
         yield from self._go_on(at)
 
+    def _on_port_change(self, change: PortChange, at: Moment) -> Actions:
+        self._link.change(change.lost)
+        self._supervisor.observe(at.steady)
+        yield from self._device.report(at)
+        yield from self._go_on(at)
+
     def _on_cycle(self, at: Moment) -> Actions:
         yield from self._go_on(at)
         if self._is_ending:
@@ -153,8 +167,9 @@ class DeviceDriver(Component):
             self._supervisor.drive(PERIOD, at.steady)
             self._cycle = Running(self._drives.exchange(_REPLY_WAIT)), at
             yield from self._go_on(at)
-        elif at.steady >= self._retry_at:
+        elif self._searches and at.steady >= self._retry_at:
             self._retry_at = at.steady + _RETRY
+            self._give_up_at = min(self._give_up_at, at.steady + self.settings.connect_timeout)
             yield from self._device.begin(self._setting_up(at.steady), self._on_set_up, at)
 
     def _go_on(self, at: Moment) -> Actions:
@@ -180,7 +195,7 @@ class DeviceDriver(Component):
     # ---- begin and end ------------------------------------------------------------------------
 
     def _setting_up(self, now: float) -> Procedure[Reply]:
-        """Look for the drives and set them up; moves nothing."""
+        """Look for the drives and set them up; moves nothing. Ones that are there may refuse."""
         why_not = yield from self._drives.probe()
         if why_not:
             return Reply(False, why_not)
@@ -191,18 +206,21 @@ class DeviceDriver(Component):
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
         self._device.simulated = yield from are_emulated(self._link, nodes)
-        return (yield from self._supervisor.configuring(now))
+        reply = yield from self._supervisor.configuring(now)
+        self._refusal = "" if reply.success else reply.message
+        return reply
 
     def _on_set_up(self, reply: Reply, at: Moment) -> Actions:
         if reply.success:
-            self._is_set_up, self._waiting = True, ""
+            self._is_set_up, self._searches, self._waiting = True, False, ""
             yield Log("info", f"both drives are there on {self.settings.link_settings}")
             for text in self._drives.missing_optional_objects:
                 yield Log("warning", text)
-        elif at.steady > self.settings.connect_timeout:
+        elif self._refusal or at.steady > self._give_up_at:
             yield Exit(EXIT_BAD_INPUT, reply.message)
-        else:
+        elif not self._waiting.endswith(reply.message):
             self._waiting = f"waiting for the drives: {reply.message}"
+            yield Log("info", self._waiting)
 
     def _end(self, at: Moment) -> Actions:
         self._is_ending, self._waiting = True, "the driver ends"

@@ -30,7 +30,8 @@ class Wait:
     seconds: float
 
 
-Procedure = Generator[Wait, None, T]
+Procedure = Generator[Wait, float, T]
+"""Sent the steady time at which it goes on [s]."""
 
 
 class Runner(Protocol):
@@ -40,7 +41,11 @@ class Runner(Protocol):
         """Run one."""
 
 
-def run(procedure: Procedure[T], wait: Callable[[Callable[[], bool], float], Any]) -> T:
+def run(
+    procedure: Procedure[T],
+    wait: Callable[[Callable[[], bool], float], Any],
+    clock: Callable[[], float],
+) -> T:
     """Run a procedure to its end.
 
     Parameters
@@ -49,19 +54,18 @@ def run(procedure: Procedure[T], wait: Callable[[Callable[[], bool], float], Any
         What is run.
     wait : callable
         Waits until what it is given returns true, at most so long [s].
+    clock : callable
+        Steady time [s].
 
     Returns
     -------
     object
         What the procedure returns.
     """
-    while True:
-        try:
-            step = next(procedure)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-        wait(step.until, step.seconds)
+    running = Running(procedure)
+    while not running.advance(clock()):
+        wait(running.is_ready, max(running.deadline - clock(), 0.0))
+    return running.result[0]
 
 
 def run_at_once(procedure: Procedure[T]) -> T:
@@ -72,11 +76,25 @@ def run_at_once(procedure: Procedure[T]) -> T:
     RuntimeError
         If it does wait.
     """
-    return run(procedure, _refuse_to_wait)
+    running = Running(procedure)
+    if not running.advance(0.0):
+        raise RuntimeError("the procedure waits, and nothing here can")
+    return running.result[0]
 
 
-def _refuse_to_wait(_until: Callable[[], bool], _seconds: float) -> None:
-    raise RuntimeError("the procedure waits, and nothing here can")
+def side_by_side(*procedures: Procedure[Any]) -> Procedure[None]:
+    """Run procedures at the same time; where one raises, the others end where they are."""
+    under_way = [Running(procedure) for procedure in procedures]
+    now = yield Wait(lambda: True, 0.0)
+    try:
+        while under_way := [running for running in under_way if not running.advance(now)]:
+            deadline = min(running.deadline for running in under_way)
+            # A hair later: then theirs is over, too.
+            seconds = deadline - now + 1.5 * _ROUNDING
+            now = yield Wait(lambda: any(running.is_ready() for running in under_way), seconds)
+    finally:
+        for running in under_way:
+            running.cancel()
 
 
 class Running(Generic[T]):
@@ -91,23 +109,30 @@ class Running(Generic[T]):
     ----------
     result : list
         What the procedure returned; empty until it has ended.
+    deadline : float
+        Steady time at which it goes on at the latest [s].
     """
 
     def __init__(self, procedure: Procedure[T]) -> None:
         self.result: list[T] = []
         self._procedure = procedure
         self._wait: Wait | None = None
-        self._deadline = 0.0
+        self.deadline = 0.0
+
+    def is_ready(self) -> bool:
+        """Tell whether what it waits for is there."""
+        return self._wait is None or self._wait.until()
 
     def advance(self, now: float) -> bool:
         """Go on as far as possible at steady time `now` [s]; return whether it has ended."""
-        while self._wait is None or self._wait.until() or now >= self._deadline:
+        while self.is_ready() or now >= self.deadline:
+            first = self._wait is None
             try:
-                self._wait = next(self._procedure)
+                self._wait = next(self._procedure) if first else self._procedure.send(now)
             except StopIteration as end:
                 self.result.append(end.value)
                 return True
-            self._deadline = now + self._wait.seconds - _ROUNDING
+            self.deadline = now + self._wait.seconds - _ROUNDING
         return False
 
     def cancel(self) -> None:

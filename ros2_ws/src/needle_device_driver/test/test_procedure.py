@@ -2,9 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import pytest
 
-from needle_device_driver.procedure import Procedure, Running, Wait, run, run_at_once
+from needle_device_driver.procedure import (
+    Procedure,
+    Running,
+    Wait,
+    run,
+    run_at_once,
+    side_by_side,
+)
 
 
 class Script:
@@ -60,7 +69,63 @@ def test_one_that_is_cancelled_does_nothing_more() -> None:
 
 def test_run_waits_for_it_and_run_at_once_refuses_to() -> None:
     waits: list[float] = []
-    assert run(Script().procedure(), lambda until, seconds: waits.append(seconds)) == "done"
-    assert waits == [0.5, 0.1]
+
+    def wait(_: Callable[[], bool], seconds: float) -> None:
+        waits.append(seconds)
+
+    assert run(Script().procedure(), wait, lambda: sum(waits)) == "done"
+    assert waits == pytest.approx([0.5, 0.1])
     with pytest.raises(RuntimeError, match="the procedure waits"):
         run_at_once(Script().procedure())
+
+
+# ---- side by side ------------------------------------------------------------------------------
+
+
+def test_side_by_side_each_goes_on_by_itself() -> None:
+    one, other = Script(), Script()
+    running = Running(side_by_side(one.procedure(), other.procedure()))
+    running.advance(0.0)
+    assert one.steps == other.steps == ["first"]
+    other.is_there = True
+    assert not running.advance(0.1)
+    assert other.steps == ["first", "second"]
+    assert not running.advance(0.2)
+    assert one.steps == ["first"]
+    assert other.steps == ["first", "second", "end"]
+    assert not running.advance(0.5)
+    assert running.advance(0.6)
+    assert one.steps == ["first", "second", "end"]
+
+
+@pytest.mark.parametrize("begin", [0.0, 1000.0, 86400.0 / 7.0])
+def test_side_by_side_a_wait_ends_in_the_cycle_in_which_one_alone_would(begin: float) -> None:
+    alone, both = Running(Script().procedure()), Running(side_by_side(Script().procedure()))
+    now = begin
+    for _ in range(40):
+        assert alone.advance(now) == both.advance(now)
+        if alone.result:
+            return
+        now += 0.02
+    raise AssertionError
+
+
+def test_side_by_side_the_others_end_where_one_raises() -> None:
+    def refused() -> Procedure[None]:
+        yield Wait(lambda: False, 0.1)
+        raise ValueError("refused")
+
+    one = Script()
+    running = Running(side_by_side(one.procedure(), refused()))
+    running.advance(0.0)
+    with pytest.raises(ValueError, match="refused"):
+        running.advance(0.1)
+    assert one.steps == ["first", "end"]
+
+
+def test_side_by_side_cancelled_ends_all() -> None:
+    scripts = Script(), Script()
+    running = Running(side_by_side(*(script.procedure() for script in scripts)))
+    running.advance(0.0)
+    running.cancel()
+    assert [script.steps for script in scripts] == [["first", "end"]] * 2

@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Callable
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
 
 
@@ -108,19 +108,30 @@ class AxisPair:
                 errors.append(error)
         _raise_all(errors)
 
-    def each_in_turn(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[None]:
-        """Let both axes carry out an order, one after the other; raises as `each`."""
+    def side_by_side(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[None]:
+        """Let both axes carry out an order at the same time; raises as `each`."""
+        errors: list[AxisError] = []
+        axes = self.insertion, self.rotation
+        yield from side_by_side(*(_attempt(order(axis), errors) for axis in axes))
+        _raise_all(errors)
+
+    def close(self) -> Procedure[None]:
+        """Let go of one axis after the other, for each sends SYNCs; raises as `each`."""
         errors: list[AxisError] = []
         for axis in (self.insertion, self.rotation):
-            try:
-                yield from order(axis)
-            except AxisError as error:
-                errors.append(error)
+            yield from _attempt(axis.close(), errors)
         _raise_all(errors)
 
     def poll(self, now: float) -> PairSnapshot:
         """Return the newest replies; `now` is the steady time [s]."""
         return PairSnapshot(self.insertion.poll(now), self.rotation.poll(now))
+
+
+def _attempt(procedure: Procedure[None], errors: list[AxisError]) -> Procedure[None]:
+    try:
+        yield from procedure
+    except AxisError as error:
+        errors.append(error)
 
 
 def _raise_all(errors: list[AxisError]) -> None:

@@ -156,7 +156,7 @@ class CanLink(FrameLink):
 
     def run(self, procedure: Procedure[T]) -> T:
         """Run a procedure to its end; frames are received meanwhile."""
-        return run(procedure, self._wait_for)
+        return run(procedure, self._wait_for, self.clock)
 
     def _begin_to_receive(self, bus: can.BusABC) -> None:
         self._thread = threading.Thread(

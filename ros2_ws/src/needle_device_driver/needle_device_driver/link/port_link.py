@@ -12,6 +12,8 @@ from needle_device_driver.link.link_settings import LinkSettings
 class PortLink(FrameLink):
     """A link without an adapter: whoever runs the component carries its frames.
 
+    What is lost stays lost until it is opened again, for the drives have missed something.
+
     Parameters
     ----------
     settings : LinkSettings
@@ -27,18 +29,34 @@ class PortLink(FrameLink):
         self.now = 0.0
         super().__init__(settings, lambda: self.now)
         self._is_open = False
+        self._why_not = ""
         self._sent: list[CanFrame] = []
 
     @property
     def is_open(self) -> bool:
         """Tell whether frames pass."""
-        return self._is_open
+        return self._is_open and not self.lost
 
     def open(self) -> None:
-        """Let frames pass."""
-        if not self._is_open:
-            self._is_open = True
-            self._note_opening()
+        """Let frames pass.
+
+        Raises
+        ------
+        LinkError
+            If the port is not open.
+        """
+        if self.is_open:
+            return
+        if self._why_not:
+            raise LinkError(f"cannot open {self.settings}: {self._why_not}")
+        self._is_open = True
+        self._note_opening()
+
+    def change(self, why_not: str) -> None:
+        """Take that the port is open, or why it is not."""
+        self._why_not = why_not
+        if why_not and self.is_open:
+            self.lost = f"link {self.settings} is lost: {why_not}"
 
     def close(self) -> None:
         """Let no frame pass."""
@@ -50,10 +68,10 @@ class PortLink(FrameLink):
         Raises
         ------
         LinkError
-            If the link is closed.
+            If the link is closed or lost.
         """
-        if not self._is_open:
-            raise LinkError(f"{self.settings} is not open")
+        if not self.is_open:
+            raise LinkError(self.lost or f"{self.settings} is not open")
         self._sent.append(CanFrame(cob_id, data))
         self.frames_sent += 1
 
@@ -66,5 +84,5 @@ class PortLink(FrameLink):
     def receive(self, frames: Iterable[CanFrame]) -> None:
         """Take frames off the bus."""
         for frame in frames:
-            if self._is_open and not frame.remote:
+            if self.is_open and not frame.remote:
                 self._take(frame.identifier, frame.data, self.now)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 
 from needle_device_driver.axes.axis import Axis, AxisError
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, side_by_side
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.homing_times import HomingTimes
 from needle_device_driver.supervisor.limits import SafetyLimits
@@ -47,6 +48,8 @@ class DeviceCore:
         The axes' newest replies.
     step_stamp_ns : int or None
         Stamp of the step under way [ns].
+    stops : int
+        How many faults and emergency stops there were, also while there was one already.
     """
 
     def __init__(
@@ -73,7 +76,7 @@ class DeviceCore:
         self.configured = False
         self.fault = ""
         self.reason = ""
-        self.watchdog_trips = 0
+        self.watchdog_trips = self.stops = 0
         self.snapshot: PairSnapshot | None = None
         self.step_stamp_ns: int | None = None
 
@@ -138,15 +141,6 @@ class DeviceCore:
             return str(error)
         return ""
 
-    def carry_out(self, order: Callable[[Axis], Procedure[None]]) -> Procedure[str]:
-        """Let both axes carry out an order; returns as `order`."""
-        try:
-            yield from self._axes.each_in_turn(order)
-        except AxisError as error:
-            self.fail(str(error), error.rule)
-            return str(error)
-        return ""
-
     def power_on(self) -> str:
         """Switch both axes on, where they stand; return what went wrong."""
         self._seen_powered = False
@@ -165,10 +159,14 @@ class DeviceCore:
 
     def configure(self) -> Procedure[str]:
         """Set the axes up; return what went wrong."""
-        if error := (yield from self.carry_out(lambda axis: axis.configure())):
+        try:
+            yield from self._axes.side_by_side(lambda axis: axis.configure())
+        except AxisError as error:
             # The other axis may be set up, and would wait for a computer that says no more.
-            yield from self.carry_out(lambda axis: axis.close())
-            return error
+            with contextlib.suppress(AxisError):
+                yield from self._axes.close()
+            self.fail(str(error), error.rule)
+            return str(error)
         self.configured = True
         self.go(Trigger.CONFIGURE, "configured")
         return ""
@@ -177,7 +175,10 @@ class DeviceCore:
         """Switch the axes off and let go of them; return whether that was from DISABLED."""
         if self.configured:
             self.configured = False
-            yield from self.carry_out(lambda axis: axis.close())
+            try:
+                yield from self._axes.close()
+            except AxisError as error:
+                self.fail(str(error), error.rule)
         if self.state is not State.DISABLED:
             return False
         self.snapshot = None
@@ -189,7 +190,7 @@ class DeviceCore:
         trigger, reason = Trigger.RESET_UNCONFIGURED, "reset"
         if self.configured:
             try:
-                yield from self._axes.each_in_turn(lambda axis: axis.reset())
+                yield from self._axes.side_by_side(lambda axis: axis.reset())
                 self._axes.each(lambda axis: axis.power(False))
             except AxisError as error:
                 return str(error)
@@ -203,12 +204,7 @@ class DeviceCore:
         self.go(trigger, reason)
         return ""
 
-    def start(
-        self,
-        activity: Activity,
-        legs: Sequence[Leg],
-        stamp_ns: int | None = None,
-    ) -> None:
+    def start(self, activity: Activity, legs: Sequence[Leg], stamp_ns: int | None = None) -> None:
         """Begin a step or retraction from where the axes are; the stamp is the command's [ns]."""
         assert self.snapshot is not None
         self.activity, self.step_stamp_ns = activity, stamp_ns
@@ -246,9 +242,10 @@ class DeviceCore:
         """Begin to look for both home switches; return what went wrong."""
         if error := self.power_on():
             return error
+        insertion = self._axes.insertion.home(self._limits.homing_speed)
+        rotation = self._axes.rotation.home(self._limits.homing_rotation_rate)
         try:
-            yield from self._axes.insertion.home(self._limits.homing_speed)
-            yield from self._axes.rotation.home(self._limits.homing_rotation_rate)
+            yield from side_by_side(insertion, rotation)
         except AxisError as refusal:
             self.fail(str(refusal), refusal.rule)
             return str(refusal)
@@ -283,11 +280,13 @@ class DeviceCore:
 
     def fail(self, reason: str, rule: Rule | None = None) -> None:
         """Stop both axes for a fault; it takes a reset to go on."""
+        self.stops += 1
         if self.state not in (State.FAULT, State.ESTOPPED):
             self._stop_for_good(Trigger.FAIL, reason, rule)
 
     def emergency_stop(self) -> None:
         """Stop both axes, whatever the state."""
+        self.stops += 1
         if self.state is not State.ESTOPPED:
             self._stop_for_good(Trigger.ESTOP, "emergency stop", Rule.ESTOP_LATCHES)
 

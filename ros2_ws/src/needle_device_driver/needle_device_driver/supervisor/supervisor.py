@@ -92,6 +92,11 @@ class MotionSupervisor:
         return self._core.activity
 
     @property
+    def stops(self) -> int:
+        """Number of faults and emergency stops, also while there was one already."""
+        return self._core.stops
+
+    @property
     def command_ns(self) -> int:
         """Stamp of the newest command, whatever became of it [ns]; 0: none yet."""
         return self._commands.newest_ns
@@ -156,7 +161,7 @@ class MotionSupervisor:
         """Stop whatever moves, switch the axes off and let go of them."""
         if self._core.activity is not Activity.NONE:
             self._core.end_motion("aborted: the device is shut down", stop=True)
-        self._run(self._axes.each_in_turn(lambda axis: axis.close()))
+        self._run(self._axes.close())
 
     def deconfigure(self) -> Reply:
         """Do `deconfiguring` at one go."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import struct
 from typing import Any
 
@@ -45,7 +46,7 @@ class Wire:
         self.answer(self.answers.pop(0) if self.answers else [])
 
     def run(self, procedure: Procedure[T]) -> T:
-        return run(procedure, lambda until, _: until())
+        return run(procedure, lambda until, _: until(), itertools.count().__next__)
 
     def upload(self, index: int, subindex: int) -> bytes:
         return self.run(self.client.upload(index, subindex))
@@ -58,6 +59,11 @@ def test_an_answer_to_an_earlier_request_is_not_taken_for_this_ones() -> None:
     wire = Wire([LATE, MODES])
     assert wire.upload(0x6502, 0) == b"\xa1\x00\x00\x00"
     wire = Wire([bytes.fromhex("8000100000000206"), MODES])
+    assert wire.upload(0x6502, 0) == b"\xa1\x00\x00\x00"
+
+
+def test_an_answer_about_another_subindex_is_not_taken_for_this_ones() -> None:
+    wire = Wire([bytes.fromhex("4302650100000000"), MODES])
     assert wire.upload(0x6502, 0) == b"\xa1\x00\x00\x00"
 
 
@@ -147,14 +153,16 @@ def test_what_it_sends_and_reads_is_what_canopen_does(size: int) -> None:
     ours, theirs = Server(), Server()
     client = SdoClient(1, ours.send_message, lambda: None, 0.001)
     ours.receivers.append(client.receive)
-    run(client.download(0x2000, 0, data), lambda until, _: until())
+    run(client.download(0x2000, 0, data), lambda until, _: until(), itertools.count().__next__)
     make_client: Any = canopen_client.SdoClient
     oracle = make_client(0x601, 0x581, theirs.object_dictionary)
     oracle.network = theirs
     theirs.receivers.append(lambda frame: oracle.on_response(0x581, bytearray(frame), 0.0))
     oracle.download(0x2000, 0, data)
     assert ours.get_data(0x2000, 0) == data
-    assert run(client.upload(0x2000, 0), lambda until, _: until()) == data
+    assert (
+        run(client.upload(0x2000, 0), lambda until, _: until(), itertools.count().__next__) == data
+    )
     assert oracle.upload(0x2000, 0) == data
     assert ours.frames == theirs.frames
     assert struct.unpack_from("<H", ours.frames[0], 1) == (0x2000,)

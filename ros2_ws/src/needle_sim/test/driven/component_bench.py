@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,17 +20,21 @@ from needle_core.component import (
     Input,
     Moment,
     Output,
+    Peers,
+    PortChange,
     Publish,
     Timer,
 )
 from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
-from needle_core.runners.virtual import VirtualRunner
+from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 
 DRIVER, DRIVES = DeviceDriver.name, DriveEmulator.name
+# Events that only a runner knows of reach the driver by topics of the test's own.
+INJECTED = {PortChange: "test/port", Peers: "test/peers"}
 
 
 class Person(Component):
@@ -39,6 +44,7 @@ class Person(Component):
 
     def __init__(self) -> None:
         self.status: dict[str, str] = {}
+        self.health: dict[str, dict[str, str]] = {}
         self.outcomes: list[str] = []
         self.answers: list[Answer] = []
         self.pressed = False
@@ -46,11 +52,13 @@ class Person(Component):
         self.inputs = (
             Input("device/status", m.Status, self._on_status, LATCHED),
             Input("device/result", m.CommandResult, self._on_result),
+            Input(DIAGNOSTICS.topic, m.Diagnostics, self._on_health),
         )
         self.outputs = (
             Output("device/hold", m.HoldState, BEST_EFFORT),
             Output("device/joint_trajectory", m.Trajectory),
             Output("device/estop", m.EmergencyStop),
+            *(Output(topic, kind) for kind, topic in INJECTED.items()),
         )
         self.timers = (Timer(0.01, self._act),)
 
@@ -60,6 +68,12 @@ class Person(Component):
 
     def _on_status(self, message: m.Status, at: Moment) -> Actions:
         self.status = message.values
+        return ()
+
+    def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
+        for status in message.statuses:
+            if status.source == DRIVER:
+                self.health[status.part] = {"text": status.text, **status.values}
         return ()
 
     def _on_result(self, message: m.CommandResult, at: Moment) -> Actions:
@@ -87,8 +101,15 @@ class ComponentBench:
         self.drives = DriveEmulator(DriveEmulatorParameters(**(drives or {})))
         settings = DeviceDriverParameters(link="virtual", channel=CAN, **driver)
         self.driver = DeviceDriver(settings)
+        handlers: dict[type[Any], Callable[[Any, Moment], Actions]] = {
+            PortChange: self.driver.ports[0].on_change,
+            Peers: self.driver.on_peers,
+        }
+        injected = (Input(topic, kind, handlers[kind]) for kind, topic in INJECTED.items())
+        self.driver.inputs = (*self.driver.inputs, *injected)
         self.person = Person()
         self.frames: list[tuple[float, str, CanFrame]] = []
+        self.marked = 0.0
         self.runner = VirtualRunner(
             [self.drives, self.driver, self.person],
             seed,
@@ -121,6 +142,26 @@ class ComponentBench:
             for time, sender, frame in self.frames
             if time > since and sender == DRIVER and frame.identifier in cob_ids
         ]
+
+    def driver_frames(self, *cob_ids: int) -> list[tuple[float, CanFrame]]:
+        """Return the driver's frames of these COB-IDs since the mark, with their times."""
+        return [
+            (time, frame)
+            for time, sender, frame in self.frames
+            if time >= self.marked and sender == DRIVER
+            if not cob_ids or frame.identifier in cob_ids
+        ]
+
+    @staticmethod
+    def entry(frame: CanFrame) -> tuple[int, int]:
+        """Return the index and subindex that an SDO frame is about."""
+        return int.from_bytes(frame.data[1:3], "little"), frame.data[3]
+
+    def mark(self) -> None:
+        self.marked = self.runner.now
+
+    def inject(self, event: PortChange | Peers) -> None:
+        self.person.actions.append(Publish(INJECTED[type(event)], event))
 
     def run(self, seconds: float) -> None:
         end = self.runner.now + seconds
@@ -188,11 +229,15 @@ class ComponentBench:
         return self.places == at
 
 
-def losing(identifiers: Sequence[int], begin: Callable[[], float]) -> Fault:
-    """Return a fault that loses the drives' frames of some identifiers from a time on."""
+def losing(
+    identifiers: Sequence[int],
+    begin: Callable[[], float],
+    end: Callable[[], float] = lambda: math.inf,
+) -> Fault:
+    """Return a fault that loses the drives' frames of some identifiers from a time to another."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        if link.topic != CAN or link.sender != DRIVES or now < begin():
+        if link.topic != CAN or link.sender != DRIVES or not begin() <= now < end():
             return (Arrival(0.0, message),)
         kept = tuple(f for f in message if f.identifier not in identifiers)
         return (Arrival(0.0, kept),)
