@@ -29,9 +29,7 @@ from needle_controller.protocol.steering_types import (
     SendStep,
     StartReply,
 )
-from needle_controller.protocol.steering_types import Log as SteeringLog
-from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_controller.protocol.tip_gate import TipCovariance, TipMeasurement
 from needle_core import messages as m
 from needle_core.component import (
     LATCHED,
@@ -132,18 +130,18 @@ class PlaneController(Component):
         """Take changed parameters."""
         self.settings = settings
         self.steering.configure(settings)
-        return self.carry_out([SteeringLog("info", "parameters changed")], at)
+        return self.carry_out([Log("info", "parameters changed")], at)
 
     def carry_out(self, actions: Iterable[Action], at: Moment) -> Actions:
         """Return what the protocol's actions are on the graph, and the status if it has changed."""
         for action in actions:
             match action:
-                case SteeringLog():
+                case Log():
                     yield from self._log(action, at)
                 case PublishUpdate():
                     yield from _update(action)
                 case SendStep() | SendPath():
-                    yield Publish(COMMANDS, _trajectory(action))
+                    yield Publish(COMMANDS, trajectory(action))
         yield from self._report()
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
@@ -174,7 +172,7 @@ class PlaneController(Component):
         self._bad_joints += topic == "joint_states"
         kept = _LAST_STAYS.get(topic)
         self.complaints[topic] = f"{error}; {kept}" if kept else str(error)
-        return [SteeringLog("warning", self.complaints[topic], topic)]
+        return [Log("warning", self.complaints[topic], topic)]
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Iterable[Action]:
         return self.steering.on_joints(joint_sample(message, at.sent_ns))
@@ -197,7 +195,7 @@ class PlaneController(Component):
         self.steering.settings.check_plane(plane)
         self.steering.control.plane = plane
         self.steering.control.target_point = None
-        return [SteeringLog("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
+        return [Log("info", f"{TARGET_PLANE} at offset {plane.offset:g} m")]
 
     def _on_point(self, message: m.Point, at: Moment) -> Iterable[Action]:
         point = point_from_message(message.frame_id, message.position)
@@ -209,12 +207,12 @@ class PlaneController(Component):
             self.steering.control.target_point = point
         x, y, z = point
         text = f"{TARGET_POINT} at ({x:g}, {y:g}, {z:g}) m"
-        return [SteeringLog("info", text, TARGET_POINT)]
+        return [Log("info", text, TARGET_POINT)]
 
     def _on_obstacles(self, message: m.Markers, at: Moment) -> Iterable[Action]:
         obstacles = obstacles_from_markers(message)
         self.steering.control.obstacles = obstacles
-        return [SteeringLog("info", f"{len(obstacles)} obstacles", OBSTACLES)]
+        return [Log("info", f"{len(obstacles)} obstacles", OBSTACLES)]
 
     # ---- services and time --------------------------------------------------------------------
 
@@ -246,12 +244,12 @@ class PlaneController(Component):
 
     # ---- what is said -------------------------------------------------------------------------
 
-    def _log(self, log: SteeringLog, at: Moment) -> Actions:
+    def _log(self, log: Log, at: Moment) -> Actions:
         if log.kind:
             if at.steady - self._logged.get(log.kind, -_LOG_PERIOD) < _LOG_PERIOD:
                 return
             self._logged[log.kind] = at.steady
-        yield Log(log.severity, log.text)
+        yield log
 
     def _report(self) -> Actions:
         history = self.steering.intake.joints
@@ -264,10 +262,22 @@ class PlaneController(Component):
         for topic in TARGETS:
             yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
         status = controller_status(self.steering, self.settings.preset, self._signature)
-        yield Diagnose("steering", status.diagnostic)
         if status != self._published or self._heard.is_full:
             self._published = status
+            yield Diagnose("steering", status.diagnostic)
             yield Publish(STATUS, dataclasses.replace(status, heard=self._heard.take_text()))
+
+
+def trajectory(command: SendStep | SendPath) -> m.Trajectory:
+    """Return a step as a trajectory of one point, a path as one of several."""
+    match command:
+        case SendStep(stamp_ns, insertion, rotation, duration):
+            points: tuple[m.TrajectoryPoint, ...] = (
+                m.TrajectoryPoint((insertion, rotation), duration),
+            )
+        case SendPath(stamp_ns, places):
+            points = tuple(m.TrajectoryPoint((at, turn), time) for at, turn, time in places)
+    return m.Trajectory(stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 
 def joint_sample(message: m.JointState, sent_ns: int) -> JointSample:
@@ -296,15 +306,6 @@ def tip_covariance(message: m.PoseWithCovariance) -> TipCovariance:
 
 def _health(complaint: str, values: dict[str, str]) -> Diagnostic:
     return Diagnostic(Level.WARN if complaint else Level.OK, complaint or "ok", values)
-
-
-def _trajectory(command: SendStep | SendPath) -> m.Trajectory:
-    """Return a step as a trajectory of one point, a path as one of several."""
-    points = tuple(
-        m.TrajectoryPoint((insertion, rotation), time)
-        for insertion, rotation, time in command.points
-    )
-    return m.Trajectory(command.stamp_ns, (m.INSERTION_JOINT, m.ROTATION_JOINT), points)
 
 
 def _update(action: PublishUpdate) -> Actions:

@@ -98,10 +98,11 @@ class Send:
 
 @dataclass(frozen=True)
 class Log:
-    """Log a line; `severity` is info, warning or error."""
+    """Log a line; `severity` is info, warning or error, `kind` throttles repetitions."""
 
     severity: str
     text: str
+    kind: str = ""
 
 
 @dataclass(frozen=True)

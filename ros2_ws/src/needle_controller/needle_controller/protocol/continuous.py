@@ -23,13 +23,13 @@ from needle_controller.protocol.steering import Steering
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    Log,
     SendPath,
     SendStep,
     StartReply,
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import AcceptedTip
+from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 
 _AS_GOOD_AS_A_STEP = 1.0 - 1e-3

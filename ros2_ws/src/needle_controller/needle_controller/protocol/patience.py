@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.steering_types import Action, Log
+from needle_controller.protocol.steering_types import Action
 from needle_controller.protocol.step_watch import REST_INSERTION
+from needle_core.component import Log
 
 
 class Patience:

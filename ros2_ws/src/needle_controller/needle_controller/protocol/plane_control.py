@@ -23,7 +23,7 @@ from needle_controller.presets.point_steering import PointSteering, point_law
 from needle_controller.presets.presets import make_controller
 from needle_controller.presets.steering_settings import ONE_SIDED_PRESETS, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.tip_covariance import TipCovariance
+from needle_controller.protocol.tip_gate import TipCovariance
 from needle_controller.protocol.trust import TARGET_TOLERANCE
 
 LARGEST_START_ROLL = np.deg2rad(80.0)

@@ -21,17 +21,21 @@ from needle_controller.protocol.start_conditions import Situation, is_out, obsta
 from needle_controller.protocol.steering_types import (
     Action,
     Awaiting,
-    Log,
     PublishUpdate,
     SendStep,
     StartReply,
     SteeringState,
 )
 from needle_controller.protocol.step_watch import FailedSteps, Followed, StepWatch
-from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import AcceptedTip, RefusedTip, TipMeasurement
+from needle_controller.protocol.tip_gate import (
+    AcceptedTip,
+    RefusedTip,
+    TipCovariance,
+    TipMeasurement,
+)
 from needle_controller.protocol.tip_intake import TipIntake
 from needle_controller.protocol.trust import Trust, trust_of
+from needle_core.component import Log
 from needle_core.status_messages import DeviceStatus
 
 _STOPPED_DEVICE = ("FAULT", "ESTOPPED")
@@ -148,7 +152,7 @@ class Steering:
 
     def on_tip_pose(self, covariance: TipCovariance) -> list[Action]:
         """Take what a tip's source says of how well it knows the tip of the same stamp."""
-        self.intake.covariances.add(covariance)
+        self.intake.covariances.append(covariance)
         return self._use_tip()
 
     def on_result(self, stamp_ns: int, text: str, sent_ns: int = 0) -> list[Action]:

@@ -6,6 +6,7 @@ import dataclasses
 import enum
 
 from needle_controller.protocol.plane_control import ControlUpdate
+from needle_core.component import Log
 
 
 class SteeringState(enum.Enum):
@@ -47,11 +48,6 @@ class SendStep:
     rotation: float
     duration: float
 
-    @property
-    def points(self) -> tuple[tuple[float, float, float], ...]:
-        """Its one point, as `SendPath` has several."""
-        return ((self.insertion, self.rotation, self.duration),)
-
 
 @dataclasses.dataclass(frozen=True)
 class SendPath:
@@ -76,15 +72,6 @@ class PublishUpdate:
 
     stamp_ns: int
     update: ControlUpdate
-
-
-@dataclasses.dataclass(frozen=True)
-class Log:
-    """Say something; `severity` is info, warning or error, `kind` throttles repetitions."""
-
-    severity: str
-    text: str
-    kind: str = ""
 
 
 Action = SendStep | SendPath | PublishUpdate | Log

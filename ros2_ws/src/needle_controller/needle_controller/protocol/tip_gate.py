@@ -11,12 +11,14 @@ import numpy as np
 from needle_controller.model.arrays import Array
 from needle_controller.model.target_plane import RIG
 from needle_controller.protocol.joint_history import JointSample
-from needle_controller.protocol.tip_covariance import TipCovariance
 
 LARGEST_SCALE = 1.15
 """How much farther than the stage moves a needle may go in: a stage's scale can be wrong."""
 STAMP_AHEAD_NS = 1_000_000_000
 """A tip's stamp farther ahead of the joints' than this is no time to wait for [ns]."""
+
+_ASYMMETRY = 1e-9
+"""Largest difference across the diagonal of a covariance, as a share of its largest entry."""
 
 
 class Fault(enum.Enum):
@@ -51,6 +53,44 @@ class TipMeasurement:
     stamp_ns: int
     frame_id: str
     position: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class TipCovariance:
+    """Covariance from needle/tip_pose of the tip with the same stamp.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Time of exposure [ns].
+    frame_id : str
+        Frame of the covariance; must be `rig`.
+    matrix : ndarray, shape (3, 3)
+        Of the position [m^2]; infinite where no tip was found.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    matrix: Array
+
+    def problem(self) -> str:
+        """Return why no tip can be used with this, empty if one can."""
+        if self.frame_id != RIG:
+            return f"needle/tip_pose in frame '{self.frame_id}', wants '{RIG}'"
+        if np.any(np.isinf(self.matrix)):
+            return "needle/tip_pose says that no tip was found"
+        if np.any(np.isnan(self.matrix)):
+            return "covariance of needle/tip_pose is not a number"
+        largest = float(np.max(np.abs(self.matrix)))
+        if np.max(np.abs(self.matrix - self.matrix.T)) > _ASYMMETRY * largest:
+            return "covariance of needle/tip_pose is not symmetric"
+        least = float(np.linalg.eigvalsh(self.matrix)[0])
+        if not least > 0.0:
+            return (
+                "covariance of needle/tip_pose is not positive definite (its least variance is "
+                f"{least:.3g} m^2)"
+            )
+        return ""
 
 
 @dataclasses.dataclass(frozen=True)

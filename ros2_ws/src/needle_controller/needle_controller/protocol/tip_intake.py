@@ -7,16 +7,16 @@ happened to arrive first.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointHistory, JointSample
 from needle_controller.protocol.step_watch import REST_INSERTION
-from needle_controller.protocol.tip_covariance import CovarianceHistory
 from needle_controller.protocol.tip_gate import (
     AcceptedTip,
     Fault,
     RefusedTip,
+    TipCovariance,
     TipMeasurement,
     refuse_message,
     refuse_position,
@@ -39,8 +39,8 @@ class TipIntake:
     ----------
     joints : JointHistory
         What the joints measured.
-    covariances : CovarianceHistory
-        What came with the tips.
+    covariances : deque of TipCovariance
+        What came with the last tips.
     last : AcceptedTip or None
         The last tip that was used.
     after_ns : int
@@ -51,7 +51,7 @@ class TipIntake:
 
     def __init__(self) -> None:
         self.joints = JointHistory()
-        self.covariances = CovarianceHistory()
+        self.covariances: deque[TipCovariance] = deque(maxlen=_MOST_WAITING)
         self.last: AcceptedTip | None = None
         self.refused: Counter[Fault] = Counter()
         self.after_ns = 0
@@ -190,7 +190,7 @@ class TipIntake:
     def forget_stamps(self) -> None:
         """Let go of all that is known by its stamp: time begins anew."""
         self.forget_waiting()
-        self.covariances = CovarianceHistory()
+        self.covariances.clear()
         self.last = None
         self.want_any()
 
@@ -237,9 +237,11 @@ class TipIntake:
     def _with_covariance(
         self, tip: TipMeasurement, joints: JointSample
     ) -> tuple[AcceptedTip | None, RefusedTip | None]:
-        covariance = self.covariances.at(tip.stamp_ns)
+        came = reversed(self.covariances)
+        covariance = next((c for c in came if c.stamp_ns == tip.stamp_ns), None)
         if covariance is None:
-            passed = self.covariances.has_passed(tip.stamp_ns)
+            # A topic keeps its order: after a later stamp's, that of this one never comes.
+            passed = bool(self.covariances) and self.covariances[-1].stamp_ns > tip.stamp_ns
             return None, _without_covariance(tip) if passed else None
         problem = covariance.problem()
         if problem:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from needle_controller.protocol.steering_types import Awaiting, Log, SteeringState
+from needle_controller.protocol.steering_types import Awaiting, SteeringState
 from needle_controller.protocol.tip_gate import Fault, TipMeasurement
+from needle_core.component import Log
 
 from .rig import HELD, MOVING, TICK, Rig, logged, none_sent, sent, where
 

@@ -10,8 +10,7 @@ import pytest
 
 from needle_controller.model.target_plane import plane_from_pose
 from needle_controller.protocol.steering_types import Action, PublishUpdate, SteeringState
-from needle_controller.protocol.tip_covariance import TipCovariance
-from needle_controller.protocol.tip_gate import Fault, TipMeasurement
+from needle_controller.protocol.tip_gate import Fault, TipCovariance, TipMeasurement
 
 from .rig import TICK, Rig, logged, none_sent, sent
 

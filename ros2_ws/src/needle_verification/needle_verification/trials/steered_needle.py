@@ -14,6 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from needle_controller.plane_controller import trajectory
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.continuous import make_steering
 from needle_controller.protocol.joint_history import JointSample
@@ -26,8 +27,6 @@ from needle_controller.protocol.steering_types import (
 from needle_controller.protocol.tip_gate import TipMeasurement
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.supervisor.command import (
-    INSERTION_JOINT,
-    ROTATION_JOINT,
     Command,
     CommandPoint,
 )
@@ -233,8 +232,6 @@ def rms_at_end(needle: SteeredNeedle, offset: float, length: float = 0.02) -> fl
 
 
 def _command(action: SendStep | SendPath) -> Command:
-    return Command(
-        action.stamp_ns,
-        (INSERTION_JOINT, ROTATION_JOINT),
-        tuple(CommandPoint((at, rotation), (), time) for at, rotation, time in action.points),
-    )
+    sent = trajectory(action)
+    points = tuple(CommandPoint(p.positions, p.others, p.time_from_start) for p in sent.points)
+    return Command(sent.stamp_ns, sent.joint_names, points)

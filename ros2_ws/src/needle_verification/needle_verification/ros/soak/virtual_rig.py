@@ -12,7 +12,9 @@ from typing import Any
 from rclpy.node import Node
 
 from needle_bringup.ros.operator import OperatorNode
-from needle_console.ros.console_node import ConsoleNode
+from needle_console.console_parameters import ConsoleParameters
+from needle_console.page.desk import Desk
+from needle_console.ros.console import ConsoleNode
 from needle_controller.ros.plane_controller import PlaneControllerNode
 from needle_core.errors import UserError
 from needle_device_driver.ros.device_driver import DeviceDriverNode
@@ -241,23 +243,15 @@ def virtual_rig(seed: int, depth: float | None) -> Iterator[VirtualRig]:
     gc.collect()
 
 
-class _NoServer:
-    """The page's server: what a page shows and does beside the hold is the person's own here."""
-
-    def start(self) -> None:
-        """Do nothing."""
-
-    def close(self) -> None:
-        """Do nothing."""
-
-
 def _make_console(process: VirtualProcess, line: VirtualLine) -> ConsoleNode:
-    def make_hold(access: Any, _: int, on_state: Any, on_notice: Any) -> VirtualHold:
-        made.append(VirtualHold(process, line, access, on_state, on_notice))
+    """Make the console with its hold alone: what else a page does is the person's own here."""
+
+    def serve(desk: Desk, settings: ConsoleParameters) -> VirtualHold:
+        made.append(VirtualHold(process, line, settings.access(), desk.hold, desk.notice))
         return made[0]
 
     made: list[VirtualHold] = []
-    node = ConsoleNode(make_hold, lambda *_: _NoServer())
+    node = ConsoleNode(serve)
     node.context.on_shutdown(made[0].close)
     return node
 
