@@ -25,6 +25,7 @@ from needle_core.component import (
     Output,
     Peers,
     Port,
+    PortChange,
     Publish,
     Reply,
     Send,
@@ -103,6 +104,7 @@ class VirtualRunner:
         self._serial = itertools.count(1)
         self._calls: dict[int, tuple[Process, str]] = {}
         self._processes: dict[str, Process] = {}
+        self._lost_ports: dict[tuple[str, str], str] = {}
         for component in components:
             self.start(component)
 
@@ -142,6 +144,9 @@ class VirtualRunner:
                 found = self.timeline.draw(f"discovery/{pair[0].name}/{pair[1].name}", DISCOVERY)
                 self.timeline.call_after(found, partial(self._discover, *pair))
         self._processes[name] = process
+        for owner, port in self._lost_ports:
+            if owner == name:
+                self._tell_port(name, port)
 
     def kill(self, name: str) -> None:
         """End a component at once, as SIGKILL does: others count it for `LEASE`."""
@@ -163,6 +168,22 @@ class VirtualRunner:
         process = self._named(name)
         process.slowness = extra
         self.timeline.call_after(seconds, partial(setattr, process, "slowness", 0.0))
+
+    def lose_port(self, name: str, port: str, why: str) -> None:
+        """Let nothing pass a component's port any more, and tell it why."""
+        self._lost_ports[name, port] = why
+        self._tell_port(name, port)
+
+    def open_port(self, name: str, port: str) -> None:
+        """Open a port that was lost, and tell its component."""
+        if self._lost_ports.pop((name, port), None) is not None:
+            self._tell_port(name, port)
+
+    def _tell_port(self, name: str, port: str) -> None:
+        change = PortChange(self._lost_ports.get((name, port), ""))
+        for row in self._processes[name].component.ports if self.runs(name) else ():
+            if row.name == port:
+                self._processes[name].offer(port, partial(row.on_change, change))
 
     def configure(self, name: str, settings: Any) -> None:
         """Change a component's settings."""
@@ -236,9 +257,10 @@ class VirtualRunner:
         receiver.offer(row.topic, partial(row.handler, message), depth=depth, sent_ns=sent_ns)
 
     def _send_through(self, sender: Process, port: str, batch: tuple[Any, ...]) -> None:
+        lost = self._lost_ports.keys()
         for receiver in self._processes.values():
             for row in receiver.component.ports if receiver is not sender else ():
-                if row.name == port:
+                if row.name == port and not {(sender.name, port), (receiver.name, port)} & lost:
                     link = Link(sender.name, port, receiver.name)
                     arrive = partial(self._arrive, receiver, row)
                     self._transport.send(link, batch, PORT_LATENCY, arrive)

@@ -65,6 +65,7 @@ class FaultOrders:
             **dict.fromkeys(_LINKS, self._spoil_link),
             **dict.fromkeys(faults.DRIVES, self._spoil_drive),
             faults.ADAPTER: self._unplug,
+            faults.PAGE: self._spoil_page,
             faults.CAMERAS: self._spoil_cameras,
             faults.CLOCK: self._spoil_clock,
             faults.PERSON: self._confuse_person,
@@ -82,20 +83,38 @@ class FaultOrders:
     # ---- parts ------------------------------------------------------------------------------------
 
     def _spoil_process(self, fault: Fault) -> Undo:
-        rig, name = self._rig, fault.part
+        rig, names = self._rig, self._rig.processes_of(fault.part)
         if fault.kind is Kind.OFF:
-            rig.kill(name)
-            return partial(rig.start, name)
-        if rig.runner.runs(name):
+            for name in names:
+                rig.kill(name)
+
+            def start() -> None:
+                for name in names:
+                    rig.start(name)
+
+            return start
+        for name in filter(rig.runner.runs, names):
             if fault.kind is Kind.STUCK:
                 rig.runner.freeze(name, fault.lasts)
             else:
                 rig.runner.slow_down(name, fault.lasts, fault.size * _SLOWEST_HANDLER)
         return _nothing
 
-    def _unplug(self, fault: Fault) -> Undo:
-        cut = Fault(faults.BUS, Kind.OFF, fault.at, fault.lasts, fault.size)
-        return self._spoil_link(cut)
+    def _unplug(self, _: Fault) -> Undo:
+        self._rig.unplug()
+        return self._rig.plug_in
+
+    def _spoil_page(self, fault: Fault) -> Undo:
+        rig = self._rig
+        if fault.kind is Kind.OFF:
+            if rig.runner.runs(faults.PAGE):
+                rig.runner.stop(faults.PAGE)
+            return partial(rig.start, faults.PAGE)
+        if fault.kind is Kind.STUCK:
+            return self._spoil_process(fault)
+        doing = "sends_garbage" if fault.kind is Kind.GARBAGE else "repeats"
+        setattr(rig.page, doing, True)
+        return lambda: setattr(rig.page, doing, False)
 
     def _spoil_link(self, fault: Fault) -> Undo:
         late = fault.size * (_LATEST_FRAME if fault.part == faults.BUS else LATEST_MESSAGE)

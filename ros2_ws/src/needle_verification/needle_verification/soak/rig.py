@@ -10,6 +10,8 @@ from typing import Any
 
 from needle_bringup.operator.component import Operator
 from needle_bringup.operator.parameters import OperatorParameters
+from needle_console.console import Console
+from needle_console.console_parameters import ConsoleParameters
 from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.can_frame import CAN
@@ -23,8 +25,11 @@ from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
+from needle_verification.soak.faults import CONSOLE, PAGE
 from needle_verification.soak.link_faults import LinkFaults
 from needle_verification.soak.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
+from needle_verification.soak.parts.hold_server import HoldServer
+from needle_verification.soak.parts.page import Page
 from needle_verification.soak.parts.person import (
     INSERT,
     RETRACT,
@@ -37,6 +42,7 @@ from needle_verification.soak.parts.person import (
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
 _SECOND_JOY = "second_joy"
+_CONSOLE = (CONSOLE, HoldServer.name)
 _DEPTHS = (0.003, 0.008)
 _LATEST_START = 0.2
 # A node that ended is started again by whoever sees it [s].
@@ -57,6 +63,8 @@ class SoakRig:
         Of all that is drawn.
     depth : float, optional
         How far the needle goes in [m]; drawn if none is given.
+    at_page : bool
+        Whether the person holds by a page of the console, and leaves the joystick alone.
 
     Attributes
     ----------
@@ -70,6 +78,12 @@ class SoakRig:
         What moves it.
     hand, second_hand : Hand
         The person's, and that of a second one.
+    person : Person
+        Who uses them.
+    hand_node : str
+        Name of the node by which the person holds.
+    page : Page or None
+        Where the person holds, if at one.
     steering : SteeringSettings
         The controller's.
     watchers : dict of str to list of Watcher
@@ -86,7 +100,7 @@ class SoakRig:
         Of who published what and when.
     """
 
-    def __init__(self, seed: int, depth: float | None = None) -> None:
+    def __init__(self, seed: int, depth: float | None = None, *, at_page: bool = False) -> None:
         self.faults = LinkFaults()
         self.watchers: dict[str, list[Watcher]] = {}
         self.hears_hold: Callable[[HoldState, float], None] = lambda *_: None
@@ -96,7 +110,7 @@ class SoakRig:
         self.log: list[str] = []
         self.crashes: list[str] = []
         self.digest = hashlib.sha256()
-        names = (*NODES, "person", "bench", DriveEmulator.name, SECOND_OPERATOR, SECOND_JOYSTICK)
+        names = (*NODES, "person", "bench", DriveEmulator.name, SECOND_OPERATOR, SECOND_JOYSTICK, *_CONSOLE, PAGE)
         self.runner = VirtualRunner(
             (),
             seed,
@@ -119,20 +133,25 @@ class SoakRig:
         self.hand, self.second_hand = Hand(), Hand()
         self.drives = DriveEmulator(DriveEmulatorParameters(boot_time=0.1))
         self.bench = Bench(self.drives.bus, timeline.stream("needle"))
-        self.person = Person(self.hand, lambda: self.bench.motors.insertion, "operator")
+        self.hand_node = CONSOLE if at_page else "operator"
+        self.person = Person(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
+        self.page: Page | None = None
         self.tracker = self._make_tracker()
         self._makers: dict[str, Callable[[], Component]] = {
             "device_driver": self._make_driver,
             "plane_controller": lambda: PlaneController(self.steering),
             "operator": lambda: Operator(_operator_settings()),
             "stereo_tracker": self._make_tracker,
-            "joy_node": lambda: Joystick(self.hand),
+            "joy_node": lambda: Joystick(Hand() if at_page else self.hand),
+            CONSOLE: lambda: Console(ConsoleParameters()),
+            HoldServer.name: lambda: HoldServer(timeline.stream("nonces")),
+            PAGE: self._make_page,
             SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),
             SECOND_JOYSTICK: lambda: Joystick(self.second_hand, SECOND_JOYSTICK, _SECOND_JOY),
         }
         for component in (self.drives, self.bench, self.person):
             self.runner.start(component)
-        for name in NODES:
+        for name in (*NODES, *((*_CONSOLE, PAGE) if at_page else ())):
             late = timeline.draw(f"start of {name}", (0.0, _LATEST_START))
             timeline.call_after(late, partial(self.start, name))
 
@@ -142,14 +161,9 @@ class SoakRig:
         return self.runner.now
 
     @property
-    def hand_node(self) -> str:
-        """Name of the node by which the person holds."""
-        return "operator"
-
-    @property
     def hand_presses(self) -> bool:
         """Whether the hand presses what could move the needle, where it holds."""
-        return self.hand.holds
+        return self.hand.holds if self.page is None else bool(self.hand.button)
 
     def watch(self, topic: str, watcher: Watcher) -> None:
         """Call `watcher` with sender and message whenever one is published on a topic."""
@@ -164,6 +178,21 @@ class SoakRig:
         """Kill a node as SIGKILL does."""
         if self.runner.runs(name):
             self.runner.kill(name)
+            if name == HoldServer.name and self.page is not None:
+                self.page.cut()
+
+    def processes_of(self, name: str) -> tuple[str, ...]:
+        """Return the components that are one process with a node: the console has two."""
+        return _CONSOLE if name == CONSOLE else (name,)
+
+    def unplug(self) -> None:
+        """Take the driver's adapter away."""
+        self.runner.lose_port(DeviceDriver.name, CAN, "unplugged")
+
+    def plug_in(self) -> None:
+        """Give the adapter back."""
+        self._adapter_is_open = False
+        self.runner.open_port(DeviceDriver.name, CAN)
 
     def run(self, seconds: float) -> None:
         """Run for some time; who ends is started again."""
@@ -177,7 +206,7 @@ class SoakRig:
     def _see_exit(self, name: str, why: str) -> None:
         if why.startswith(_INTERNAL):
             self.crashes.append(f"{name}: {why}")
-        if name in self._makers:
+        if name in self._makers and name != PAGE:
             self.runner.timeline.call_after(_RESTART, partial(self.start, name))
 
     def _make_driver(self) -> Component:
@@ -194,6 +223,11 @@ class SoakRig:
     def _take_hold(self, handler: Any, message: HoldState, at: Any) -> Any:
         self.hears_hold(message, at.steady)
         return handler(message, at)
+
+    def _make_page(self) -> Page:
+        self.page = Page(lambda: self.hand.button, self.runner.timeline.stream("page"))
+        self.person.sees_lost_press = self.page.asks_for_a_new_press
+        return self.page
 
     def _make_tracker(self) -> TrackerStandIn:
         self.tracker = TrackerStandIn(self.bench, self.runner.timeline.stream("tips"))

@@ -11,6 +11,9 @@ from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.fault_orders import LATEST_MESSAGE, FaultOrders
 from needle_verification.soak.faults import (
+    CONSOLE,
+    PAGE,
+    PAGE_LINE,
     SECOND_PERSON,
     Fault,
     Kind,
@@ -37,6 +40,8 @@ UNDISTURBED_DEPTH, _CONVERGED = 0.08, 0.001
 _HOLD, _JOINTS = "/device/hold", "/joint_states"
 # The way of a press to the driver.
 _HOLD_LINKS = ("/joy", _HOLD)
+# Where one of them goes wrong the person holds by a page.
+_AT_PAGE = (CONSOLE, PAGE, PAGE_LINE)
 _LATE = (Kind.SLOW, Kind.REORDERED, Kind.DUPLICATED)
 # The device's faults that take the joints from the controller.
 _TAKE_JOINTS = (_JOINTS, "device_driver", "plane_controller")
@@ -109,7 +114,8 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     faults : sequence of Fault
         What goes wrong meanwhile.
     """
-    rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH)
+    at_page = any(fault.part in _AT_PAGE for fault in faults)
+    rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == SECOND_PERSON for fault in faults):
         # Their hand must be seen neutral before it counts.
         rig.start(SECOND_JOYSTICK)
@@ -153,6 +159,8 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
         for fault in faults
         if fault.part in _HOLD_LINKS and fault.kind in _LATE
     )
+    # A page may be silent for 0.25 s, a joystick for 0.1 s.
+    late += 0.15 if rig.hand_node == CONSOLE else 0.0
     watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
@@ -169,6 +177,10 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
         watch.see_command([(at.positions[0], at.positions[1]) for at in message.points])
 
     def see_hold(node: str, message: m.HoldState) -> None:
+        if node == CONSOLE:
+            # It may have been pressed since the last tick.
+            watch.see_hand(rig.now, holds=rig.hand_presses)
+            watch.see_page_hold(rig.now, pressed=message.pressed)
         if message.pressed:
             (watch.see_hold if node == rig.hand_node else watch.see_other_hold)(rig.now)
 
