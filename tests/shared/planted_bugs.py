@@ -5,14 +5,10 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
-from mcap.writer import Writer
 
-from needle_bags.format.bag_writer import BagWriter
-from needle_bags.recording.recording import Received, Recording
 from needle_bringup.operator.joy_source import JoySource
 from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
@@ -21,16 +17,15 @@ from needle_controller.laws.roll_law import RollLaw
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.ros.device_driver import DeviceDriverNode
-from needle_device_driver.ros.device_interface import DeviceInterface
+from needle_device_driver.device import DeviceRows
+from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.ros.soak import rig_run
-from needle_verification.ros.soak.virtual_topics import VirtualPublisher, VirtualSubscription
+from needle_verification.soak import link_faults, rig_run
 from needle_verification.soak.judging import limit_witness
 from needle_verification.soak.judging.hold_witness import HoldWitness
 from needle_verification.soak.judging.invariants import Watch
@@ -124,13 +119,12 @@ def _cycle_that_orders_twice(patch: pytest.MonkeyPatch) -> None:
 
 
 def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
-    tell = DeviceInterface._tell
+    is_news = DeviceRows._is_news
 
-    def some(interface: DeviceInterface, status: Any, now: float) -> None:
-        if status.state is not State.MOVING:
-            tell(interface, status, now)
+    def some(rows: DeviceRows, status: Any, now: float) -> bool:
+        return status.state is not State.MOVING and is_news(rows, status, now)
 
-    patch.setattr(DeviceInterface, "_tell", some)
+    patch.setattr(DeviceRows, "_is_news", some)
 
 
 def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
@@ -162,7 +156,11 @@ def _estop_unheard(patch: pytest.MonkeyPatch) -> None:
 
 
 def _reset_refused(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(MotionSupervisor, "reset", lambda *_: Reply(False, "no"))
+    def refuse(*_: Any) -> Any:
+        return Reply(False, "no")
+        yield
+
+    patch.setattr(MotionSupervisor, "resetting", refuse)
 
 
 def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
@@ -173,21 +171,6 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
         return dataclasses.replace(command, rotation_rate=-command.rotation_rate)
 
     patch.setattr(RollLaw, "__call__", away)
-
-
-def _queue_without_a_bound(patch: pytest.MonkeyPatch) -> None:
-    def append(recording: Recording, message: Received) -> None:
-        recording.append_all((message,))
-
-    patch.setattr(Recording, "append", append)
-
-
-def _drops_uncounted(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Recording, "_drop", lambda *_: None)
-
-
-def _never_written_out(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(BagWriter, "flush", lambda _: None)
 
 
 PLANTED = {
@@ -213,22 +196,8 @@ PLANTED = {
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
-    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 134),
-    "a message dropped unsaid": PlantedBug("nothing_recorded_is_lost", _drops_uncounted, 28),
-    "a bag kept in memory": PlantedBug("nothing_recorded_is_lost", _never_written_out, 10),
     "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
 }
-
-
-def _bag_begins_without_writing(patch: pytest.MonkeyPatch) -> None:
-    begin = BagWriter._begin_file
-
-    def unwritten(bag: BagWriter) -> None:
-        with pytest.MonkeyPatch.context() as meanwhile:
-            meanwhile.setattr(Writer, "flush", lambda *_: None)
-            begin(bag)
-
-    patch.setattr(BagWriter, "_begin_file", unwritten)
 
 
 class MendedBug(NamedTuple):
@@ -250,15 +219,15 @@ def _blocked_axis_keeps_its_power(patch: pytest.MonkeyPatch) -> None:
 def _start_within_set_up_forgotten(patch: pytest.MonkeyPatch) -> None:
     await_start = drive_upkeep.await_start
 
-    def forgetful(link: Any, monitor: Any, *others: Any) -> None:
-        await_start(link, monitor, *others)
+    def forgetful(link: Any, monitor: Any, *others: Any) -> Any:
+        yield from await_start(link, monitor, *others)
         monitor.forget_start()
 
     patch.setattr(cia402_axis, "await_start", forgetful)
 
 
 def _reliable_messages_overtake(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(VirtualPublisher, "_keeps_order", lambda *at: not at[1].overtakes)
+    patch.setattr(link_faults, "_RESENT", {})
 
 
 def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
@@ -271,13 +240,13 @@ def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
 
 
 def _emergency_stop_ends_the_search(patch: pytest.MonkeyPatch) -> None:
-    start = DeviceDriverNode._start_by_itself
+    set_up = DeviceDriver._setting_up
 
-    def unless_stopped(node: DeviceDriverNode) -> None:
-        if node._supervisor.state is not State.ESTOPPED:
-            start(node)
+    def unless_stopped(driver: DeviceDriver, now: float) -> Any:
+        driver._searches = driver._supervisor.state is not State.ESTOPPED
+        return (yield from set_up(driver, now))
 
-    patch.setattr(DeviceDriverNode, "_start_by_itself", unless_stopped)
+    patch.setattr(DeviceDriver, "_setting_up", unless_stopped)
 
 
 def _set(owner: Any, **values: Any) -> Plant:
@@ -298,16 +267,6 @@ def _judge_forgets(**values: float) -> Plant:
     return _set(Watch, see_device=forgetful)
 
 
-def _each_loss_is_told_by_itself(patch: pytest.MonkeyPatch) -> None:
-    def lose(subscription: Any) -> None:
-        subscription.graph.overflows[subscription.node_name, subscription.topic_name] += 1
-        subscription._lost += 1
-        told = SimpleNamespace(total_count=subscription._lost)
-        subscription.process.do(lambda: subscription._on_lost and subscription._on_lost(told))
-
-    patch.setattr(VirtualSubscription, "_lose_one", lose)
-
-
 def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
     bounds = dataclasses.replace(
         rig_run.bounds_of_the_rig(), insertion_following_error=0.0, rotation_following_error=0.0
@@ -319,9 +278,6 @@ def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
 MENDED = {
     "an_emergency_stop_while_drives_are_waited_for": MendedBug(
         "the_way_goes_on", _emergency_stop_ends_the_search
-    ),
-    "a_recorder_begins_on_a_broken_disk": MendedBug(
-        "nothing_recorded_is_lost", _bag_begins_without_writing
     ),
     "blocked_when_the_hold_is_let_go": MendedBug(
         "no_motion_without_hold", _blocked_axis_keeps_its_power
@@ -335,9 +291,6 @@ MENDED = {
     "set_points_come_late": MendedBug("none_beyond_limits", _judge_of_drives_never_behind),
     "old_set_points_come_after_new_ones": MendedBug(
         "none_beyond_limits", _judge_of_drives_never_behind
-    ),
-    "a_flood_while_the_recorder_stands_still": MendedBug(
-        "nothing_recorded_is_lost", _each_loss_is_told_by_itself
     ),
     "a_fault_ends_homing_on_a_late_bus": MendedBug(
         "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)
