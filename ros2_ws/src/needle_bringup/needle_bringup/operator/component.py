@@ -86,7 +86,7 @@ class Operator(Component):
 
     @property
     def trouble(self) -> str:
-        """Why there is no hand to follow; empty: there is one."""
+        """Trouble with the hand to follow; empty: there is none."""
         return self._grip.trouble
 
     def on_settings(self, settings: OperatorParameters, at: Moment) -> Actions:

@@ -243,6 +243,7 @@ def test_a_lost_port_stops_both_and_a_reset_opens_it_anew(why: str) -> None:
         assert drive.error_code == 0x8130
     assert f"cannot open virtual can: {why}" in bench.call("reset").text
     bench.inject(PortChange())
+    bench.run(0.02)
     assert bench.call("reset").success
     bench.ready()
     bench.step()
