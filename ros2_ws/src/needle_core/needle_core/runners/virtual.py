@@ -97,7 +97,6 @@ class VirtualRunner:
     ) -> None:
         self.timeline = Timeline(seed)
         self.exits: dict[str, Exit] = {}
-        self._has_exited = False
         self._compute, self._taps = compute or {}, taps
         self._real_time_factor = real_time_factor
         self._transport = Transport(self.timeline, faults)
@@ -115,8 +114,7 @@ class VirtualRunner:
 
     def run(self, seconds: float) -> bool:
         """Run until another component exits, or for `seconds`; return whether one did."""
-        self._has_exited = False
-        return self.timeline.run(seconds, lambda: self._has_exited, self._real_time_factor)
+        return self.timeline.run(seconds, self._real_time_factor)
 
     # ---- what befalls components ----------------------------------------------------------------
 
@@ -226,7 +224,7 @@ class VirtualRunner:
                 self._diagnose(process, part, diagnostic)
             case Exit():
                 self.exits[process.name] = action
-                self._has_exited = True
+                self.timeline.interrupt()
                 self._remove(process)
                 self._forget(process)
 
@@ -241,16 +239,21 @@ class VirtualRunner:
     def _publish(self, process: Process, output: Output, message: Any) -> None:
         for tap in self._taps:
             tap(self.timeline.stamp_ns, process.name, message, output)
+        topic = output.topic
         if output.delivery.latched:
-            process.latched[output.topic] = message
-        for receiver in process.known:
-            self._send(process, receiver, output.topic, message)
+            process.latched[topic] = message
+        routes = process.routes.get(topic)
+        if routes is None:
+            routes = process.routes[topic] = [
+                route for other in process.known for route in _routes(process, topic, other)
+            ]
+        for route in routes:
+            self._send(route, message)
 
-    def _send(self, sender: Process, receiver: Process, topic: str, message: Any) -> None:
-        for row in receiver.inputs.get(topic, ()):
-            link = Link(sender.name, topic, receiver.name)
-            arrive = partial(self._deliver, receiver, row, self.timeline.stamp_ns)
-            self._transport.send(link, message, LATENCY, arrive)
+    def _send(self, route: tuple[Process, Input, Link], message: Any) -> None:
+        receiver, row, link = route
+        arrive = partial(self._deliver, receiver, row, self.timeline.stamp_ns)
+        self._transport.send(link, message, LATENCY, arrive)
 
     def _deliver(self, receiver: Process, row: Input, sent_ns: int, message: Any) -> None:
         depth = row.delivery.depth
@@ -276,7 +279,8 @@ class VirtualRunner:
             return
         process.known.append(other)
         for topic, message in process.latched.items():
-            self._send(process, other, topic, message)
+            for route in _routes(process, topic, other):
+                self._send(route, message)
         self._tell_peers(process)
 
     def _forget(self, gone: Process) -> None:
@@ -287,6 +291,7 @@ class VirtualRunner:
                 self._tell_peers(process)
 
     def _tell_peers(self, process: Process) -> None:
+        process.routes.clear()
         peers = Peers.of(p.component for p in (process, *process.known))
         process.offer("peers", partial(process.component.on_peers, peers))
 
@@ -347,3 +352,10 @@ class VirtualRunner:
         if number in self._calls:
             caller, _ = self._calls.pop(number)
             caller.offer("answer", partial(caller.component.on_answer, answer))
+
+
+def _routes(sender: Process, topic: str, receiver: Process) -> list[tuple[Process, Input, Link]]:
+    """Return how a topic's messages get from one component to another."""
+    link = Link(sender.name, topic, receiver.name)
+    rows = receiver.component.inputs
+    return [(receiver, row, link) for row in rows if row.topic == topic]

@@ -17,7 +17,7 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.can_frame import CAN
 from needle_core.component import Component, Output
 from needle_core.messages import HoldState, LogLine
-from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_core.runners.faults import Arrivals, Link
 from needle_core.runners.process import uniform
 from needle_core.runners.virtual import LOG, VirtualRunner
 from needle_device_driver.device import HOLD
@@ -118,7 +118,7 @@ class SoakRig:
                 **dict.fromkeys(names, uniform(*_COMPUTE)),
                 "stereo_tracker": uniform(*ANSWER),
             },
-            faults=(self._see_sent, self.faults),
+            faults=(self._meet_faults,),
             taps=(self._see_published,),
         )
         timeline = self.runner.timeline
@@ -248,14 +248,14 @@ class SoakRig:
         if line.text.startswith(_INTERNAL):
             self.crashes.append(f"{line.source}: {line.text}")
 
-    def _see_sent(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals:
+    def _meet_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals:
         if link.topic == CAN and link.sender == "device_driver":
             for see in () if self._adapter_is_open else self.adapter_opened:
                 see()
             self._adapter_is_open = True
             for take in self.frames_sent:
                 take(message)
-        return (Arrival(0.0, message),)
+        return self.faults(link, message, now, rng)
 
 
 def _operator_settings() -> OperatorParameters:

@@ -16,7 +16,7 @@ from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.needle.plant import NeedlePlant, initial_pose
 from needle_sim.needle.tissue import Torsion
 
-TICK = 0.005
+TICK = 0.01
 """Between two looks at the motors [s]."""
 _FRAME_RATE = 20.0
 ANSWER = (0.015, 0.045)
@@ -29,6 +29,7 @@ _CURVATURE = 1.0 / 0.122
 _PIECE = 0.0002, 0.1
 # A tip alone says nothing about the heading [rad^2].
 _UNKNOWN_ORIENTATION = 1e6
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,12 +147,13 @@ class TrackerStandIn(Component):
         self.timers = (Timer(1.0 / _FRAME_RATE, self._expose),)
 
     def _expose(self, at: Moment) -> Actions:
-        noise = [self._chance.uniform(-TIP_NOISE, TIP_NOISE) for _ in range(3)]
-        wrong = [self._chance.uniform(-0.02, 0.02) for _ in range(3)]
-        late = self._chance.uniform(0.0, _LATEST_ANSWER)
+        draw = self._chance.uniform
+        noise = [draw(-TIP_NOISE, TIP_NOISE) for _ in range(3)]
+        wrong = [draw(-0.02, 0.02) for _ in range(3)]
+        late = draw(0.0, _LATEST_ANSWER)
         if self.sight is not Sight.FROZEN:
-            self._last = self._bench.tip + np.array(noise)
-        seen = self._last + np.array(wrong) if self.sight is Sight.WRONG else self._last
+            self._last = self._bench.tip + noise
+        seen = self._last + wrong if self.sight is Sight.WRONG else self._last
         due = at.steady + (late if self.sight is Sight.LATE else 0.0)
         self._answers.append((due, list(self._answer(seen, at.stamp_ns))))
         for answer in [one for one in self._answers if one[0] <= at.steady]:
@@ -161,12 +163,12 @@ class TrackerStandIn(Component):
     def _answer(self, seen: np.ndarray, stamp_ns: int) -> Actions:
         x, y, z = seen.tolist()
         found = self.sight is not Sight.BLACK
+        covariance = [0.0] * 36
         variance = TIP_NOISE**2 / 3.0 if found else math.inf
-        diagonal = np.diag([variance] * 3 + [_UNKNOWN_ORIENTATION] * 3)
-        covariance = tuple(diagonal.ravel().tolist())
+        covariance[::7] = [variance] * 3 + [_UNKNOWN_ORIENTATION] * 3
         yield Publish(
             "needle/tip_pose",
-            m.PoseWithCovariance(stamp_ns, "rig", (x, y, z), (0.0, 0.0, 0.0, 1.0), covariance),
+            m.PoseWithCovariance(stamp_ns, "rig", (x, y, z), _UPRIGHT, tuple(covariance)),
         )
         if found:
             yield Publish("needle/tip", m.Point(stamp_ns, "rig", (x, y, z)))
