@@ -151,7 +151,9 @@ class SoakRig:
         }
         for component in (self.drives, self.bench, self.person):
             self.runner.start(component)
-        for name in (*NODES, *((*_CONSOLE, PAGE) if at_page else ())):
+        if at_page:
+            self.start(PAGE)
+        for name in (*NODES, *(_CONSOLE if at_page else ())):
             late = timeline.draw(f"start of {name}", (0.0, _LATEST_START))
             timeline.call_after(late, partial(self.start, name))
 
