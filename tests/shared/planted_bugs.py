@@ -8,7 +8,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import pytest
+from mcap.writer import Writer
 
+from needle_bags.format.bag_writer import BagWriter
+from needle_bags.recording.recording import Received, Recording
 from needle_bringup.operator.joy_source import JoySource
 from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
@@ -157,8 +160,8 @@ def _estop_unheard(patch: pytest.MonkeyPatch) -> None:
 
 def _reset_refused(patch: pytest.MonkeyPatch) -> None:
     def refuse(*_: Any) -> Any:
+        yield from ()
         return Reply(False, "no")
-        yield
 
     patch.setattr(MotionSupervisor, "resetting", refuse)
 
@@ -173,20 +176,35 @@ def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(RollLaw, "__call__", away)
 
 
+def _queue_without_a_bound(patch: pytest.MonkeyPatch) -> None:
+    def append(recording: Recording, message: Received) -> None:
+        recording.append_all((message,))
+
+    patch.setattr(Recording, "append", append)
+
+
+def _drops_uncounted(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Recording, "_drop", lambda *_: None)
+
+
+def _never_written_out(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(BagWriter, "flush", lambda _: None)
+
+
 PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 143),
     "a press beside the owner waits": PlantedBug(
-        "no_motion_by_another", _press_beside_the_owner_waits, 362
+        "no_motion_by_another", _press_beside_the_owner_waits, 235
     ),
     "a hold that anybody keeps": PlantedBug(
-        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 34, faults_of=466
+        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 3, faults_of=466
     ),
     "a page's hold that outlives its words": PlantedBug(
-        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 2
+        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 30
     ),
     "a page's lost press that goes on": PlantedBug(
-        "hold_is_of_now", _lost_press_of_a_page_goes_on, 88
+        "hold_is_of_now", _lost_press_of_a_page_goes_on, 392
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a cycle that orders twice": PlantedBug("none_beyond_limits", _cycle_that_orders_twice, 1),
@@ -196,8 +214,22 @@ PLANTED = {
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
-    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
+    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 134),
+    "a message dropped unsaid": PlantedBug("nothing_recorded_is_lost", _drops_uncounted, 28),
+    "a bag kept in memory": PlantedBug("nothing_recorded_is_lost", _never_written_out, 10),
+    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 100),
 }
+
+
+def _bag_begins_without_writing(patch: pytest.MonkeyPatch) -> None:
+    begin = BagWriter._begin_file
+
+    def unwritten(bag: BagWriter) -> None:
+        with pytest.MonkeyPatch.context() as meanwhile:
+            meanwhile.setattr(Writer, "flush", lambda *_: None)
+            begin(bag)
+
+    patch.setattr(BagWriter, "_begin_file", unwritten)
 
 
 class MendedBug(NamedTuple):
@@ -279,6 +311,9 @@ MENDED = {
     "an_emergency_stop_while_drives_are_waited_for": MendedBug(
         "the_way_goes_on", _emergency_stop_ends_the_search
     ),
+    "a_recorder_begins_on_a_broken_disk": MendedBug(
+        "nothing_recorded_is_lost", _bag_begins_without_writing
+    ),
     "blocked_when_the_hold_is_let_go": MendedBug(
         "no_motion_without_hold", _blocked_axis_keeps_its_power
     ),
@@ -303,4 +338,4 @@ MENDED = {
         "no_motion_by_another", _set(HoldWitness, lose_device=lambda *_: None)
     ),
 }
-"""By the schedule, in test/ros/soak/schedules, that found them."""
+"""By the schedule, in test/soak/schedules, that found them."""

@@ -104,7 +104,5 @@ def told_by_moments(course: Course) -> list[Fault]:
     told = []
     for fault, begun in course.begun:
         last = [one for one in course.met if one.at <= begun][-1]
-        told.append(
-            dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at)
-        )
+        told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at))
     return told

@@ -61,7 +61,10 @@ class FaultOrders:
         self._timeline = rig.runner.timeline
         self._strangers = itertools.count(1)
         self._spoilers: dict[str, Callable[[Fault], Undo]] = {
-            **dict.fromkeys((*faults.PROCESSES, faults.CONSOLE), self._spoil_process),
+            **dict.fromkeys(
+                (*faults.PROCESSES, faults.CONSOLE, faults.RECORDER), self._spoil_process
+            ),
+            faults.DISK: self._spoil_disk,
             **dict.fromkeys(_LINKS, self._spoil_link),
             **dict.fromkeys(faults.DRIVES, self._spoil_drive),
             faults.ADAPTER: self._unplug,
@@ -80,7 +83,7 @@ class FaultOrders:
     def _chance_of(self, fault: Fault) -> random.Random:
         return self._timeline.stream(f"fault of {fault.part}")
 
-    # ---- parts ------------------------------------------------------------------------------------
+    # ---- parts ----------------------------------------------------------------------------------
 
     def _spoil_process(self, fault: Fault) -> Undo:
         rig, names = self._rig, self._rig.processes_of(fault.part)
@@ -190,6 +193,10 @@ class FaultOrders:
 
         return end
 
+    def _spoil_disk(self, fault: Fault) -> Undo:
+        assert self._rig.disk is not None, "who records nothing has no disk"
+        return self._rig.disk.spoil(fault)
+
     def _let_second_person_in(self, fault: Fault) -> Undo:
         rig, hand, chance = self._rig, self._rig.second_hand, self._chance_of(fault)
 
@@ -246,7 +253,7 @@ class FaultOrders:
         change_to(changed)
         return partial(change_to, rig.steering)
 
-    # ---- strangers --------------------------------------------------------------------------------
+    # ---- strangers ------------------------------------------------------------------------------
 
     def _let_stranger_act(self, fault: Fault) -> Undo:
         rig = self._rig

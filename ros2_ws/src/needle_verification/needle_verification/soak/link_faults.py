@@ -13,6 +13,7 @@ from needle_verification.soak.faults import BUS, PAGE_LINE, TOPICS
 # From sending what was lost to sending it again [s]: a reliable topic, and TCP.
 _RESEND, _RESEND_TCP = (0.02, 0.1), (0.2, 0.4)
 _BEST_EFFORT = ("/joy", "/device/hold")
+_PARTS = {CAN: BUS, PAGE_LINE: PAGE_LINE}
 _RESENT = {
     **{topic: _RESEND for topic in TOPICS if topic not in _BEST_EFFORT},
     PAGE_LINE: _RESEND_TCP,
@@ -70,16 +71,9 @@ class LinkFaults:
         fault = self._on.get(part)
         if fault is None:
             return (Arrival(0.0, message),)
-        if part == BUS:
-            frames = [(frame,) for frame in message]
-        else:
-            frames = [message]
-        return [
-            arrival for one in frames for arrival in _arrivals(fault, one, now, rng, _RESENT.get(part))
-        ]
-
-
-_PARTS = {CAN: BUS, PAGE_LINE: PAGE_LINE}
+        resend = _RESENT.get(part)
+        whole = [(frame,) for frame in message] if part == BUS else [message]
+        return [arrival for one in whole for arrival in _arrivals(fault, one, now, rng, resend)]
 
 
 def _arrivals(

@@ -16,6 +16,7 @@ from needle_controller.plane_controller import PlaneController
 from needle_controller.presets.steering_settings import SteeringSettings
 from needle_core.can_frame import CAN
 from needle_core.component import Component, Output
+from needle_core.errors import UserError
 from needle_core.messages import HoldState, LogLine
 from needle_core.runners.faults import Arrivals, Link
 from needle_core.runners.process import uniform
@@ -25,7 +26,7 @@ from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_sim.drive_emulator import DriveEmulator
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_verification.soak.faults import CONSOLE, PAGE
+from needle_verification.soak.faults import CONSOLE, PAGE, RECORDER
 from needle_verification.soak.link_faults import LinkFaults
 from needle_verification.soak.parts.bench import ANSWER, TIP_NOISE, Bench, TrackerStandIn
 from needle_verification.soak.parts.hold_server import HoldServer
@@ -38,11 +39,16 @@ from needle_verification.soak.parts.person import (
     Joystick,
     Person,
 )
+from needle_verification.soak.parts.recorder import Disk, RecorderStandIn
 
 NODES = ("device_driver", "plane_controller", "operator", "stereo_tracker", "joy_node")
 SECOND_OPERATOR, SECOND_JOYSTICK = "second_operator", "second_joy_node"
+SECOND = (SECOND_JOYSTICK, SECOND_OPERATOR)
+"""Of a second person."""
 _SECOND_JOY = "second_joy"
 _CONSOLE = (CONSOLE, HoldServer.name)
+# Whose topics are recorded.
+_RECORDED = ("device_driver", "plane_controller", "operator", "joy_node")
 _DEPTHS = (0.003, 0.008)
 _LATEST_START = 0.2
 # A node that ended is started again by whoever sees it [s].
@@ -84,6 +90,8 @@ class SoakRig:
         Name of the node by which the person holds.
     page : Page or None
         Where the person holds, if at one.
+    disk, recorders : Disk or None, list of RecorderStandIn
+        What records, one after the other, and where; none unless `record` was called.
     steering : SteeringSettings
         The controller's.
     watchers : dict of str to list of Watcher
@@ -110,12 +118,12 @@ class SoakRig:
         self.log: list[str] = []
         self.crashes: list[str] = []
         self.digest = hashlib.sha256()
-        names = (*NODES, "person", "bench", DriveEmulator.name, SECOND_OPERATOR, SECOND_JOYSTICK, *_CONSOLE, PAGE)
+        names = (*NODES, "person", "bench", DriveEmulator.name, PAGE, RECORDER, *_CONSOLE)
         self.runner = VirtualRunner(
             (),
             seed,
             compute={
-                **dict.fromkeys(names, uniform(*_COMPUTE)),
+                **dict.fromkeys((*names, *SECOND), uniform(*_COMPUTE)),
                 "stereo_tracker": uniform(*ANSWER),
             },
             faults=(self._meet_faults,),
@@ -136,6 +144,8 @@ class SoakRig:
         self.hand_node = CONSOLE if at_page else "operator"
         self.person = Person(self.hand, lambda: self.bench.motors.insertion, self.hand_node)
         self.page: Page | None = None
+        self.disk: Disk | None = None
+        self.recorders: list[RecorderStandIn] = []
         self.tracker = self._make_tracker()
         self._makers: dict[str, Callable[[], Component]] = {
             "device_driver": self._make_driver,
@@ -146,6 +156,7 @@ class SoakRig:
             CONSOLE: lambda: Console(ConsoleParameters()),
             HoldServer.name: lambda: HoldServer(timeline.stream("nonces")),
             PAGE: self._make_page,
+            RECORDER: self._make_recorder,
             SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),
             SECOND_JOYSTICK: lambda: Joystick(self.second_hand, SECOND_JOYSTICK, _SECOND_JOY),
         }
@@ -173,8 +184,13 @@ class SoakRig:
 
     def start(self, name: str) -> None:
         """Make and start a node that does not run."""
-        if not self.runner.runs(name):
+        if self.runner.runs(name):
+            return
+        try:
             self.runner.start(self._makers[name]())
+        except UserError:
+            # As a recorder on a full disk.
+            self.runner.timeline.call_after(_RESTART, partial(self.start, name))
 
     def kill(self, name: str) -> None:
         """Kill a node as SIGKILL does."""
@@ -182,10 +198,26 @@ class SoakRig:
             self.runner.kill(name)
             if name == HoldServer.name and self.page is not None:
                 self.page.cut()
+            if name == RECORDER:
+                self.recorders[-1].cut(self.now)
 
     def processes_of(self, name: str) -> tuple[str, ...]:
         """Return the components that are one process with a node: the console has two."""
         return _CONSOLE if name == CONSOLE else (name,)
+
+    def record(self) -> None:
+        """Record all that is published from now on."""
+        self.disk = Disk()
+        self.start(RECORDER)
+
+    def losses(self, *, judges_killed: bool) -> list[str]:
+        """End the recording; return what the bags lack."""
+        losses: list[str] = []
+        for recorder in self.recorders:
+            losses += recorder.losses(judges_killed=judges_killed)
+        if self.disk is not None:
+            self.disk.close()
+        return losses
 
     def unplug(self) -> None:
         """Take the driver's adapter away."""
@@ -231,11 +263,19 @@ class SoakRig:
         self.person.sees_lost_press = self.page.asks_for_a_new_press
         return self.page
 
+    def _make_recorder(self) -> RecorderStandIn:
+        assert self.disk is not None
+        parts = [make() for name, make in self._makers.items() if name in _RECORDED]
+        topics = {row.topic: row for part in (*parts, self.person) for row in part.outputs}
+        chance = self.runner.timeline.stream("disk")
+        self.recorders.append(RecorderStandIn(self.disk, topics.values(), chance))
+        return self.recorders[-1]
+
     def _make_tracker(self) -> TrackerStandIn:
         self.tracker = TrackerStandIn(self.bench, self.runner.timeline.stream("tips"))
         return self.tracker
 
-    # ---- what is seen -----------------------------------------------------------------------------
+    # ---- what is seen ---------------------------------------------------------------------------
 
     def _see_published(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
         topic = output.topic

@@ -12,8 +12,10 @@ from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.fault_orders import LATEST_MESSAGE, FaultOrders
 from needle_verification.soak.faults import (
     CONSOLE,
+    DISK,
     PAGE,
     PAGE_LINE,
+    RECORDER,
     SECOND_PERSON,
     Fault,
     Kind,
@@ -26,7 +28,7 @@ from needle_verification.soak.judging.set_point_frames import SetPointFrames
 from needle_verification.soak.moments import watch_moments
 from needle_verification.soak.parts.bench import Motors
 from needle_verification.soak.parts.person import OUT, Wish
-from needle_verification.soak.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
+from needle_verification.soak.rig import SECOND, SoakRig
 
 # So long moments are waited for whose faults shall follow them [s].
 _FAULTS_OVER = 30.0
@@ -118,8 +120,11 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
     rig = SoakRig(seed, None if faults else UNDISTURBED_DEPTH, at_page=at_page)
     if any(fault.part == SECOND_PERSON for fault in faults):
         # Their hand must be seen neutral before it counts.
-        rig.start(SECOND_JOYSTICK)
-        rig.start(SECOND_OPERATOR)
+        for name in SECOND:
+            rig.start(name)
+    of_recording = [fault for fault in faults if fault.part in (RECORDER, DISK)]
+    if of_recording:
+        rig.record()
     watch = _watched(rig, faults)
     course = Course(rig.runner.timeline, faults, FaultOrders(rig).begin)
     watch_moments(rig, course.meet)
@@ -134,6 +139,9 @@ def run(seed: int, faults: Sequence[Fault]) -> RunResult:
         rig.run(_LOOK)
     if not _has_left(rig):
         watch.violate("the_way_goes_on", rig.now, _state_of(rig))
+    losses = rig.losses(judges_killed=len(of_recording) == 1)
+    if losses:
+        watch.violate("nothing_recorded_is_lost", rig.now, "; ".join(losses))
     for error in rig.crashes:
         watch.violate("no_node_crashes", rig.now, error)
     if not faults and not (rig.person.done and abs(rig.bench.deepest_tip[0]) <= _CONVERGED):
@@ -170,6 +178,8 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
         watch.see_hand(now, holds=rig.hand_presses)
         watch.see_driver(now, speaks=rig.runner.is_up("device_driver"))
         watch.see_motors(now, at.insertion, at.rotation)
+        if rig.recorders:
+            watch.see_waiting(now, rig.recorders[-1].recording.bytes_waiting)
 
     def see_command(_: str, message: m.Trajectory) -> None:
         for point in message.points:

@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Sequence
 
 from needle_core.status_messages import ControllerStatus, DeviceStatus
+from needle_verification.soak.judging.bag_witness import WAITING_LIMIT
 from needle_verification.soak.judging.hold_witness import HoldWitness
 from needle_verification.soak.judging.limit_witness import Bounds, LimitWitness
-from needle_verification.soak.virtual_disk import WAITING_LIMIT
 
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
@@ -107,7 +107,7 @@ class Watch:
         if all(one.invariant != invariant for one in self.violations):
             self.violations.append(Violation(invariant, at, text))
 
-    # ---- what happens -------------------------------------------------------------------------
+    # ---- what happens ---------------------------------------------------------------------------
 
     def see_hand(self, at: float, *, holds: bool) -> None:
         """Take whether the hand presses what could move the needle."""
@@ -245,7 +245,7 @@ class Watch:
                 f"{self._before[1] * 1e3:.2f} mm in",
             )
 
-    # ---- judgement ----------------------------------------------------------------------------
+    # ---- judgement ------------------------------------------------------------------------------
 
     @property
     def _is_homing(self) -> bool:

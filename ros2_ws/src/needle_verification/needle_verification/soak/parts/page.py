@@ -23,7 +23,7 @@ _KEPT = 50
 
 @dataclasses.dataclass(frozen=True)
 class Said:
-    """What goes over the line, either way.
+    """A word on the line between page and console.
 
     Attributes
     ----------
@@ -94,7 +94,7 @@ class Page(Component):
         yield Send(PAGE_LINE, (Said(self._connection),))
         yield Exit(0)
 
-    # ---- the connection ---------------------------------------------------------------------------
+    # ---- the connection -------------------------------------------------------------------------
 
     def _take(self, batch: Sequence[Said], at: Moment) -> Actions:
         # The finger comes first, as in a browser that stood still.
@@ -139,7 +139,7 @@ class Page(Component):
     def _send(self, text: str) -> Action:
         return Send(PAGE_LINE, (Said(self._connection, text),))
 
-    # ---- the finger -------------------------------------------------------------------------------
+    # ---- the finger -----------------------------------------------------------------------------
 
     def _look(self, at: Moment) -> Actions:
         yield from self._see_finger()
