@@ -144,13 +144,18 @@ def _noted(module: ModuleType, way: Way, domain: int, scratch: Path) -> Noted:
 
 
 def _class_of(module: ModuleType) -> Callable[[], Node]:
-    """Return the one class of nodes that a module defines."""
-    (found,) = (
+    """Return what makes a module's node: its class, or what its `main` runs a component by."""
+    found = [
         each
         for each in vars(module).values()
         if inspect.isclass(each) and issubclass(each, Node) and each.__module__ == module.__name__
-    )
-    return found
+    ]
+    if found:
+        return found[0]
+    with mock.patch("needle_core.ros.main.run_node", return_value=0) as run:
+        module.main()
+    make: Callable[[], Node] = run.call_args.args[0]
+    return make
 
 
 def _turn(node: Any, _: Noted) -> None:
@@ -215,15 +220,10 @@ def _report_and_close(node: Any, _: Noted) -> None:
 
 
 def _tick(node: Any, noted: Noted) -> None:
-    """Do what a hand's timer, and a simulation's loop, do."""
-    for name in ("turn", "_on_timer"):
-        getattr(node, name, lambda: None)()
+    """Do what every timer does."""
+    for timer in list(node.timers):
+        timer.callback()
     _turn(node, noted)
-
-
-def _drive_on(node: Any, noted: Noted) -> None:
-    _tick(node, noted)
-    node._device.count_watchdog_trip()
 
 
 def _camera(module: ModuleType) -> Node:
@@ -263,7 +263,7 @@ WAYS: dict[str, tuple[Way, ...]] = {
     "sim_rig": (
         Way("level tip", ("level:=tip",), then=_tick),
         Way("level camera", ("level:=camera",), then=_tick),
-        Way("level drive", ("level:=drive",), then=_drive_on),
+        Way("level drive", ("level:=drive",), then=_tick),
     ),
     "simulated_operator": (
         Way(then=_tick),

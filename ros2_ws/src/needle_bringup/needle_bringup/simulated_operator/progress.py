@@ -13,7 +13,7 @@ PROGRESS_FD = "NEEDLE_PROGRESS_FD"
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """How far the needle is in [m], and why it does not go on; empty: it does."""
+    """Insertion and depth of the needle [m], and why it does not go on; empty: it does."""
 
     insertion: float
     depth: float

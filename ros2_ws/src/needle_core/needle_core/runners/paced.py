@@ -27,7 +27,7 @@ class Outside(Protocol):
 
 
 class Bell(Protocol):
-    """What of a `threading.Event` is used; tests have one on a clock of their own."""
+    """Part of a `threading.Event` that is used; tests have one on a clock of their own."""
 
     def set(self) -> None:
         """Ring, from any thread."""

@@ -42,15 +42,16 @@ class Transport:
             stream = self._timeline.stream
             streams = self._streams[link] = stream(name), stream(f"faults/{name}")
         timeline = self._timeline
+        now = timeline.now
         arrivals: Arrivals = (Arrival(streams[0].uniform(*latency), message),)
         for fault in self._faults:
             arrivals = [
                 Arrival(sent.late + late, changed, sent.overtakes or overtakes)
                 for sent in arrivals
-                for late, changed, overtakes in fault(link, sent.message, timeline.now, streams[1])
+                for late, changed, overtakes in fault(link, sent.message, now, streams[1])
             ]
         for late, arrived, overtakes in arrivals:
-            when = timeline.now + late
+            when = now + late
             if not overtakes:
                 when = max(when, self._arrived.get(link, 0.0))
                 self._arrived[link] = when

@@ -45,8 +45,12 @@ class _CommandLines:
         self._is_closed = False
 
     def open(self, arrive: Callable[[Any], None]) -> None:
-        if sys.stdin is not None:
-            threading.Thread(target=self._read, args=(arrive,), daemon=True).start()
+        try:
+            terminal = sys.stdin.fileno()
+        except (AttributeError, ValueError, OSError):
+            # A program without input.
+            return
+        threading.Thread(target=self._read, args=(terminal, arrive), daemon=True).start()
 
     def send(self, batch: tuple[Any, ...]) -> None:
         """Do nothing: nobody answers a line."""
@@ -54,15 +58,15 @@ class _CommandLines:
     def close(self) -> None:
         self._is_closed = True
 
-    def _read(self, arrive: Callable[[Any], None]) -> None:
+    def _read(self, terminal: int, arrive: Callable[[Any], None]) -> None:
         rest = b""
         while not self._is_closed:
-            if not select.select([sys.stdin], [], [], _LOOK)[0]:
+            if not select.select([terminal], [], [], _LOOK)[0]:
                 continue
             # What is typed for a shell in front is not for a program in its background.
-            if sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) != os.getpgrp():
+            if os.isatty(terminal) and os.tcgetpgrp(terminal) != os.getpgrp():
                 continue
-            data = os.read(sys.stdin.fileno(), 4096)
+            data = os.read(terminal, 4096)
             if not data:
                 return
             *lines, rest = (rest + data).split(b"\n")

@@ -55,6 +55,8 @@ class Bench:
             context=context,
             parameter_overrides=[Parameter(name, value=v) for name, v in given.items()],
         )
+        assert isinstance(self.node.component, PlaneController)
+        self.steering = self.node.component.steering
         self.outside = outside = Node("outside", context=context)
         self._executor = SingleThreadedExecutor(context=context)
         for node in (self.node, outside):
@@ -148,7 +150,7 @@ class Bench:
     def start(self) -> None:
         self.device()
         self.joints()
-        steering = self.node.component.steering
+        steering = self.steering
         self.until(
             lambda: steering.intake.joints.latest is not None and steering._device is not None
         )

@@ -111,7 +111,7 @@ def test_joints_that_jump_say_what_to_do_and_go_on_once_they_are_back(bench: Ben
     bench.start()
     for _ in range(8):
         bench.run(bench.step())
-    deep, steering = bench.insertion, bench.node.component.steering
+    deep, steering = bench.insertion, bench.steering
     for place in (0.004, deep):
         bench.insertion = place
         for _ in range(CONFIRMED_BY):
@@ -164,7 +164,7 @@ def test_a_tip_waits_for_the_covariance_with_its_stamp(context: Context) -> None
     bench.until(lambda: poses.get_subscription_count() > 0)
     bench.start()
     stamps = [bench.tip([0.0, 0.0, 0.0])]
-    intake = bench.node.component.steering.intake
+    intake = bench.steering.intake
     bench.until(lambda: bool(intake._waiting) and intake.joints.at(stamps[0]) is not None)
     assert not bench.commands
     # That of another tip says that this one's will not come.
@@ -228,7 +228,7 @@ def test_joints_that_cannot_be_used_are_named(bench: Bench) -> None:
     bench._joints.publish(JointState(name=["insertion_joint"], position=[0.0]))
     bench.until(lambda: bench.health("joint_states")[0] == Level.WARN)
     assert "rotation_joint" in bench.health("joint_states")[1]
-    assert bench.node.component.steering.intake.joints.latest is None
+    assert bench.steering.intake.joints.latest is None
 
 
 def test_parameters_change_as_valid_wholes_only(bench: Bench) -> None:
@@ -262,7 +262,7 @@ def test_covariance_follows_the_messages_convention(bench: Bench) -> None:
     bench.start()
     bench.step()
     bench.until(lambda: bool(bench.received["needle/estimate"]))
-    estimate = bench.node.component.steering.control._estimator.estimate()
+    estimate = bench.steering.control._estimator.estimate()
     published = np.reshape(bench.received["needle/estimate"][-1].pose.covariance, (6, 6))
     scale = 1e-4
     rng = np.random.default_rng(1)

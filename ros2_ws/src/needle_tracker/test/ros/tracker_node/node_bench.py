@@ -25,7 +25,7 @@ from needle_core.ros.conversions import (
     to_stamp,
 )
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
-from needle_tracker.stereo_tracker import make_tracker
+from needle_tracker.stereo_tracker import StereoTipTracker, make_tracker
 
 LIMIT = 20.0
 INSERTION = 0.05
@@ -45,6 +45,8 @@ class Bench:
             context=context,
             parameter_overrides=[Parameter(name, value=v) for name, v in parameters.items()],
         )
+        assert isinstance(self.node.component, StereoTipTracker)
+        self.tracker = self.node.component
         self.outside = Node("outside", context=context)
         self._executor = SingleThreadedExecutor(context=context)
         for node in (self.node, self.outside):

@@ -100,7 +100,7 @@ def test_a_camera_that_runs_at_another_resolution_gives_no_tip(
     assert not bench.tips
     # A driver that knows nothing contradicts nothing.
     bench.camera_info(0, 0)
-    bench.until(lambda: not bench.node.component._health.camera_info["left"])
+    bench.until(lambda: not bench.tracker._health.camera_info["left"])
     assert found(bench.pair(20, images))
 
 
@@ -110,7 +110,7 @@ def test_a_camera_whose_sensor_is_larger_than_its_images_gives_tips(
     bench.camera_info(2048, 1536)
     bench.until(lambda: bench.health["images"][0] == 2)
     bench.camera_info(2048, 1536, binning_x=2, binning_y=2)
-    bench.until(lambda: not bench.node.component._health.camera_info["left"])
+    bench.until(lambda: not bench.tracker._health.camera_info["left"])
     assert found(bench.pair(10, images))
     bench.camera_info(2048, 1536, binning_x=4, binning_y=2)
     reason = (

@@ -60,7 +60,7 @@ def test_images_wait_for_their_joint_state(bench: Bench, images: Images) -> None
     bench.image("left", 1_020_000_000, images[0])
     bench.image("right", 1_020_000_000, images[1])
     # In between only the needle's length says that this is no needle: so it was waited for.
-    bench.until(lambda: len(bench.node.component.answers._queue) == 1)
+    bench.until(lambda: len(bench.tracker.answers._queue) == 1)
     bench.joints(1_010_000_000)
     bench.joints(1_030_000_000, INSERTION + 0.04)
     assert not found(bench.answer())
