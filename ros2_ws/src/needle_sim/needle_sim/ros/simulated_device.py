@@ -8,8 +8,11 @@ from typing import Any
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 
+from needle_core.component import Moment
 from needle_core.errors import UserError
 from needle_core.ros.base_node import DiagnosticsPublisher
+from needle_core.ros.discovery import signature
+from needle_device_driver.device import COMMANDS, HOLD, DeviceRows
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.states import Activity
@@ -74,16 +77,16 @@ class SimulatedDevice:
             path_delay=path_delay,
         )
         self._supervisor.configure(now)
+        self._rows = DeviceRows(self._supervisor, signature(node), simulated=True)
         self._interface = interface = DeviceInterface(
-            node,
-            self._supervisor,
-            diagnostics,
-            simulated=True,
-            refuse=refuse,
-            on_step_end=on_step_end,
+            node, self._rows, diagnostics, refuse=refuse, on_step_end=on_step_end
         )
         self.publishers = interface.publishers
-        self.subscriptions: list[Subscription[Any]] = [interface.commands, interface.holds]
+        self.subscriptions: list[Subscription[Any]] = [
+            interface.subscription(COMMANDS),
+            interface.subscription(HOLD),
+        ]
+        self._report()
 
     def missing(self) -> list[str]:
         """Return what else is not there yet: nothing.
@@ -93,8 +96,9 @@ class SimulatedDevice:
         UserError
             If there is another device.
         """
-        if self._interface.others:
-            raise UserError(self._interface.others)
+        self._interface.look_around()
+        if self._rows.others:
+            raise UserError(self._rows.others)
         return []
 
     def observe(self, now: float) -> None:
@@ -129,8 +133,8 @@ class SimulatedDevice:
     def end_tick(self, time_ns: int, now: float) -> bool:
         """Tell what the tick came to; returns whether it is over."""
         # Of the tick, whose joints stay what they are however long this process stood still in it.
-        self._interface.publish_joint_states(time_ns, now)
-        self._interface.report()
+        self._tell_joints(time_ns, now)
+        self._report()
         return True
 
     @property
@@ -151,9 +155,9 @@ class SimulatedDevice:
             Whether somebody may have missed the joints.
         """
         self._supervisor.note_time(time_ns, now)
-        self._interface.report()
+        self._report()
         if repeat:
-            self._interface.publish_joint_states(time_ns, now)
+            self._tell_joints(time_ns, now)
 
     def count_watchdog_trip(self) -> None:
         """Count a watchdog of sim_rig's."""
@@ -166,5 +170,11 @@ class SimulatedDevice:
     def close(self) -> None:
         """Stop the simulated axes and say so."""
         self._supervisor.close()
-        self._interface.report()
+        self._report()
         self._interface.close()
+
+    def _report(self) -> None:
+        self._interface.do(self._rows.report(self._interface.moment()))
+
+    def _tell_joints(self, time_ns: int, now: float) -> None:
+        self._interface.do(self._rows.joint_states(Moment(now, time_ns)))
