@@ -126,7 +126,7 @@ class PlaneController(Component):
         )
         self.timers = (Timer(0.1, self._on_timer),)
 
-    def configure(self, settings: SteeringSettings, at: Moment) -> Actions:
+    def on_settings(self, settings: SteeringSettings, at: Moment) -> Actions:
         """Take changed parameters."""
         self.settings = settings
         self.steering.configure(settings)

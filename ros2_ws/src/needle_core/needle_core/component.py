@@ -40,7 +40,7 @@ class Delivery:
     Attributes
     ----------
     depth : int
-        Messages that wait while the receiver is busy; of an unreliable topic the oldest goes.
+        Messages that wait while the receiver is busy; where there is no room the oldest goes.
     reliable : bool
         Whether a message that is sent arrives.
     latched : bool
@@ -130,12 +130,13 @@ Actions = Iterable[Action]
 
 @dataclass(frozen=True)
 class Input:
-    """A topic that the component receives."""
+    """A topic that the component receives; what has more than `longest` bytes is refused."""
 
     topic: str
     message: type[Any]
     handler: Callable[[Any, Moment], Actions]
     delivery: Delivery = RELIABLE
+    longest: int = 1 << 26
 
 
 @dataclass(frozen=True)
@@ -231,11 +232,14 @@ class Peers:
         Topic to the names of the nodes that receive it.
     services : frozenset of str
         Services that somebody offers.
+    nodes : frozenset of str
+        Full names of all nodes.
     """
 
     publishers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     subscribers: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     services: frozenset[str] = frozenset()
+    nodes: frozenset[str] = frozenset()
 
     @staticmethod
     def of(components: Iterable[Component]) -> Peers:
@@ -243,7 +247,9 @@ class Peers:
         publishers: dict[str, tuple[str, ...]] = {}
         subscribers: dict[str, tuple[str, ...]] = {}
         services: list[str] = []
+        nodes: list[str] = []
         for component in components:
+            nodes.append(component.name)
             services += [service.name for service in component.services]
             for output in component.outputs:
                 names = publishers.get(output.topic, ())
@@ -251,7 +257,7 @@ class Peers:
             for row in component.inputs:
                 names = subscribers.get(row.topic, ())
                 subscribers[row.topic] = (*names, component.name)
-        return Peers(publishers, subscribers, frozenset(services))
+        return Peers(publishers, subscribers, frozenset(services), frozenset(nodes))
 
 
 class Component:
@@ -281,6 +287,10 @@ class Component:
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Handle a change of what is known of other components."""
+        return ()
+
+    def on_settings(self, settings: Any, at: Moment) -> Actions:
+        """Take changed settings."""
         return ()
 
     def on_stop(self, at: Moment) -> Actions:

@@ -114,19 +114,27 @@ def _trajectory(message: Any) -> m.Trajectory:
         )
         for point in message.points
     ]
-    stamp_ns = to_nanoseconds(message.header.stamp)
-    return m.Trajectory(stamp_ns, tuple(message.joint_names), tuple(points))
+    names = tuple(message.joint_names)
+    return m.Trajectory(to_nanoseconds(message.header.stamp), names, tuple(points))
+
+
+def _joystick_fields(message: m.Joystick, t: MessageTypes, frame_id: str = "") -> dict[str, Any]:
+    return {
+        "header": t.header(message.stamp_ns, frame_id),
+        "axes": t.array(np.float32, message.axes),
+        "buttons": t.array(np.int32, message.buttons),
+    }
+
+
+def _joystick(message: Any) -> m.Joystick:
+    buttons = tuple(int(button) for button in message.buttons)
+    return m.Joystick(to_nanoseconds(message.header.stamp), _floats(message.axes), buttons)
 
 
 def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
-    axes = [message.speed_scale]
-    if math.isfinite(message.lifetime):
-        axes.append(message.lifetime)
-    return {
-        "header": t.header(message.stamp_ns, message.source),
-        "axes": t.array(np.float32, axes),
-        "buttons": t.array(np.int32, [int(message.pressed)]),
-    }
+    axes = (message.speed_scale, *filter(math.isfinite, (message.lifetime,)))
+    joystick = m.Joystick(message.stamp_ns, axes, (int(message.pressed),))
+    return _joystick_fields(joystick, t, message.source)
 
 
 def _hold(message: Any) -> m.HoldState:
@@ -142,13 +150,11 @@ def _hold(message: Any) -> m.HoldState:
 
 
 def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[str, Any]:
-    make = t.make("geometry_msgs/msg/PoseWithCovariance")
-    pose = t.pose(message.position, message.orientation)
-    covariance = t.array(np.float64, message.covariance)
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "pose": make(pose=pose, covariance=covariance),
-    }
+    pose = t.make("geometry_msgs/msg/PoseWithCovariance")(
+        pose=t.pose(message.position, message.orientation),
+        covariance=t.array(np.float64, message.covariance),
+    )
+    return {"header": t.header(message.stamp_ns, message.frame_id), "pose": pose}
 
 
 def _image_fields(message: m.Image, t: MessageTypes) -> dict[str, Any]:
@@ -225,10 +231,6 @@ def _marker(message: Any) -> m.Marker:
         _xyzw(message.pose.orientation),
         _xyz(message.scale),
     )
-
-
-def _markers_fields(message: m.Markers, t: MessageTypes) -> dict[str, Any]:
-    return {"markers": [_ros_marker(marker, t) for marker in message.markers]}
 
 
 def _ros_marker(marker: m.Marker, t: MessageTypes) -> Any:
@@ -315,10 +317,7 @@ TABLE: dict[type[Any], Row] = {
         "sensor_msgs/msg/JointState",
         _joint_state_fields,
         lambda r: m.JointState(
-            to_nanoseconds(r.header.stamp),
-            tuple(r.name),
-            _floats(r.position),
-            _floats(r.velocity),
+            to_nanoseconds(r.header.stamp), tuple(r.name), _floats(r.position), _floats(r.velocity)
         ),
     ),
     m.Trajectory: Row("trajectory_msgs/msg/JointTrajectory", _trajectory_fields, _trajectory),
@@ -328,6 +327,7 @@ TABLE: dict[type[Any], Row] = {
         lambda r: m.CommandResult(to_nanoseconds(r.stamp), r.frame_id),
     ),
     m.HoldState: Row("sensor_msgs/msg/Joy", _hold_fields, _hold),
+    m.Joystick: Row("sensor_msgs/msg/Joy", _joystick_fields, _joystick),
     m.EmergencyStop: Row(
         "std_msgs/msg/Bool",
         lambda message, t: {"data": message.pressed},
@@ -382,7 +382,7 @@ TABLE: dict[type[Any], Row] = {
     ),
     m.Markers: Row(
         "visualization_msgs/msg/MarkerArray",
-        _markers_fields,
+        lambda message, t: {"markers": [_ros_marker(marker, t) for marker in message.markers]},
         lambda r: m.Markers(tuple(_marker(marker) for marker in r.markers)),
     ),
     m.Status: Row(_STATUS, _status_fields, _status),

@@ -88,6 +88,15 @@ class HoldState:
 
 
 @dataclass(frozen=True)
+class Joystick:
+    """State of a joystick: its axes, -1 to 1, and its buttons."""
+
+    stamp_ns: int
+    axes: tuple[float, ...]
+    buttons: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class EmergencyStop:
     """State of the emergency stop."""
 

@@ -24,6 +24,7 @@ MESSAGES = (
     m.CommandResult(STAMP, "aborted: hold released"),
     m.HoldState(STAMP, "person", True, 0.5, 0.125),
     m.HoldState(STAMP, "person", False, 0.0),
+    m.Joystick(STAMP, (0.5, -1.0), (1, 0, 1)),
     m.EmergencyStop(True),
     m.Point(STAMP, "rig", (0.1, -0.2, 0.3)),
     m.Vector(STAMP, "target_plane", (0.1, -0.2, 0.3)),

@@ -1,4 +1,4 @@
-"""The `operator` executable: what a person holds becomes the hold to run."""
+"""The `operator` executable: the component `Operator` as a ROS node, with its input device."""
 
 from __future__ import annotations
 
@@ -7,21 +7,28 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from rclpy.task import Future
-from sensor_msgs.msg import Joy
 from std_srvs.srv import Trigger
 
+from needle_bringup.operator.component import CALLED, HOLD, PERIOD, RELEASES, Operator
 from needle_bringup.operator.event_source import Device, EventSource
-from needle_bringup.operator.hold_gate import Grip, Held, HoldGate
 from needle_bringup.operator.input_device import InputDevice
-from needle_bringup.operator.joy_source import JoySource
-from needle_bringup.operator.retraction import RETRACT, STOP_STEERING, Retraction
-from needle_bringup.ros.operator_parameters import JOY, OperatorParameters
+from needle_bringup.operator.parameters import JOY, OperatorParameters
 from needle_core.commands.cli import EXIT_DONE
-from needle_core.diagnostics import Diagnostic, Level
-from needle_core.messages import HOLD_LIFETIME
+from needle_core.component import (
+    Actions,
+    Answer,
+    Call,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Peers,
+    Publish,
+)
+from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.message_types import rclpy_types
 from needle_core.process.end_request import EndRequest
 from needle_core.ros.base_node import (
     LOOK_PERIOD,
@@ -31,8 +38,7 @@ from needle_core.ros.base_node import (
     run_node,
 )
 from needle_core.ros.bounded_subscription import listen
-from needle_core.ros.conversions import HOLD, LATCHED, to_nanoseconds, values_of
-from needle_core.ros.hold_topic import HoldTopic
+from needle_core.ros.conversions import to_qos
 from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
@@ -51,15 +57,11 @@ Subscribes  joy (source joy), device/status
 Calls       device/stop, device/retract, plane_controller/stop
 """
 
-HOLD_RATE = 50.0
-DEVICE_STOP = "device/stop"
-# The hold is best effort: a release worth sending is worth sending again.
-RELEASES = 3
 _RELEASE_PERIOD = 0.02
 
 
 class OperatorNode(WholeNode):
-    """Shell around a source, `HoldGate` and `Retraction`.
+    """The ROS shell of `Operator`: hears, reads the input device, publishes, calls.
 
     Parameters
     ----------
@@ -69,106 +71,91 @@ class OperatorNode(WholeNode):
 
     def __init__(self, open_device: Callable[[str], Device] = InputDevice) -> None:
         super().__init__("operator")
-        self._settings = NodeParameters(self, OperatorParameters)
+        self._settings = NodeParameters(self, OperatorParameters, self._on_parameters)
+        values = self._settings.values
+        self._component = Operator(values, self.get_name())
+        self._types = rclpy_types()
+        self._converter = Converter(self._types)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._source = self._make_source(open_device)
-        self._gate = HoldGate()
-        self._retraction = Retraction(self.get_name())
-        self._grip = Grip()
-        self._press_again = False
-        self._told = ""
-        self._hold = HoldTopic(self, self.get_name(), HOLD_LIFETIME)
-        self._service_clients = {
-            name: self.create_client(Trigger, name)
-            for name in (DEVICE_STOP, RETRACT, STOP_STEERING)
-        }
-        self.create_subscription(DiagnosticStatus, "device/status", self._on_device, LATCHED)
+        (row,) = self._component.outputs
+        kind = self._types.make(ros_type(row.message))
+        self._hold = self.create_publisher(kind, HOLD, to_qos(row.delivery))
+        self._service_clients = {name: self.create_client(Trigger, name) for name in CALLED}
+        self._sources = {row.topic: self._hear(row) for row in self._component.inputs}
         self._life = LifeSigns(self, self._diagnostics, "holds for a person", self._missing)
+        if values.source == JOY:
+            look = self._component.timers[0].handler
+        else:
+            source = EventSource(
+                values.device,
+                values.controls,
+                lambda: self._settings.values.speed_scale,
+                open_device,
+            )
+            (port,) = self._component.ports
+
+            def look(at: Moment) -> Actions:
+                return port.handler((source.read(at.steady),), at)
+
         # The hold must not follow simulated time: steady clock.
-        self.create_timer(1.0 / HOLD_RATE, self._on_timer, clock=STEADY_CLOCK)
+        self.create_timer(PERIOD, functools.partial(self._on_timer, look), clock=STEADY_CLOCK)
 
     def release(self) -> None:
         """Say that nothing is held."""
-        self._hold.publish(pressed=False, speed=0.0)
+        self._do((self._component.hold(_now(), pressed=False, speed=0.0),))
 
-    def _make_source(self, open_device: Callable[[str], Device]) -> EventSource | JoySource:
-        values = self._settings.values
+    def _hear(self, row: Input) -> Any:
+        def hear(messages: list[Any]) -> None:
+            self._do(row.handler(from_ros(row.message, messages[-1]), _now()))
 
-        def speed() -> float:
-            return self._settings.values.speed_scale
-
-        if values.source != JOY:
-            return EventSource(values.device, values.controls, speed, open_device)
-
-        def on_joy(messages: list[Joy]) -> None:
-            last = messages[-1]
-            stamp = to_nanoseconds(last.header.stamp) / 1e9
-            joy.take(last.axes, last.buttons, time.monotonic(), stamp=stamp)
-
-        # The newest alone: what waited behind a stall is no hand of now.
-        topic = listen(self, Joy, "joy", on_joy, HOLD, refuse=self._diagnostics.refuse)
-        joy = JoySource(values.controls, speed, topic.get_publisher_count)
-        return joy
+        kind, qos = self._types.make(ros_type(row.message)), to_qos(row.delivery)
+        return listen(self, kind, row.topic, hear, qos, refuse=self._diagnostics.refuse)
 
     def _missing(self) -> list[str]:
-        missing = [] if self._hold.is_heard else ["subscriber of device/hold"]
-        return [self._grip.trouble, *missing] if self._grip.trouble else missing
+        missing = [] if self._hold.get_subscription_count() else [f"subscriber of {HOLD}"]
+        trouble = self._component.trouble
+        return [trouble, *missing] if trouble else missing
 
-    def _on_timer(self) -> None:
-        now = time.monotonic()
-        grip = self._grip = self._gate.take(self._source.read(now), now)
-        controller = self._service_clients[STOP_STEERING].service_is_ready()
-        call = self._retraction.look(grip.held is Held.RETRACT, now, controller=controller)
-        pressed = grip.held is Held.INSERT or self._retraction.holds
-        self._hold.publish(pressed=pressed, speed=grip.speed)
-        if grip.stop:
-            self._call(DEVICE_STOP)
-        if call is not None:
-            self._call(call)
-        self._report()
+    def _on_timer(self, look: Callable[[Moment], Actions]) -> None:
+        at = _now()
+        publishers = {
+            topic: (topic,) * source.get_publisher_count()
+            for topic, source in self._sources.items()
+        }
+        ready = (
+            name for name, client in self._service_clients.items() if client.service_is_ready()
+        )
+        self._do(self._component.on_peers(Peers(publishers, {}, frozenset(ready)), at))
+        self._do(look(at))
 
-    def _call(self, service: str) -> None:
-        future = self._service_clients[service].call_async(Trigger.Request())
-        future.add_done_callback(functools.partial(self._on_answer, service))
+    def _on_parameters(self, values: OperatorParameters) -> None:
+        self._do(self._component.on_settings(values, _now()))
+
+    def _do(self, actions: Actions) -> None:
+        for action in actions:
+            match action:
+                case Publish(_, message):
+                    self._hold.publish(self._converter.to_ros(message))
+                case Call(service):
+                    future = self._service_clients[service].call_async(Trigger.Request())
+                    future.add_done_callback(functools.partial(self._on_answer, service))
+                case Diagnose(part, diagnostic):
+                    self._diagnostics.set(part, diagnostic)
+                # rclpy wants each place in the code to keep to one level.
+                case Log("info", text):
+                    self.get_logger().info(text)
+                case Log(_, text):
+                    self.get_logger().warning(text)
 
     def _on_answer(self, service: str, future: Future[Any]) -> None:
-        answer = future.result()
-        if answer is not None:
-            self._retraction.take_answer(service, answer.success, answer.message, time.monotonic())
+        reply = future.result()
+        if reply is not None:
+            answer = Answer(service, reply.success, reply.message)
+            self._do(self._component.on_answer(answer, _now()))
 
-    def _on_device(self, message: DiagnosticStatus) -> None:
-        values = values_of(message)
-        self._press_again = values.get("press_again") == self.get_name()
-        owner, activity = values.get("hold_owner", ""), values.get("activity", "")
-        self._retraction.see_device(owner, activity, time.monotonic())
 
-    def _report(self) -> None:
-        level, text = self._health()
-        self._diagnostics.set("hold", Diagnostic(level, text))
-        if text == self._told:
-            return
-        self._told = text
-        # rclpy wants each place in the code to keep to one level.
-        if level is Level.OK:
-            self.get_logger().info(text)
-        else:
-            self.get_logger().warning(text)
-
-    def _health(self) -> tuple[Level, str]:
-        grip = self._grip
-        if grip.trouble:
-            return Level.WARN, f"nothing is held: {grip.trouble}"
-        if self._retraction.trouble:
-            return Level.WARN, f"not drawn out: {self._retraction.trouble}"
-        if grip.unheeded:
-            return Level.WARN, "what is held does not count: let go of all, then press again"
-        if self._press_again and grip.held is not Held.NOTHING:
-            return Level.WARN, "the device does not take this press: let go, then press again"
-        return Level.OK, {
-            Held.NOTHING: "nothing is held",
-            Held.INSERT: "held to insert",
-            Held.RETRACT: "held to draw the needle out",
-        }[grip.held]
+def _now() -> Moment:
+    return Moment(time.monotonic(), time.time_ns())
 
 
 def _spin(node: Node, end: EndRequest) -> int:

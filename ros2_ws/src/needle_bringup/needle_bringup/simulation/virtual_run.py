@@ -21,7 +21,8 @@ from needle_core.component import Action, Component, Exit, Output, Publish
 from needle_core.errors import UserError
 from needle_core.files.calibration_text import read_calibration
 from needle_core.files.installed import find_shared
-from needle_core.runners.virtual import DIAGNOSTICS, LOG, Compute, VirtualRunner, uniform
+from needle_core.runners.process import Compute, uniform
+from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_core.settings.parameter_fields import from_values
 from needle_core.settings.parameter_files import Parameters
 from needle_core.status_messages import ControllerStatus

@@ -13,7 +13,7 @@ from sensor_msgs.msg import Joy
 from std_srvs.srv import Trigger
 
 from needle_bringup.operator.controls import Controls
-from needle_bringup.ros.operator_parameters import OperatorParameters
+from needle_bringup.operator.parameters import OperatorParameters
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import own_domain
 from needle_core.ros.conversions import RELIABLE, to_nanoseconds

@@ -177,7 +177,7 @@ class PlaneControllerNode(WholeNode):
         self._do(row.handler(from_ros(row.message, message), self._moment(sent_ns)))
 
     def _on_parameters(self, values: SteeringSettings) -> None:
-        self._do(self._component.configure(values, self._moment()))
+        self._do(self._component.on_settings(values, self._moment()))
 
     def _on_timer(self, handler: Any) -> None:
         steady = self._watched.read(time.monotonic())

@@ -103,6 +103,24 @@ def publishers_of(node: Node, topic: str) -> list[str]:
     ]
 
 
+def subscribers_of(node: Node, topic: str) -> list[str]:
+    """Return the full names of the nodes that receive a topic, one for each subscription.
+
+    Parameters
+    ----------
+    node : Node
+        The node that asks.
+    topic : str
+        Its name as the node would give it.
+    """
+    infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
+    return [
+        full_name(info.node_namespace, info.node_name)
+        for info in infos
+        if info.node_name != _UNKNOWN
+    ]
+
+
 def known_publishers_of(node: Node, topic: str) -> set[str]:
     """Return the full names of the other nodes that publish a topic, as far as they are known.
 

@@ -4,29 +4,46 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 
-@dataclass(frozen=True)
-class Link:
-    """The way of a topic's messages from one component to another."""
+class Link(NamedTuple):
+    """The way of a topic's messages, a service's calls or a port's batches between components."""
 
     sender: str
     topic: str
     receiver: str
 
 
-Arrivals = Sequence[tuple[float, Any]]
+class Arrival(NamedTuple):
+    """One arrival of a message.
+
+    Attributes
+    ----------
+    late : float
+        How much later than usual [s].
+    message : object
+        What arrives.
+    overtakes : bool
+        Whether it may arrive before what was sent earlier.
+    """
+
+    late: float
+    message: Any
+    overtakes: bool = False
+
+
+Arrivals = Sequence[Arrival]
 Fault = Callable[[Link, Any, float, random.Random], Arrivals]
-"""(link, message, time [s], random stream) to pairs of extra delay [s] and message; none: lost."""
+"""(link, message, time [s], random stream) to what arrives; nothing: it is lost."""
 
 
 def drop(topic: str, share: float) -> Fault:
     """Return a fault that loses a share of a topic's messages."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        return () if link.topic == topic and rng.random() < share else ((0.0, message),)
+        lost = link.topic == topic and rng.random() < share
+        return () if lost else (Arrival(0.0, message),)
 
     return fault
 
@@ -35,7 +52,7 @@ def delay(topic: str, seconds: float) -> Fault:
     """Return a fault that delays a topic's messages."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        return ((seconds if link.topic == topic else 0.0, message),)
+        return (Arrival(seconds if link.topic == topic else 0.0, message),)
 
     return fault
 
@@ -44,8 +61,8 @@ def duplicate(topic: str, seconds: float) -> Fault:
     """Return a fault that delivers each message of a topic once more after some time."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        once = ((0.0, message),)
-        return (*once, (seconds, message)) if link.topic == topic else once
+        once = Arrival(0.0, message)
+        return (once, Arrival(seconds, message, True)) if link.topic == topic else (once,)
 
     return fault
 
@@ -54,6 +71,7 @@ def silence(sender: str, begin: float, end: float) -> Fault:
     """Return a fault that loses all that a component sends for some time."""
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        return () if link.sender == sender and begin <= now < end else ((0.0, message),)
+        lost = link.sender == sender and begin <= now < end
+        return () if lost else (Arrival(0.0, message),)
 
     return fault

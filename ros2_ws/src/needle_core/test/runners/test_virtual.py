@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import pytest
 
 from needle_core.component import (
     LATCHED,
     RELIABLE,
-    Action,
     Actions,
     Answer,
     Call,
@@ -18,99 +16,27 @@ from needle_core.component import (
     Delivery,
     Diagnose,
     Exit,
-    Input,
     Log,
     Moment,
-    Output,
-    Peers,
     Port,
     Publish,
     Reply,
     Send,
-    Service,
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
-from needle_core.messages import EmergencyStop, Point
-from needle_core.runners.faults import Fault, delay, drop, duplicate, silence
-from needle_core.runners.virtual import ANSWER_TIMEOUT, DISCOVERY, START_NS, VirtualRunner
+from needle_core.messages import EmergencyStop
+from needle_core.runners.faults import (
+    Fault,
+    delay,
+    drop,
+    duplicate,
+    silence,
+)
+from needle_core.runners.timeline import START_NS
+from needle_core.runners.virtual import ANSWER_TIMEOUT, DISCOVERY, VirtualRunner
 
-
-class Sender(Component):
-    """Counts on `numbers`, every 0.1 s."""
-
-    def __init__(self, name: str = "sender", delivery: Delivery = RELIABLE) -> None:
-        self.name = name
-        self.count = 0
-        self.outputs = (Output("numbers", Point, delivery),)
-        self.timers = (Timer(0.1, self._send),)
-
-    def _send(self, at: Moment) -> Actions:
-        self.count += 1
-        yield Publish("numbers", Point(at.stamp_ns, "rig", (float(self.count), 0.0, 0.0)))
-
-
-class Receiver(Component):
-    """Keeps what it receives, with the moment."""
-
-    def __init__(self, name: str = "receiver", delivery: Delivery = RELIABLE) -> None:
-        self.name = name
-        self.received: list[tuple[float, Moment]] = []
-        self.peers: list[Peers] = []
-        self.inputs = (Input("numbers", Point, self._receive, delivery),)
-
-    @property
-    def numbers(self) -> list[int]:
-        return [int(number) for number, _ in self.received]
-
-    def on_peers(self, peers: Peers, at: Moment) -> Actions:
-        self.peers.append(peers)
-        return ()
-
-    def _receive(self, message: Point, at: Moment) -> Actions:
-        self.received.append((message.position[0], at))
-        return ()
-
-
-class Once(Component):
-    """Does something at 0.5 s, and keeps the answers to its calls."""
-
-    def __init__(self, actions: Sequence[Action], name: str = "once") -> None:
-        self.name = name
-        self.answers: list[Answer] = []
-        self.outputs = (Output("numbers", Point, LATCHED), Output("stop", EmergencyStop))
-        self.timers = (Timer(0.1, self._tick),)
-        self._actions = list(actions)
-
-    def _tick(self, at: Moment) -> Actions:
-        if at.steady >= 0.5:
-            while self._actions:
-                yield self._actions.pop(0)
-
-    def on_answer(self, answer: Answer, at: Moment) -> Actions:
-        self.answers.append(answer)
-        return ()
-
-
-class Server(Component):
-    """Answers as it is told."""
-
-    name = "server"
-
-    def __init__(self, answer: Callable[[bool | None, int, Moment], Actions]) -> None:
-        self.services = (Service("serve", answer, has_argument=True),)
-
-
-def run(
-    components: Sequence[Component], seconds: float = 3.0, **options: Any
-) -> tuple[VirtualRunner, list[tuple[Any, ...]]]:
-    told: list[tuple[Any, ...]] = []
-    tap = lambda stamp, sender, message, output: told.append(  # noqa: E731
-        (stamp, sender, output.topic, message)
-    )
-    runner = VirtualRunner(components, taps=(tap,), **options)
-    runner.run(seconds)
-    return runner, told
+from .runner_scene import Once, Receiver, Sender, Server, run
 
 
 def test_the_same_seed_is_the_same_run_and_another_seed_another() -> None:
@@ -268,7 +194,7 @@ def test_a_component_that_is_asked_to_end_exits() -> None:
     runner.stop("sender")
     assert runner.run(1.0)
     assert runner.exits == {"sender": Exit(0)}
-    with pytest.raises(ValueError, match="no component 'nobody': sender"):
+    with pytest.raises(ValueError, match="no component 'nobody'"):
         runner.stop("nobody")
 
 

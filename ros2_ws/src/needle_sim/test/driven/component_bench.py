@@ -25,7 +25,7 @@ from needle_core.component import (
     Publish,
     Timer,
 )
-from needle_core.runners.faults import Arrivals, Fault, Link
+from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
 from needle_core.runners.virtual import DIAGNOSTICS, VirtualRunner
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.parameters import DeviceDriverParameters
@@ -119,7 +119,7 @@ class ComponentBench:
     def _note(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic == CAN:
             self.frames += [(now, link.sender, frame) for frame in message]
-        return ((0.0, message),)
+        return (Arrival(0.0, message),)
 
     @property
     def state(self) -> str:
@@ -238,7 +238,8 @@ def losing(
 
     def fault(link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
         if link.topic != CAN or link.sender != DRIVES or not begin() <= now < end():
-            return ((0.0, message),)
-        return ((0.0, tuple(f for f in message if f.identifier not in identifiers)),)
+            return (Arrival(0.0, message),)
+        kept = tuple(f for f in message if f.identifier not in identifiers)
+        return (Arrival(0.0, kept),)
 
     return fault

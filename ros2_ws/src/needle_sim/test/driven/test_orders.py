@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from needle_core.component import Peers
+from needle_core.component import Answer, Peers
 from needle_core.runners.faults import silence
 
 from .component_bench import DRIVER, DRIVES, ComponentBench, losing
@@ -152,10 +152,13 @@ def test_a_reset_that_is_called_off_sends_nothing_more_and_fails(name: str) -> N
     bench.until(lambda: bool(bench.sent(lost[0], 0x602)))
     answers = len(bench.person.answers)
     RESET_CALLED_OFF[name](bench)
-    bench.until(lambda: len(bench.person.answers) > answers)
-    replies = {a.service: a for a in bench.person.answers[answers:]}
-    assert not replies["device/reset"].success
-    assert "called off" in replies["device/reset"].text
+
+    def replies() -> dict[str, Answer]:
+        return {a.service: a for a in bench.person.answers[answers:]}
+
+    bench.until(lambda: "device/reset" in replies())
+    assert not replies()["device/reset"].success
+    assert "called off" in replies()["device/reset"].text
     bench.mark()
     bench.run(1.5)
     assert bench.sent(bench.marked, *SDO) == []

@@ -1,0 +1,358 @@
+"""A component as a ROS node: the one node class behind the executables of components."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial
+from typing import Any, Protocol
+
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.client import Client
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.serialization import deserialize_message
+from rclpy.task import Future
+from std_srvs.srv import SetBool, Trigger
+
+from needle_core.component import (
+    Action,
+    Actions,
+    Answer,
+    Call,
+    Component,
+    Diagnose,
+    Exit,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Reply,
+    Send,
+    Service,
+    Timer,
+)
+from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.message_types import rclpy_types
+from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
+from needle_core.ros.conversions import to_qos
+from needle_core.ros.discovery import full_name, publishers_of, signature, subscribers_of
+from needle_core.ros.parameters import NodeParameters
+from needle_core.ros.whole_node import WholeNode
+
+ANSWER_TIMEOUT = 5.0
+"""A call without an answer is given up after this time [s]."""
+LOG_PERIOD = 2.0
+"""Time between two lines of log of one kind [s]."""
+_PEERS_PERIOD = 0.2
+
+
+class RealPort(Protocol):
+    """The real implementation of a component's port; it may have a reader thread."""
+
+    def open(self, arrive: Callable[[Any], None]) -> None:
+        """Begin; `arrive` takes a batch, or a `PortChange`, from any thread."""
+
+    def send(self, batch: tuple[Any, ...]) -> None:
+        """Send a batch; never waits."""
+
+    def close(self) -> None:
+        """End, after what was sent is out."""
+
+
+class ComponentNode(WholeNode):
+    """Delivers messages and time to a component, and carries out its actions.
+
+    Parameters
+    ----------
+    name : str
+        Name of the node.
+    parameters : type
+        The component's settings dataclass, the node's parameters.
+    make : callable
+        Makes the component from its settings and the node's full name.
+    ports : callable
+        Returns the real ports of the component for its settings, by name.
+    node_arguments : dict
+        Passed on to rclpy's Node (a context of its own, parameter overrides).
+
+    Attributes
+    ----------
+    component : Component
+        What runs here.
+    outputs : dict of str to Publisher
+        By topic.
+    peers : Peers
+        What is known of other nodes.
+    exit : Exit or None
+        The component's wish to end.
+
+    Raises
+    ------
+    UserError
+        A parameter that is unknown, of the wrong type, out of bounds, or part of a bad whole.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        parameters: type[Any],
+        make: Callable[[Any, str], Component],
+        ports: Callable[[Any], Mapping[str, RealPort]] = lambda _: {},
+        **node_arguments: Any,
+    ) -> None:
+        super().__init__(name, **node_arguments)
+        self._own, self._begun = name, time.monotonic()
+        # A service that answers later keeps no other callback from running.
+        self._group = ReentrantCallbackGroup()
+        settings = NodeParameters(self, parameters, self._on_parameters).values
+        self.component = make(settings, signature(self))
+        self.exit: Exit | None = None
+        self._types = rclpy_types()
+        self._converter = Converter(self._types)
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._failures = 0
+        self._logged: dict[str, float] = {}
+        self.peers = Peers()
+        self._requests: dict[int, Future[Reply]] = {}
+        self._calls: dict[int, tuple[Call, float, Future[Any] | None]] = {}
+        self._numbers = 0
+        self._service_clients: dict[str, Client[Any, Any]] = {}
+        self._ports = dict(ports(settings))
+        self._arrived: deque[tuple[str, Any]] = deque()
+        self._bell = self.create_guard_condition(self._take_arrived)
+        self.outputs = {row.topic: self._advertise(row) for row in self.component.outputs}
+        for row in self.component.inputs:
+            self._hear(row)
+        for service in self.component.services:
+            self._offer(service)
+        for timer in self.component.timers:
+            self._repeat(timer)
+        self.create_timer(_PEERS_PERIOD, self._look_around, clock=STEADY_CLOCK)
+        for port_name, port in self._ports.items():
+            port.open(partial(self._arrive, port_name))
+        self.get_logger().info(f"runs (ROS_DOMAIN_ID {self.context.get_domain_id()})")
+
+    def stop(self) -> None:
+        """Ask the component to end."""
+        self._handle(lambda: self.component.on_stop(self._moment()))
+
+    def close(self) -> None:
+        """Close the ports."""
+        for port in self._ports.values():
+            port.close()
+
+    def _moment(self, sent_ns: int = 0) -> Moment:
+        steady = time.monotonic() - self._begun
+        return Moment(steady, self.get_clock().now().nanoseconds, sent_ns)
+
+    def _name_of(self, topic: str) -> str:
+        """Return a row's name as rclpy resolves it: below the node's own where it says so."""
+        prefix = f"{self._own}/"
+        return f"~/{topic.removeprefix(prefix)}" if topic.startswith(prefix) else topic
+
+    # ---- rows ---------------------------------------------------------------------------------
+
+    def _advertise(self, row: Output) -> Any:
+        kind = self._types.make(ros_type(row.message))
+        return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
+
+    def _hear(self, row: Input) -> None:
+        def on_incompatible(_: Any) -> None:
+            cure = "transient_local" if row.delivery.latched else "reliable"
+            option = "durability" if row.delivery.latched else "reliability"
+            why = f"a publisher's QoS does not fit: --qos-{option} {cure} does"
+            self._diagnostics.refuse(row.topic, "incompatible QoS", why)
+
+        # Raw: what cannot be decoded must not raise out of the executor.
+        self.create_subscription(
+            self._types.make(ros_type(row.message)),
+            self._name_of(row.topic),
+            lambda data, info: self._on_bytes(row, data, info),
+            to_qos(row.delivery),
+            raw=True,
+            callback_group=self._group,
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
+        )
+
+    def _on_bytes(self, row: Input, data: bytes, info: Mapping[str, int]) -> None:
+        if len(data) > row.longest:
+            why = f"{len(data)} bytes, at most {row.longest}"
+            self._diagnostics.refuse(row.topic, "too long", why)
+            return
+        try:
+            kind = self._types.make(ros_type(row.message))
+            message = from_ros(row.message, deserialize_message(data, kind))
+        except Exception as error:  # noqa: BLE001 - whatever the middleware raises
+            why = f"{len(data)} bytes: {type(error).__name__}: {error}"
+            self._diagnostics.refuse(row.topic, "undecodable", why)
+            return
+        sent_ns = info["source_timestamp"]
+        self._handle(lambda: row.handler(message, self._moment(sent_ns)))
+
+    def _repeat(self, timer: Timer) -> None:
+        def run() -> None:
+            # What has come at a port came before the time that goes by now.
+            self._take_arrived()
+            self._handle(lambda: timer.handler(self._moment()))
+
+        self.create_timer(timer.period, run, clock=STEADY_CLOCK, callback_group=self._group)
+
+    def _offer(self, service: Service) -> None:
+        async def answer(request: Any, response: Any) -> Any:
+            number = self._number()
+            reply: Future[Reply] = Future(executor=self.executor)
+            self._requests[number] = reply
+            argument = request.data if service.has_argument else None
+            self._handle(lambda: service.handler(argument, number, self._moment()))
+            told = await reply
+            response.success, response.message = told.success, told.text
+            return response
+
+        kind = SetBool if service.has_argument else Trigger
+        name = self._name_of(service.name)
+        self.create_service(kind, name, answer, callback_group=self._group)
+
+    # ---- ports --------------------------------------------------------------------------------
+
+    def _arrive(self, port: str, batch: Any) -> None:
+        """Take a batch, or what has become of the port, from a port's thread."""
+        self._arrived.append((port, batch))
+        self._bell.trigger()
+
+    def _take_arrived(self) -> None:
+        while self._arrived:
+            name, batch = self._arrived.popleft()
+            for row in self.component.ports:
+                if row.name == name:
+                    handler = row.handler if isinstance(batch, tuple) else row.on_change
+                    self._handle(partial(self._pass_on, handler, batch))
+
+    def _pass_on(self, handler: Callable[[Any, Moment], Actions], batch: Any) -> Actions:
+        return handler(batch, self._moment())
+
+    # ---- actions ------------------------------------------------------------------------------
+
+    def _handle(self, work: Callable[[], Actions]) -> None:
+        """Carry out the actions of a handler; one that raises is reported and ends nothing."""
+        if self.exit is not None:
+            return
+        try:
+            actions: Iterable[Action] = list(work())
+        except Exception as error:  # noqa: BLE001 - whatever a message may lead to
+            self._failures += 1
+            text = f"internal error: {type(error).__name__}: {error}"
+            values = {"failures": str(self._failures)}
+            failed = Diagnose("handlers", Diagnostic(Level.ERROR, text, values))
+            actions = [Log("error", text, kind=text), failed]
+        for action in actions:
+            self._do(action)
+
+    def _do(self, action: Action) -> None:
+        match action:
+            case Publish(topic, message):
+                self.outputs[topic].publish(self._converter.to_ros(message))
+            case Send(port, batch):
+                self._ports[port].send(batch)
+            case Call():
+                self._call(action)
+            case Reply(number):
+                reply = self._requests.pop(number, None)
+                if reply is not None:
+                    reply.set_result(action)
+            case Diagnose(part, diagnostic):
+                self._diagnostics.set(part, diagnostic)
+            case Log():
+                self._log(action)
+            case Exit():
+                self.exit = action
+
+    def _log(self, line: Log) -> None:
+        now = time.monotonic()
+        if line.kind:
+            if now - self._logged.get(line.kind, -LOG_PERIOD) < LOG_PERIOD:
+                return
+            self._logged[line.kind] = now
+        # Not one call through a variable: rclpy knows a line by where it is called from.
+        if line.severity == "error":
+            self.get_logger().error(line.text)
+        elif line.severity == "warning":
+            self.get_logger().warning(line.text)
+        else:
+            self.get_logger().info(line.text)
+
+    def _number(self) -> int:
+        self._numbers += 1
+        return self._numbers
+
+    # ---- calls --------------------------------------------------------------------------------
+
+    def _call(self, call: Call) -> None:
+        client = self._service_clients.get(call.service)
+        if client is None:
+            kind = Trigger if call.request is None else SetBool
+            client = self.create_client(kind, call.service, callback_group=self._group)
+            self._service_clients[call.service] = client
+        number = self._number()
+        future: Future[Any] | None = None
+        if client.service_is_ready() or client.wait_for_service(0.0):
+            has_argument = call.request is not None
+            request = SetBool.Request(data=call.request) if has_argument else Trigger.Request()
+            future = client.call_async(request)
+            future.add_done_callback(partial(self._on_answer, number))
+        self._calls[number] = (call, time.monotonic() + ANSWER_TIMEOUT, future)
+
+    def _on_answer(self, number: int, future: Future[Any]) -> None:
+        response = future.result()
+        if response is not None:
+            self._end_call(number, response.success, response.message)
+
+    def _end_call(self, number: int, success: bool, text: str, *, answered: bool = True) -> None:
+        call, _, _ = self._calls.pop(number, (None, 0.0, None))
+        if call is not None:
+            answer = Answer(call.service, success, text, answered)
+            self._handle(lambda: self.component.on_answer(answer, self._moment()))
+
+    def _give_up_calls(self) -> None:
+        now = time.monotonic()
+        for number, (call, deadline, future) in list(self._calls.items()):
+            if future is None or now >= deadline:
+                if future is not None:
+                    self._service_clients[call.service].remove_pending_request(future)
+                why = "no server" if future is None else "no answer"
+                self._end_call(number, False, why, answered=False)
+
+    # ---- others -------------------------------------------------------------------------------
+
+    def _look_around(self) -> None:
+        self._give_up_calls()
+        rows: list[Input | Output] = [*self.component.inputs, *self.component.outputs]
+        topics = {row.topic: self._name_of(row.topic) for row in rows}
+        namespace = self.get_namespace().rstrip("/") + "/"
+        services = {name for name, _ in self.get_service_names_and_types()}
+        peers = Peers(
+            _known({topic: publishers_of(self, name) for topic, name in topics.items()}),
+            _known({topic: subscribers_of(self, name) for topic, name in topics.items()}),
+            frozenset(name.removeprefix(namespace) for name in services),
+            frozenset(full_name(space, name).lstrip("/") for name, space in self._nodes()),
+        )
+        if peers != self.peers:
+            self.peers = peers
+            self._handle(lambda: self.component.on_peers(peers, self._moment()))
+
+    def _nodes(self) -> list[tuple[str, str]]:
+        """Return names and namespaces of all nodes but hidden ones."""
+        known = self.get_node_names_and_namespaces()
+        return [(name, space) for name, space in known if not name.startswith("_")]
+
+    def _on_parameters(self, settings: Any) -> None:
+        self._handle(lambda: self.component.on_settings(settings, self._moment()))
+
+
+def _known(names: Mapping[str, Iterable[str]]) -> dict[str, tuple[str, ...]]:
+    """Return the topics with names, as `Peers` has them: without the first slash."""
+    found = {topic: tuple(sorted(n.lstrip("/") for n in some)) for topic, some in names.items()}
+    return {topic: some for topic, some in found.items() if some}

@@ -1,0 +1,152 @@
+"""A component as a process: its handlers run one after the other, each for its compute time."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+from needle_core.component import (
+    Action,
+    Actions,
+    Component,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Publish,
+)
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.runners.timeline import Timeline
+
+Compute = Callable[[Sequence[Action], random.Random], float]
+"""Compute time of a handler [s], from its actions and a random stream."""
+Work = Callable[[Moment], Actions]
+
+
+def uniform(shortest: float, longest: float) -> Compute:
+    """Return a compute time that is the same for all handlers, between two bounds [s]."""
+    return lambda actions, rng: rng.uniform(shortest, longest)
+
+
+class Process:
+    """A component with its queue.
+
+    Parameters
+    ----------
+    component : Component
+        What runs.
+    compute : Compute
+        Compute times of its handlers.
+    timeline : Timeline
+        Its time.
+    carry_out : callable
+        Carries out each action of a handler that has ended.
+
+    Attributes
+    ----------
+    is_alive : bool
+        Whether it runs; what has ended never does anything again.
+    slowness : float
+        What each handler takes longer than usual [s].
+    known : list of Process
+        Those that it knows.
+    latched : dict of str to object
+        Topic to its last message, for those that come late.
+    health : dict of str to Diagnostic
+        Part to what it last said of it.
+    """
+
+    def __init__(
+        self,
+        component: Component,
+        compute: Compute,
+        timeline: Timeline,
+        carry_out: Callable[[Process, Action], None],
+    ) -> None:
+        self.component = component
+        self.name = component.name
+        self.outputs = {output.topic: output for output in component.outputs}
+        self.inputs: dict[str, list[Input]] = {}
+        for row in component.inputs:
+            self.inputs.setdefault(row.topic, []).append(row)
+        self.is_alive = True
+        self.slowness = 0.0
+        self.known: list[Process] = []
+        self.latched: dict[str, Any] = {}
+        self.health: dict[str, Diagnostic] = {}
+        self._compute, self._timeline, self._carry_out = compute, timeline, carry_out
+        self._busy = False
+        self._frozen_until = 0.0
+        self._queue: deque[tuple[str, Work, int]] = deque()
+        self._waiting: Counter[str] = Counter()
+        self._streams: dict[str, random.Random] = {}
+        self._failures = 0
+
+    @property
+    def stands_still(self) -> bool:
+        """Tell whether it is frozen."""
+        return self._timeline.now < self._frozen_until
+
+    def offer(self, source: str, work: Work, *, depth: int | None = None, sent_ns: int = 0) -> None:
+        """Queue an event; of one source only the newest `depth` wait."""
+        if not self.is_alive:
+            return
+        if depth is not None and self._waiting[source] >= depth:
+            oldest = next(n for n, item in enumerate(self._queue) if item[0] == source)
+            del self._queue[oldest]
+            self._waiting[source] -= 1
+        self._waiting[source] += 1
+        self._queue.append((source, work, sent_ns))
+        self._work_off()
+
+    def freeze(self, seconds: float) -> None:
+        """Stand still from now on, as a stopped process does."""
+        self._frozen_until = max(self._frozen_until, self._timeline.now + seconds)
+        self._timeline.call_at(self._frozen_until, self._work_off)
+
+    def end(self) -> None:
+        """Do nothing any more."""
+        self.is_alive = False
+        self._queue.clear()
+
+    def _work_off(self) -> None:
+        if self._busy or not self._queue or self.stands_still:
+            return
+        self._busy = True
+        source, work, sent_ns = self._queue.popleft()
+        self._waiting[source] -= 1
+        actions = self._handle(work, self._timeline.moment(sent_ns))
+        stream = self._streams.get(source)
+        if stream is None:
+            stream = self._streams[source] = self._timeline.stream(f"{self.name}/{source}")
+        seconds = self._compute(actions, stream) + self.slowness
+        self._timeline.call_after(seconds, partial(self._finish, actions))
+
+    def _handle(self, work: Work, at: Moment) -> list[Action]:
+        """Return the actions of a handler; one that raises is reported and ends nothing."""
+        actions: list[Action] = []
+        try:
+            for action in work(at):
+                if isinstance(action, Publish) and action.topic not in self.outputs:
+                    raise ValueError(f"{action.topic} is not among its outputs")
+                actions.append(action)
+        except Exception as error:  # noqa: BLE001
+            self._failures += 1
+            text = f"internal error: {type(error).__name__}: {error}"
+            values: dict[str, Any] = {"failures": str(self._failures)}
+            actions.append(Log("error", text))
+            actions.append(Diagnose("handlers", Diagnostic(Level.ERROR, text, values)))
+        return actions
+
+    def _finish(self, actions: Sequence[Action]) -> None:
+        if self.stands_still:
+            self._timeline.call_at(self._frozen_until, partial(self._finish, actions))
+            return
+        self._busy = False
+        for action in actions:
+            if self.is_alive:
+                self._carry_out(self, action)
+        self._work_off()
