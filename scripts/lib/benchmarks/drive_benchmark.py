@@ -6,9 +6,11 @@ SYNC arrives. The ways take turns, so that what else the machine does falls on a
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
+import queue
 import subprocess
 import sys
 import tempfile
@@ -36,7 +38,7 @@ from canopen.profiles.p402 import BaseNode402
 from needle_core.component import PortChange
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_port import CanPort
+from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
@@ -82,7 +84,9 @@ class Driver:
         values = DeviceDriverParameters()
         settings = LinkSettings("slcan", channel, BITRATE)
         self._link = FrameLink(settings)
-        self._port = CanPort(settings, time.monotonic, lambda: None)
+        self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
+        self._port = CanPort(settings)
+        self._port.open(self._arrived.put)
         self._axes = [
             Cia402Axis(name, values.drive(name), self._link, period=PERIOD, watchdog=0.5)
             for name in ("insertion", "rotation")
@@ -120,18 +124,15 @@ class Driver:
 
     def _wait(self, is_there: Callable[[], bool], seconds: float) -> None:
         """Send what is to be sent, and take what comes."""
+        self._port.send(self._link.take_sent())
         until = self._now() + seconds
-        while True:
-            self._port.send(self._link.take_sent())
-            for item in self._port.take():
+        with contextlib.suppress(queue.Empty):
+            while not is_there():
+                item = self._arrived.get(timeout=max(until - self._now(), 0.0))
                 if isinstance(item, PortChange):
                     self._link.change(item.lost)
                 else:
-                    self._link.receive([item])
-            left = until - self._now()
-            if is_there() or left <= 0.0:
-                return
-            self._port.wait(left)
+                    self._link.receive(item)
 
 
 class PlainSlcan:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
-from collections import deque
+import time
 from collections.abc import Callable
 
 import can
@@ -21,8 +21,9 @@ _JOIN_WAIT = 1.0
 _OPEN_AGAIN = 0.1
 # An adapter from which nothing comes for so long may have started meanwhile, its channel closed.
 _SILENCE = 0.4
+_LARGEST_BATCH = 50
 
-Item = CanFrame | CanErrors | PortChange
+Batch = tuple[CanFrame | CanErrors, ...]
 
 
 def open_bus(settings: LinkSettings) -> can.BusABC:
@@ -53,9 +54,7 @@ def _plainly(error: Exception) -> str:
 
 
 class CanPort:
-    """A CAN bus behind an adapter, from the first attempt to open it.
-
-    Its thread gives frames their time of arrival; what is lost is opened again until it is there.
+    """A CAN bus behind an adapter, which its thread opens, reads, and opens again when it is lost.
 
     Parameters
     ----------
@@ -63,44 +62,33 @@ class CanPort:
         Which adapter.
     clock : callable
         Steady time [s].
-    wake : callable
-        Called, by whatever thread, when there is something to take.
     """
 
-    def __init__(
-        self, settings: LinkSettings, clock: Callable[[], float], wake: Callable[[], None]
-    ) -> None:
+    def __init__(self, settings: LinkSettings, clock: Callable[[], float] = time.monotonic) -> None:
         self._settings = settings
         self._clock = clock
-        self._wake = wake
-        self._items: deque[Item] = deque()
-        self._there = threading.Event()
         self._closed = threading.Event()
         # Of the adapter: the thread greets it while others send.
         self._lock = threading.Lock()
         self._bus: can.BusABC | None = None
         self._errors = self._refusals = 0
         self._told: PortChange | None = None
-        self._open()
         self._thread = threading.Thread(target=self._run, name="can-receive", daemon=True)
+
+    def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+        """Begin, with one attempt at once; `arrive` is called by whatever thread."""
+        self._arrive = arrive
+        self._open()
         self._thread.start()
 
-    def take(self) -> list[Item]:
-        """Return what has come since the last call, oldest first."""
-        self._there.clear()
-        return [self._items.popleft() for _ in range(len(self._items))]
-
-    def wait(self, seconds: float) -> None:
-        """Wait until there is something to take, at most so long."""
-        self._there.wait(seconds)
-
     def send(self, frames: tuple[CanFrame, ...]) -> None:
-        """Send frames; an adapter that takes none of them is lost, and told so."""
+        """Send frames; an adapter that takes none for `write_timeout` is lost, and that is told."""
         with self._lock:
             bus = self._bus
+            if bus is None:
+                return
             try:
-                for frame in frames if bus is not None else ():
-                    assert bus is not None
+                for frame in frames:
                     bus.send(
                         can.Message(
                             arbitration_id=frame.identifier, data=frame.data, is_extended_id=False
@@ -116,15 +104,10 @@ class CanPort:
         with self._lock:
             self._let_go()
 
-    def _hand_on(self, item: Item) -> None:
-        self._items.append(item)
-        self._there.set()
-        self._wake()
-
     def _tell(self, change: PortChange) -> None:
         if change != self._told:
             self._told = change
-            self._hand_on(change)
+            self._arrive(change)
 
     def _open(self) -> None:
         try:
@@ -161,17 +144,15 @@ class CanPort:
         while not self._closed.is_set():
             bus = self._bus
             if bus is None:
-                self._closed.wait(_OPEN_AGAIN)
-                if not self._closed.is_set():
+                if not self._closed.wait(_OPEN_AGAIN):
                     self._open()
                     heard_at = self._clock()
                 continue
             try:
-                message = bus.recv(_RECEIVE_WAIT)
-                if message is not None:
+                batch = self._receive(bus)
+                if batch:
                     heard_at = self._clock()
-                    self._take(message, heard_at)
-                self._count(bus)
+                    self._arrive(batch)
                 if self._clock() - heard_at > _SILENCE and isinstance(bus, SlcanBus):
                     heard_at = self._clock()
                     with self._lock:
@@ -182,16 +163,21 @@ class CanPort:
                     if self._bus is bus:
                         self._lose(error)
 
-    def _take(self, message: can.Message, now: float) -> None:
-        if message.is_error_frame:
-            self._hand_on(CanErrors(1))
-        elif not (message.is_remote_frame or message.is_extended_id):
-            self._hand_on(CanFrame(message.arbitration_id, bytes(message.data), time=now))
-
-    def _count(self, bus: can.BusABC) -> None:
-        """Hand on what the adapter has counted."""
+    def _receive(self, bus: can.BusABC) -> Batch:
+        """Return what is there, once something is or a while is over."""
+        items: list[CanFrame | CanErrors] = []
+        message, error_frames = bus.recv(_RECEIVE_WAIT), 0
+        while message is not None:
+            if message.is_error_frame:
+                error_frames += 1
+            elif not (message.is_remote_frame or message.is_extended_id):
+                frame = CanFrame(message.arbitration_id, bytes(message.data), time=self._clock())
+                items.append(frame)
+            message = bus.recv(0.0) if len(items) < _LARGEST_BATCH else None
         errors = bus.malformed if isinstance(bus, SlcanBus | SocketcandBus) else 0
         refusals = bus.refused if isinstance(bus, SlcanBus) else 0
-        if (errors, refusals) != (self._errors, self._refusals):
-            self._hand_on(CanErrors(errors - self._errors, refusals - self._refusals))
+        if error_frames or (errors, refusals) != (self._errors, self._refusals):
+            count = error_frames + errors - self._errors
+            items.append(CanErrors(count, refusals - self._refusals))
             self._errors, self._refusals = errors, refusals
+        return tuple(items)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import gc
-import itertools
 import logging
+import queue
 import sys
 import time
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from needle_core.ros.whole_node import WholeLifecycleNode
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
 from needle_device_driver.device import COMMANDS
 from needle_device_driver.device_driver import NOT_ACTIVE, PERIOD, DeviceDriver
-from needle_device_driver.link.can_port import CanPort
+from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.reports import Reply
@@ -125,9 +125,11 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._on_cycle = cycle.handler
         self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
         self.create_timer(health.period, partial(self._do, health.handler), clock=STEADY_CLOCK)
-        arrived = self.create_guard_condition(self._take_from_port)
-        self._port = CanPort(values.link_settings, time.monotonic, arrived.trigger)
-        self._take_from_port()
+        self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
+        self._bell = self.create_guard_condition(self._take_arrived)
+        self._port = CanPort(values.link_settings)
+        self._port.open(self._arrive)
+        self._take_arrived()
 
     def _cycle_health(self) -> dict[str, str]:
         # The longest since the last word on it.
@@ -173,21 +175,27 @@ class DeviceDriverNode(WholeLifecycleNode):
                 if code != EXIT_DONE:
                     raise RuntimeError(text)
 
-    def _take_from_port(self) -> None:
+    def _arrive(self, item: Batch | PortChange) -> None:
+        """Take what comes from the port, in its thread."""
+        self._arrived.put(item)
+        self._bell.trigger()
+
+    def _take_arrived(self, wait: float = 0.0) -> None:
+        """Hand on all that has come, or what comes first within `wait` [s]."""
         (port,) = self._component.ports
-        for is_change, items in itertools.groupby(
-            self._port.take(), lambda item: isinstance(item, PortChange)
-        ):
-            if is_change:
-                for change in items:
-                    self._do(port.on_change, change)
-            else:
-                self._do(port.handler, list(items))
+        with contextlib.suppress(queue.Empty):
+            item = self._arrived.get(timeout=wait) if wait else self._arrived.get_nowait()
+            while True:
+                handler = port.on_change if isinstance(item, PortChange) else port.handler
+                self._do(handler, item)
+                item = self._arrived.get_nowait()
         self._follow()
 
     def _on_timer(self) -> None:
         self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
         self._timer.reset()
+        # What has come came before the time that goes by now.
+        self._take_arrived()
         if self._component.searches:
             self._device.look_around()
         self._do(self._on_cycle)
@@ -235,8 +243,7 @@ class DeviceDriverNode(WholeLifecycleNode):
     def _wait_while(self, goes_on: Callable[[], bool]) -> None:
         """Let the component go on until something has ended: a transition answers at its end."""
         while goes_on():
-            self._port.wait(PERIOD / 2.0)
-            self._take_from_port()
+            self._take_arrived(PERIOD / 2.0)
             self._do(self._on_cycle)
 
     # ---- lifecycle ----------------------------------------------------------------------------

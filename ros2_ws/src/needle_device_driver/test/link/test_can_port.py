@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import queue
 import socket
 import threading
 import time
@@ -17,7 +19,7 @@ from needle_core.can_frame import CanErrors, CanFrame
 from needle_core.component import PortChange
 from needle_core.errors import UserError
 from needle_device_driver.link import socketcand_bus
-from needle_device_driver.link.can_port import CanPort, Item
+from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.link.link_settings import SLCAN_BITRATES, LinkSettings
 from needle_device_driver.link.slcan_bus import SlcanBus
 
@@ -63,23 +65,23 @@ class Port:
     """A port, and what has come through it."""
 
     def __init__(self, settings: LinkSettings, clock: Callable[[], float] = time.monotonic) -> None:
-        self.items: list[Item] = []
-        self.wakes = 0
-        self._port = CanPort(settings, clock, self._wake)
-        self.take()
+        self.items: list[CanFrame | CanErrors | PortChange] = []
+        self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
+        self._port = CanPort(settings, clock)
+        self._port.open(self._arrived.put)
+        self.take(0.0)
 
-    def _wake(self) -> None:
-        self.wakes += 1
-
-    def take(self) -> None:
-        self.items += self._port.take()
+    def take(self, wait: float) -> None:
+        with contextlib.suppress(queue.Empty):
+            while True:
+                batch = self._arrived.get(timeout=wait)
+                self.items += [batch] if isinstance(batch, PortChange) else batch
 
     def until(self, condition: Callable[[], bool]) -> None:
         deadline = time.monotonic() + 5.0
         while not condition():
             assert time.monotonic() < deadline, self.items
-            self._port.wait(0.05)
-            self.take()
+            self.take(0.02)
 
     def send(self, cob_id: int, data: bytes = b"") -> None:
         self._port.send((CanFrame(cob_id, data),))
@@ -146,7 +148,7 @@ def test_slcan_takes_what_comes_in_any_pieces_and_counts_what_is_no_frame(
     adapter.say(b"02\rt1812ABCD\rt18\rnonsense\rt181xZZ\r\x07" + b"?" * 100 + b"\rt1810\r")
     port.until(lambda: len(port.frames(0x181)) >= 3)
     assert port.frames(0x181) == [b"\x37\x02", b"\xab\xcd", b""]
-    port.until(lambda: port.errors >= 4)
+    port.until(lambda: port.errors + port.refusals >= 4)
     assert port.changes == [""]
 
 
@@ -366,7 +368,7 @@ def fill(port: Port, most: int) -> None:
     """Send until the port tells that it is lost."""
     for _ in range(most):
         port.send(0x201, bytes(8))
-        port.take()
+        port.take(0.0)
         if any("takes nothing" in change for change in port.changes):
             return
     raise AssertionError(port.changes)
