@@ -53,9 +53,7 @@ def test_it_steers_records_and_reports(run: Run, level: str) -> None:
     assert (bag / "report.html").stat().st_size > 1000
     assert list(bag.glob("*.png"))
     counts = {topic: len(data) for topic, data in payloads(bag, TOPICS).items()}
-    # Drives take more than a second to be set up and homed: one exposure that nobody waits for.
-    tips = 12 if (level, mode) == ("drive", []) else 11
-    assert counts == dict.fromkeys(TOPICS, 10) | {"/needle/tip": tips, "/sim/tip_pose": tips}
+    assert counts == dict.fromkeys(TOPICS, 10) | {"/needle/tip": 11, "/sim/tip_pose": 11}
     # What was recorded is what the code does, taken through it again.
     assert rerun.main([str(bag)]) == 0
 
