@@ -6,9 +6,11 @@ SYNC arrives. The ways take turns, so that what else the machine does falls on a
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
 import os
+import queue
 import select
 import subprocess
 import sys
@@ -34,11 +36,14 @@ from canopen.objectdictionary import (
 )
 from canopen.profiles.p402 import BaseNode402
 
+from needle_core.component import PortChange
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.can_port import Batch, CanPort
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.procedure import Procedure, T, run
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
@@ -77,18 +82,21 @@ class Driver:
 
     def __init__(self, channel: str) -> None:
         values = DeviceDriverParameters()
-        self._link = CanLink(LinkSettings("slcan", channel, BITRATE), time.monotonic)
+        settings = LinkSettings("slcan", channel, BITRATE)
+        self._link = FrameLink(settings)
+        self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
+        self._port = CanPort(settings)
+        self._port.open(self._arrived.put)
         self._axes = [
             Cia402Axis(name, values.drive(name), self._link, period=PERIOD, watchdog=0.5)
             for name in ("insertion", "rotation")
         ]
         self._cycle = DriveCycle(self._link, self._axes)
-        self._link.open()
         for axis in self._axes:
-            self._link.run(axis.configure())
+            self._run(axis.configure())
             axis.power(True)
         while not all(axis.poll(0.0).powered for axis in self._axes):
-            self._link.run(self._cycle.exchange(PERIOD / 2))
+            self._run(self._cycle.exchange(PERIOD / 2))
             time.sleep(PERIOD)
         self._starts = [axis.poll(0.0).position for axis in self._axes]
         self._units = [values.drive(axis.name).counts_per_unit for axis in self._axes]
@@ -99,13 +107,32 @@ class Driver:
             self._axes, self._starts, COUNTS_PER_CYCLE, self._units, strict=True
         ):
             axis.start_move(start + (number + 1) * counts / unit, counts / unit / PERIOD)
-        self._link.run(self._cycle.exchange(PERIOD / 2))
+        self._run(self._cycle.exchange(PERIOD / 2))
 
     def close(self) -> None:
         """Switch off."""
         for axis in self._axes:
-            self._link.run(axis.close())
-        self._link.close()
+            self._run(axis.close())
+        self._port.close()
+
+    def _run(self, procedure: Procedure[T]) -> T:
+        return run(procedure, self._wait, self._now)
+
+    def _now(self) -> float:
+        self._link.now = time.monotonic()
+        return self._link.now
+
+    def _wait(self, is_there: Callable[[], bool], seconds: float) -> None:
+        """Send what is to be sent, and take what comes."""
+        self._port.send(self._link.take_sent())
+        until = self._now() + seconds
+        with contextlib.suppress(queue.Empty):
+            while not is_there():
+                item = self._arrived.get(timeout=max(until - self._now(), 0.0))
+                if isinstance(item, PortChange):
+                    self._link.change(item.lost)
+                else:
+                    self._link.receive(item)
 
 
 class PlainSlcan:

@@ -20,8 +20,27 @@ class CanFrame:
         0..8 bytes.
     remote : bool
         A request for the frame of that identifier; it has no data.
+    time : float or None
+        Steady time of its arrival, where its port knows it [s].
     """
 
     identifier: int
     data: bytes = b""
     remote: bool = False
+    time: float | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CanErrors:
+    """What a port has counted since the last batch and could not hand on.
+
+    Attributes
+    ----------
+    frames : int
+        Error frames, and lines that are none.
+    refusals : int
+        Commands and frames that the adapter did not take.
+    """
+
+    frames: int
+    refusals: int = 0

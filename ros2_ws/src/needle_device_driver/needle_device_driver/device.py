@@ -6,7 +6,7 @@ It is the same for real, emulated and simulated axes; a component adds its cycle
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from needle_core import messages as m
 from needle_core import status_messages as m_status
@@ -25,6 +25,7 @@ from needle_core.component import (
 )
 from needle_core.component import Reply as ServiceReply
 from needle_core.diagnostics import Level
+from needle_core.process.claim import WAY_OUT
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
@@ -40,9 +41,12 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 COMMANDS, HOLD, EMERGENCY_STOP = "device/joint_trajectory", "device/hold", "device/estop"
 STATUS, RESULT, JOINTS = "device/status", "device/result", "joint_states"
+STOP = "device/stop"
 # Every message counts, also while somebody floods the topic.
 _HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
+# A lock-step simulation sends the 25 joint states of a step at once: more than a depth of 10 keeps.
+_JOINT_STATES = Delivery(depth=200)
 # Positions alone change device/status so often at most [s]; joint_states has them all.
 _STATUS_PERIOD = 0.5
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
@@ -98,18 +102,18 @@ class DeviceRows:
         self._told_at = 0.0
         self._notices = NoticeLimit()
         self._order: _Order | None = None
-        self.inputs = (
+        self.inputs: Sequence[Input] = (
             Input(COMMANDS, m.Trajectory, self._on_command),
             Input(HOLD, m.HoldState, self._on_hold, _HOLDS),
             Input(EMERGENCY_STOP, m.EmergencyStop, self._on_emergency_stop, _EMERGENCY_STOPS),
         )
-        self.outputs = (
-            Output(JOINTS, m.JointState),
+        self.outputs: Sequence[Output] = (
+            Output(JOINTS, m.JointState, _JOINT_STATES),
             Output(RESULT, m.CommandResult),
             Output(STATUS, m_status.DeviceStatus, LATCHED),
         )
         call = supervisor
-        self.services = (
+        self.services: Sequence[Service] = (
             self._trigger("home", lambda at: call.homing(at.steady)),
             self._trigger("retract", lambda at: call.retract(at.steady)),
             self._trigger("reset", lambda at: call.resetting(at.steady)),
@@ -163,7 +167,9 @@ class DeviceRows:
         self._command_publishers = len(peers.publishers.get(COMMANDS, ()))
         others = [name for name in peers.publishers.get(STATUS, ()) if name != self._name]
         names = ", ".join(others)
-        self.others = f"another device is there: {names} publishes {STATUS}" if others else ""
+        self.others = (
+            f"another device is there: {names} publishes {STATUS}; {WAY_OUT}" if others else ""
+        )
         self._supervisor.see_others(self.others)
         return self.report(at)
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from needle_core.can_frame import CAN, CanFrame
+from needle_core.can_frame import CAN, CanErrors, CanFrame
 from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
 from needle_core.component import (
     Actions,
@@ -26,7 +26,7 @@ from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
 from needle_device_driver.device import DeviceRows
-from needle_device_driver.link.port_link import PortLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.parameters import DriverParameters
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.reports import Reply
@@ -35,10 +35,13 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 PERIOD = 0.02
 """Of the cycle: set-points, SYNC, answers [s]."""
+NOT_ACTIVE = "waiting for the driver to be activated"
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 EXIT_BROKEN = 3
 """The cycle itself failed: nobody drives the axes any more."""
+
+Then = Callable[[Reply, Moment], Actions]
 
 
 class DeviceDriver(Component):
@@ -48,34 +51,66 @@ class DeviceDriver(Component):
     ----------
     settings : DriverParameters
         The node's parameters, a `DeviceDriverParameters`.
+    name : str
+        How it signs what it says.
+    in_simulation : bool
+        Whether time is simulated: emulated drives are then no real needle's.
+    on_clock : bool
+        Whether `begin_cycle` is called when a cycle is due, not by the component's own timer.
+    more_health : callable
+        Returns what else to tell of the bus's health.
+
+    Attributes
+    ----------
+    supervisor : MotionSupervisor
+        What the rows speak for.
+    link : FrameLink
+        The bus.
+    waiting : str
+        What services wait for; empty: nothing.
+    is_set_up : bool
+        Whether cycles run.
     """
 
     name = "device_driver"
 
-    def __init__(self, settings: DriverParameters) -> None:
+    def __init__(
+        self,
+        settings: DriverParameters,
+        name: str = name,
+        *,
+        in_simulation: bool = True,
+        on_clock: bool = False,
+        more_health: Callable[[], Mapping[str, str]] = dict,
+    ) -> None:
         self.settings = settings
-        self._link = PortLink(settings.link_settings)
+        self.link = FrameLink(settings.link_settings)
         insertion, rotation = (
             Cia402Axis(
-                name, settings.drive(name), self._link, period=PERIOD, watchdog=settings.watchdog
+                axis, settings.drive(axis), self.link, period=PERIOD, watchdog=settings.watchdog
             )
-            for name in ("insertion", "rotation")
+            for axis in ("insertion", "rotation")
         )
-        self._drives = DriveCycle(self._link, (insertion, rotation))
-        self._supervisor = MotionSupervisor(
+        self._drives = DriveCycle(self.link, (insertion, rotation))
+        self.supervisor = MotionSupervisor(
             insertion,
             rotation,
             settings.limits,
+            lock_step=settings.lock_step,
+            path_delay=settings.path_delay,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
         )
         self._device = DeviceRows(
-            self._supervisor, self.name, simulated=None, refuse=lambda: self._waiting
+            self.supervisor, name, simulated=None, refuse=lambda: self.waiting
         )
-        self._waiting = "waiting for the driver to be activated"
-        self._searches = settings.autostart
+        self.waiting = NOT_ACTIVE
+        self.searches = settings.autostart
+        self.is_set_up = False
         self._refusal = ""
-        self._is_set_up = self._is_ending = False
+        self._in_simulation, self._on_clock = in_simulation, on_clock
+        self._more_health = more_health
+        self._is_ending = self._exits = False
         self._retry_at, self._give_up_at = 0.0, math.inf
         self._cycle: tuple[Running[Any], Moment] | None = None
         self.inputs = tuple(
@@ -98,12 +133,13 @@ class DeviceDriver(Component):
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note who else is a device here; with another one nothing begins."""
         yield from self._guarded(self._device.on_peers)(peers, at)
-        if self._searches and self._device.others:
+        if self.searches and self._device.others:
             yield Exit(EXIT_BAD_INPUT, self._device.others)
 
     def on_stop(self, at: Moment) -> Actions:
         """Stop both axes, switch them off, and exit."""
-        return self._guarded(self._end)(at)
+        self._exits = True
+        return self.take_down(at)
 
     def _guarded(
         self, handler: Callable[..., Actions], *, ends: bool = False
@@ -120,12 +156,12 @@ class DeviceDriver(Component):
 
         def guarded(*arguments: Any) -> Actions:
             at: Moment = arguments[-1]
-            self._link.now = at.steady
+            self.link.now = at.steady
             try:
                 yield from handler(*arguments)
             except Exception as error:
                 text = f"internal error: {type(error).__name__}: {error}"
-                self._supervisor.fail(text)
+                self.supervisor.fail(text)
                 yield from self._device.report(at)
                 yield from self._send()
                 if ends:
@@ -136,19 +172,35 @@ class DeviceDriver(Component):
         return guarded
 
     def _send(self) -> Actions:
-        frames = self._link.take_sent()
+        frames = self.link.take_sent()
         if frames:
             yield Send(CAN, frames)
 
     # ---- the cycle ----------------------------------------------------------------------------
 
-    def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
-        self._link.receive(frames)
+    @property
+    def is_busy(self) -> bool:
+        """Tell whether an order or a cycle is under way."""
+        return self._device.is_busy or self._cycle is not None
+
+    def begin_cycle(self, at: Moment, wait: float) -> Actions:
+        """Send set-points and SYNC; the cycle ends with both drives' answers, or after `wait` [s].
+
+        Call it only while nothing is under way.
+        """
+        return self._guarded(self._begin_cycle)(wait, at)
+
+    def repeat_joint_states(self, at: Moment) -> Actions:
+        """Tell the joints again, as those of this moment."""
+        return self._device.joint_states(at)
+
+    def _on_frames(self, items: Sequence[CanFrame | CanErrors], at: Moment) -> Actions:
+        self.link.receive(items)
         yield from self._go_on(at)
 
     def _on_port_change(self, change: PortChange, at: Moment) -> Actions:
-        self._link.change(change.lost)
-        self._supervisor.observe(at.steady)
+        self.link.change(change.lost)
+        self.supervisor.observe(at.steady)
         yield from self._device.report(at)
         yield from self._go_on(at)
 
@@ -156,21 +208,32 @@ class DeviceDriver(Component):
         yield from self._go_on(at)
         if self._is_ending:
             return
-        if self._device.is_busy or self._cycle is not None:
+        if self.is_busy:
             # A drive takes its time, and the SDO client sends the heartbeat: the rest goes on, too.
-            self._supervisor.observe(at.steady)
-            yield from self._device.report(at)
+            yield from self._observe(at)
             yield from self._device.advance(at)
-        elif self._is_set_up:
-            self._supervisor.note_time(at.stamp_ns, at.steady)
-            self._drives.collect()
-            self._supervisor.drive(PERIOD, at.steady)
-            self._cycle = Running(self._drives.exchange(_REPLY_WAIT)), at
-            yield from self._go_on(at)
-        elif self._searches and at.steady >= self._retry_at:
+        elif self.is_set_up and self._on_clock:
+            # Simulated time may stand still; watchdogs do not.
+            self._drives.beat()
+            yield from self._observe(at)
+        elif self.is_set_up:
+            yield from self._begin_cycle(_REPLY_WAIT, at)
+        elif self.searches and at.steady >= self._retry_at:
             self._retry_at = at.steady + _RETRY
             self._give_up_at = min(self._give_up_at, at.steady + self.settings.connect_timeout)
-            yield from self._device.begin(self._setting_up(at.steady), self._on_set_up, at)
+            yield from self.set_up(self._after_search, at)
+
+    def _observe(self, at: Moment) -> Actions:
+        if self._drives.may_judge(at.steady):
+            self.supervisor.observe(at.steady)
+        yield from self._device.report(at)
+
+    def _begin_cycle(self, wait: float, at: Moment) -> Actions:
+        self.supervisor.note_time(at.stamp_ns, at.steady)
+        self._drives.collect()
+        self.supervisor.drive(PERIOD, at.steady)
+        self._cycle = Running(self._drives.exchange(wait)), at
+        yield from self._go_on(at)
 
     def _go_on(self, at: Moment) -> Actions:
         """Go on with what is under way, as far as it goes."""
@@ -183,52 +246,98 @@ class DeviceDriver(Component):
 
     def _finish_cycle(self, begun: Moment, at: Moment) -> Actions:
         if self._is_ending:
-            self._link.close()
-            yield from self._send()
-            yield Exit(EXIT_DONE)
+            yield from self._leave(at)
             return
-        self._supervisor.observe(at.steady)
+        self.supervisor.observe(at.steady)
         yield from self._device.report(at)
         # The drives sampled them at the SYNC.
         yield from self._device.joint_states(dataclasses.replace(at, stamp_ns=begun.stamp_ns))
 
     # ---- begin and end ------------------------------------------------------------------------
 
+    def search_after(self, steady: float) -> None:
+        """Look for the drives not before this steady time [s]."""
+        self._retry_at = steady
+
+    def set_up(self, then: Then, at: Moment) -> Actions:
+        """Look for the drives and set them up; moves nothing. `then` gets the outcome."""
+        self._refusal = ""
+
+        def after(reply: Reply, at: Moment) -> Actions:
+            if reply.success:
+                self.is_set_up, self.searches, self.waiting = True, False, ""
+                yield Log("info", f"both drives are there on {self.settings.link_settings}")
+                for text in self._drives.missing_optional_objects:
+                    # Many words take longer than a watchdog waits.
+                    self._drives.beat()
+                    yield from self._send()
+                    yield Log("warning", text)
+            yield from then(reply, at)
+
+        yield from self._device.begin(self._setting_up(at.steady), after, at)
+
     def _setting_up(self, now: float) -> Procedure[Reply]:
-        """Look for the drives and set them up; moves nothing. Ones that are there may refuse."""
         why_not = yield from self._drives.probe()
         if why_not:
             return Reply(False, why_not)
-        if self._supervisor.state is not State.UNCONFIGURED:
+        if self.supervisor.state is not State.UNCONFIGURED:
             # A fault from before; an emergency stop that is pressed stays.
-            reply = yield from self._supervisor.resetting(now)
+            reply = yield from self.supervisor.resetting(now)
             if not reply.success:
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
-        self._device.simulated = yield from are_emulated(self._link, nodes)
-        reply = yield from self._supervisor.configuring(now)
+        emulated = yield from are_emulated(self.link, nodes)
+        if self.settings.lock_step and not emulated:
+            reply = Reply(
+                False,
+                "lock_step: a drive does not say that it is emulated; a real motor would turn",
+            )
+        else:
+            self._device.simulated = emulated and self._in_simulation
+            reply = yield from self.supervisor.configuring(now)
+        # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message
         return reply
 
-    def _on_set_up(self, reply: Reply, at: Moment) -> Actions:
+    def _after_search(self, reply: Reply, at: Moment) -> Actions:
         if reply.success:
-            self._is_set_up, self._searches, self._waiting = True, False, ""
-            yield Log("info", f"both drives are there on {self.settings.link_settings}")
-            for text in self._drives.missing_optional_objects:
-                yield Log("warning", text)
-        elif self._refusal or at.steady > self._give_up_at:
+            return
+        if self._refusal or at.steady > self._give_up_at:
             yield Exit(EXIT_BAD_INPUT, reply.message)
-        elif not self._waiting.endswith(reply.message):
-            self._waiting = f"waiting for the drives: {reply.message}"
-            yield Log("info", self._waiting)
+        elif not self.waiting.endswith(reply.message):
+            self.waiting = f"waiting for the drives: {reply.message}"
+            yield Log("info", self.waiting)
 
-    def _end(self, at: Moment) -> Actions:
-        self._is_ending, self._waiting = True, "the driver ends"
+    def disable(self, at: Moment) -> Actions:
+        """Stop and switch off, as `device/enable` false does."""
+        return self._guarded(self._disable)(at)
+
+    def _disable(self, at: Moment) -> Actions:
+        yield from self._device.call_off("disabled on request", at)
+        self.supervisor.enable(False, at.steady)
+        yield from self._device.report(at)
+
+    def take_down(self, at: Moment) -> Actions:
+        """Stop both axes, switch them off, and let go of the bus."""
+        return self._guarded(self._take_down)(at)
+
+    def _take_down(self, at: Moment) -> Actions:
+        self._is_ending, self.is_set_up, self.searches = True, False, False
+        self.waiting = NOT_ACTIVE
         yield from self._device.call_off("the driver ends", at)
         if self._cycle is not None:
             self._cycle[0].cancel()
-        self._cycle = Running(self._supervisor.deconfiguring()), at
+        self._cycle = Running(self.supervisor.deconfiguring()), at
         yield from self._go_on(at)
 
+    def _leave(self, at: Moment) -> Actions:
+        self._is_ending = False
+        self._device.simulated = None
+        yield from self._device.report(at)
+        yield from self._send()
+        self.link.close()
+        if self._exits:
+            yield Exit(EXIT_DONE)
+
     def _tell_health(self, at: Moment) -> Actions:
-        yield Diagnose("can", self._drives.health(self._waiting))
+        yield Diagnose("can", self._drives.health(self.waiting, self._more_health()))

@@ -42,6 +42,7 @@ class DriveCycle:
         self._outstanding = 0
         self._paused = 0
         self._looked_at = math.inf
+        self._held_up_at = -math.inf
         self._told_unanswered = 0
 
     @property
@@ -58,14 +59,14 @@ class DriveCycle:
         """Tell whether a drive is on its way to where it was ordered, apart from set-points."""
         return any(axis.needs_cycles for axis in self._axes)
 
-    def health(self, waiting: str, more: Mapping[str, str] | None = None) -> Diagnostic:
+    def health(self, waiting: str, more: Mapping[str, str]) -> Diagnostic:
         """Return the health of the bus since the last call.
 
         Parameters
         ----------
         waiting : str
             What is said while the link is closed.
-        more : mapping, optional
+        more : mapping
             Further values.
         """
         link = self._link
@@ -73,8 +74,8 @@ class DriveCycle:
             "link": str(link.settings),
             "frames_sent": str(link.frames_sent),
             "frames_received": str(link.frames_received),
-            "bus_errors": str(link.errors),
-            **(more or {}),
+            "bus_errors": str(link.error_frames),
+            **more,
             "unanswered_syncs": str(self.unanswered),
         }
         count, self._told_unanswered = self.unanswered - self._told_unanswered, self.unanswered
@@ -106,8 +107,8 @@ class DriveCycle:
             except LinkError:
                 return
 
-    def hear_first(self, now: float) -> Procedure[None]:
-        """After a hold-up of this process, hear every drive anew before it is judged.
+    def may_judge(self, now: float) -> bool:
+        """Return whether drives can be judged: after a hold-up of this process it hears them first.
 
         Parameters
         ----------
@@ -115,11 +116,10 @@ class DriveCycle:
             Time of this call, one of each cycle [s].
         """
         before, self._looked_at = self._looked_at, now
-        if now - before <= _HELD_UP:
-            return
-        yield Wait(
-            lambda: all(axis.monitor.fresh_time >= now for axis in self._axes), _HEARD_WITHIN
-        )
+        if now - before > _HELD_UP:
+            self._held_up_at = now
+        waits = now - self._held_up_at < _HEARD_WITHIN
+        return not waits or all(axis.monitor.fresh_time >= self._held_up_at for axis in self._axes)
 
     def collect(self) -> None:
         """Take the answers that came too late for the cycle before."""

@@ -61,7 +61,7 @@ class Feedback:
 
 
 class DriveMonitor:
-    """Listens to one node, in the link's receiving thread, and ages what it hears.
+    """Listens to one node, and ages what it hears.
 
     Process data is as old as its arrival, unless it answers the last SYNC that was sent: then
     nothing newer was asked for, and a heartbeat keeps it fresh. So positions do not grow stale
@@ -81,7 +81,6 @@ class DriveMonitor:
 
     def __init__(self, link: FrameLink, node_id: int) -> None:
         self._link = link
-        self._lock = link.arrival
         self._number = 0
         self._statusword = self._mode = self._inputs = self._position = 0
         self._following_error = 0
@@ -108,77 +107,66 @@ class DriveMonitor:
     @property
     def feedback(self) -> Feedback:
         """The newest process data."""
-        with self._lock:
-            return Feedback(
-                self._number,
-                self._statusword,
-                self._mode,
-                self._inputs,
-                self._position,
-                self._following_error,
-                *self._taken,
-            )
+        return Feedback(
+            self._number,
+            self._statusword,
+            self._mode,
+            self._inputs,
+            self._position,
+            self._following_error,
+            *self._taken,
+        )
 
     @property
     def fresh_time(self) -> float:
         """Time at which the drive last said where it is, steady clock [s]."""
-        with self._lock:
-            return self._age_base()
+        return self._age_base()
 
     @property
     def left_operational(self) -> bool:
         """Tell whether the node's own heartbeat says that it no longer exchanges process data."""
-        with self._lock:
-            return self._watching and self._nmt_state != NMT_OPERATIONAL
+        return self._watching and self._nmt_state != NMT_OPERATIONAL
 
     @property
     def heartbeats(self) -> int:
         """Number of heartbeats since the last set-up began."""
-        with self._lock:
-            return self._heartbeats
+        return self._heartbeats
 
     def answered(self) -> bool:
         """Return whether all process data arrived since the last SYNC, and in its time."""
-        with self._lock:
-            return not self._awaited()
+        return not self._awaited()
 
     @property
     def outstanding(self) -> int:
         """Number of unanswered SYNCs, if too many before the last are; else 0."""
-        with self._lock:
-            return self._syncs - min(self._received.values()) if self._is_behind() else 0
+        return self._syncs - min(self._received.values()) if self._is_behind() else 0
 
     def give_up(self) -> None:
         """Take what is outstanding for lost."""
-        with self._lock:
-            self._count_anew()
+        self._count_anew()
 
     def expect_answer(self) -> None:
         """Take note that a SYNC goes out now."""
-        with self._lock:
-            self._fresh_time = self._age_base()
-            self._answers.clear()
-            if self._syncs >= _FORGIVEN_AFTER and not self._is_behind():
-                self._count_anew()
-            self._syncs += 1
-            self._all_syncs += 1
+        self._fresh_time = self._age_base()
+        self._answers.clear()
+        if self._syncs >= _FORGIVEN_AFTER and not self._is_behind():
+            self._count_anew()
+        self._syncs += 1
+        self._all_syncs += 1
 
     def begin_set_up(self) -> None:
         """Forget what was; the node is set up from the start."""
-        with self._lock:
-            self._watching = False
-            self._heartbeats = 0
+        self._watching = False
+        self._heartbeats = 0
 
     def forget_start(self) -> None:
         """Take note that the node answers: a start that it tells of from now on is another one."""
-        with self._lock:
-            self.rebooted = False
+        self.rebooted = False
 
     def end_set_up(self) -> None:
         """Watch over the node from now on."""
-        with self._lock:
-            self._watching = True
-            self.emergency = None
+        self._watching = True
+        self.emergency = None
 
     def take(self, statusword: int, mode: int, inputs: int, position: int) -> None:
         """Take what was read on request as if it had been sent.
@@ -186,21 +174,19 @@ class DriveMonitor:
         The next answer to a SYNC is older in some drives, which answer with what they sampled at
         the SYNC before: it counts as an answer, not for what it says.
         """
-        with self._lock:
-            self._statusword, self._mode, self._inputs = statusword, mode, inputs
-            self._position, self._following_error = position, 0
-            self._answers = set(_ANSWER)
-            self._count_anew()
-            self._number += 1
-            self._outdated = True
-            self._fresh_time = self._link.clock()
-            self._taken = self._all_syncs, self._fresh_time
+        self._statusword, self._mode, self._inputs = statusword, mode, inputs
+        self._position, self._following_error = position, 0
+        self._answers = set(_ANSWER)
+        self._count_anew()
+        self._number += 1
+        self._outdated = True
+        self._fresh_time = self._link.now
+        self._taken = self._all_syncs, self._fresh_time
 
     def await_operational(self, before: int, timeout: float) -> Procedure[bool]:
         """Return whether, within `timeout` [s], one after `before` heartbeats says: operational."""
         yield Wait(lambda: self._heartbeats > before, timeout)
-        with self._lock:
-            return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
+        return self._heartbeats > before and self._nmt_state == NMT_OPERATIONAL
 
     def _awaited(self) -> bool:
         return len(self._answers) < len(_ANSWER) or self._is_behind()
@@ -231,13 +217,11 @@ class DriveMonitor:
 
     def _take(self, handler: Callable[[bytes, float], None], data: bytes, time: float) -> None:
         """Take a frame; one that is not as its kind must be is counted by the link."""
-        with self._lock:
-            try:
-                handler(data, time)
-            except ValueError:
-                self._link.error_frames += 1
-                return
-            self._lock.notify_all()
+        try:
+            handler(data, time)
+        except ValueError:
+            self._link.error_frames += 1
+            return
 
     def _on_status(self, data: bytes, time: float) -> None:
         if len(data) == _LENGTH_WITHOUT_INPUTS:

@@ -201,9 +201,9 @@ def _check_modes(link: FrameLink, access: ObjectAccess, node: int) -> Procedure[
 def _try_mode(link: FrameLink, access: ObjectAccess, node: int, mode: Mode) -> Procedure[None]:
     """Refuse a drive that does not take a mode, or does not show it."""
     yield from access.write(od.MODE_OF_OPERATION, mode)
-    until = link.clock() + _MODE_WAIT
+    until = link.now + _MODE_WAIT
     while (shown := (yield from access.read(od.MODE_DISPLAY))) != mode:
-        if link.clock() > until:
+        if link.now > until:
             raise DriveError(
                 f"node {node} has no {mode.name.lower().replace('_', ' ')} mode "
                 f"(0x6060 = {mode}, 0x6061 = {shown})"
@@ -233,9 +233,9 @@ def _switch_off(link: FrameLink, access: ObjectAccess, settings: DriveSettings) 
     if drive_state((yield from access.read(od.STATUSWORD))) not in POWERED:
         return
     yield from access.write(od.CONTROLWORD, DriveCommand.DISABLE_VOLTAGE)
-    until = link.clock() + _SWITCH_OFF_WAIT
+    until = link.now + _SWITCH_OFF_WAIT
     while drive_state((yield from access.read(od.STATUSWORD))) in POWERED:
-        if link.clock() > until:
+        if link.now > until:
             raise DriveError(f"node {settings.node_id} does not switch off")
 
 

@@ -21,8 +21,8 @@ def await_operational(
     link: FrameLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
 ) -> Procedure[bool]:
     """Return whether the drive's heartbeat says: operational; the computer's goes on meanwhile."""
-    until = link.clock() + timeout
-    while link.clock() < until:
+    until = link.now + timeout
+    while link.now < until:
         # It may come at once.
         before = monitor.heartbeats
         link.beat()
@@ -99,9 +99,9 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     # The rising edge counts.
     yield from order(DriveCommand.DISABLE_VOLTAGE)
     yield from order(DriveCommand.FAULT_RESET)
-    until = link.clock() + _FAULT_RESET_WAIT
+    until = link.now + _FAULT_RESET_WAIT
     while drive_state((yield from access.read(od.STATUSWORD))) in FAULTS:
-        if link.clock() > until:
+        if link.now > until:
             code = yield from access.ask(od.ERROR_CODE)
             why = "" if code is None else f": {describe_error(code)}"
             raise DriveError(f"the drive does not leave its fault{why}")

@@ -1,11 +1,10 @@
-"""A CAN bus as drives are steered through it, whatever carries the frames."""
+"""The CAN bus as drives are steered through it: frames come and go in batches, between handlers."""
 
 from __future__ import annotations
 
-import abc
-import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
+from needle_core.can_frame import CanErrors, CanFrame
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.link.objects import (
     HEARTBEAT,
@@ -33,77 +32,103 @@ class LinkError(Exception):
     """The link cannot be opened or is lost; the text says which and why."""
 
 
-class FrameLink(abc.ABC):
-    """One CAN bus, to be opened, lost and opened again. All sending is the control loop's.
+class FrameLink:
+    """One CAN bus, to be opened, lost and opened again; whoever runs the component carries frames.
+
+    What is lost stays lost until it is opened again, for the drives have missed something.
 
     Parameters
     ----------
     settings : LinkSettings
-        Which adapter.
-    clock : callable
-        Steady time [s].
+        Only their text counts.
 
     Attributes
     ----------
-    arrival : threading.Condition
-        Notified of each frame; who reads what frames change holds its lock.
+    now : float
+        Steady time of the handler that runs [s].
     lost : str
         How the link was lost; empty: it is not.
     other_master : str
         What another master was heard to send; empty: nobody's.
     """
 
-    def __init__(self, settings: LinkSettings, clock: Callable[[], float]) -> None:
+    def __init__(self, settings: LinkSettings) -> None:
         self.settings = settings
-        self.clock = clock
-        self.arrival = threading.Condition()
+        self.now = 0.0
         self.lost = ""
         self.other_master = ""
         self.openings = 0
         self.frames_sent = 0
         self.frames_received = 0
         self.error_frames = 0
+        self.refused = 0
+        self._is_open = False
+        self._why_not = ""
+        self._sent: list[CanFrame] = []
         self._callbacks: dict[int, list[Callback]] = {}
         self._sdo: dict[int, SdoClient] = {}
 
     @property
-    @abc.abstractmethod
     def is_open(self) -> bool:
-        """Tell whether the link is open, as far as anybody knows."""
+        """Tell whether frames pass."""
+        return self._is_open and not self.lost
 
-    @property
-    def errors(self) -> int:
-        """Number of error frames, and of process data that are none."""
-        return self.error_frames
-
-    @property
-    def refused(self) -> int:
-        """Number of commands and frames that the adapter did not take."""
-        return 0
-
-    @abc.abstractmethod
     def open(self) -> None:
-        """Open the link; one that is lost is opened anew.
+        """Let frames pass; a lost link begins anew.
 
         Raises
         ------
         LinkError
-            If that is not possible.
+            If the port is not open.
         """
+        if self.is_open:
+            return
+        if self._why_not:
+            raise LinkError(f"cannot open {self.settings}: {self._why_not}")
+        self._is_open = True
+        # What was asked before is not answered any more.
+        self._sdo = {}
+        self.lost = self.other_master = ""
+        self.openings += 1
 
-    @abc.abstractmethod
+    def change(self, why_not: str) -> None:
+        """Take that the port is open, or why it is not."""
+        self._why_not = why_not
+        if why_not and self.is_open:
+            self.lost = f"link {self.settings} is lost: {why_not}"
+
     def close(self) -> None:
-        """Let go of the bus. May be called twice."""
+        """Let no frame pass."""
+        self._is_open = False
 
-    @abc.abstractmethod
     def send(self, cob_id: int, data: bytes = b"") -> None:
-        """Send one frame.
+        """Send one frame with the batch of the handler that runs.
 
         Raises
         ------
         LinkError
             If the link is closed or lost.
         """
+        if not self.is_open:
+            raise LinkError(self.lost or f"{self.settings} is not open")
+        self._sent.append(CanFrame(cob_id, data))
+        self.frames_sent += 1
+
+    def take_sent(self) -> tuple[CanFrame, ...]:
+        """Return the frames that were sent since the last call."""
+        frames = tuple(self._sent)
+        self._sent.clear()
+        return frames
+
+    def receive(self, items: Iterable[CanFrame | CanErrors]) -> None:
+        """Take what comes off the bus."""
+        for item in items:
+            if isinstance(item, CanErrors):
+                self.error_frames += item.frames + item.refusals
+                self.refused += item.refusals
+            elif self.is_open and not item.remote:
+                time = self.now if item.time is None else item.time
+                self._take(item.identifier, item.data, time)
 
     def subscribe(self, cob_id: int, callback: Callback) -> None:
         """Call `callback(data, time)` for each frame with this COB-ID, as it arrives."""
@@ -133,12 +158,6 @@ class FrameLink(abc.ABC):
             self._sdo[node_id] = SdoClient(node_id, self.send, self.beat, _HEARTBEAT_PERIOD)
         return self._sdo[node_id]
 
-    def _note_opening(self) -> None:
-        """Begin anew: what was asked before is not answered any more."""
-        self._sdo = {}
-        self.lost = self.other_master = ""
-        self.openings += 1
-
     def _take(self, cob_id: int, data: bytes, time: float) -> None:
         """Hand a frame that arrived at `time` [s] to whom it concerns."""
         self.frames_received += 1
@@ -149,5 +168,3 @@ class FrameLink(abc.ABC):
         client = self._sdo.get(cob_id - SDO_ANSWER)
         if client is not None:
             client.receive(data)
-        with self.arrival:
-            self.arrival.notify_all()

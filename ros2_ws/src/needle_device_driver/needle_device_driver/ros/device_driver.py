@@ -5,9 +5,11 @@ from __future__ import annotations
 import contextlib
 import gc
 import logging
+import queue
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from rclpy._rclpy_pybind11 import RCLError
@@ -16,7 +18,8 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 
-from needle_core.commands.cli import EXIT_DONE
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.component import Action, Actions, Exit, Moment, PortChange, Send
 from needle_core.errors import UserError
 from needle_core.process.end_request import EndRequest
 from needle_core.process.reach import DISCOVERY, is_open
@@ -25,6 +28,7 @@ from needle_core.ros.conversions import NANOSECONDS, RELIABLE, to_nanoseconds
 from needle_core.ros.discovery import (
     AnsweringNodes,
     one_too_many,
+    signature,
     unheard,
     unpublished,
     unrecorded,
@@ -33,17 +37,13 @@ from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameter_desk import ParameterDesk
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeLifecycleNode
-from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.cycle_clock import CycleClock, CycleSchedule
-from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.cia402.drive_identity import are_emulated
-from needle_device_driver.link.can_link import CanLink
-from needle_device_driver.link.frame_link import LinkError
-from needle_device_driver.link.link_settings import LinkSettings
+from needle_device_driver.device import COMMANDS
+from needle_device_driver.device_driver import NOT_ACTIVE, PERIOD, DeviceDriver
+from needle_device_driver.link.can_port import Batch, CanPort
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.ros.device_interface import DeviceInterface
-from needle_device_driver.supervisor.states import State
-from needle_device_driver.supervisor.supervisor import MotionSupervisor
+from needle_device_driver.supervisor.reports import Reply
 
 HELP = """\
 device_driver: moves the needle's stepper stage and rotation servo, CiA 402 drives on a CAN bus.
@@ -62,11 +62,7 @@ Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad p
 """
 
 PARAMETERS = "needle_device_driver.parameters:DeviceDriverParameters"
-PERIOD_NS = 20_000_000
-PERIOD = PERIOD_NS / NANOSECONDS
-# On a running clock the next cycle must come; a simulated one waits for this one's answers.
-_REPLY_WAIT = 0.75 * PERIOD
-_RETRY = 0.25
+PERIOD_NS = round(PERIOD * NANOSECONDS)
 _DESK_LOOK = 0.1
 # From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
 _GRACE = 0.8
@@ -74,63 +70,42 @@ _SLACK = 0.1 * PERIOD
 
 
 class DeviceDriverNode(WholeLifecycleNode):
-    """Runs the cycle: set-points, SYNC, answers, supervision.
+    """The ROS shell of `DeviceDriver`: its clock, its bus, its lifecycle.
 
     Parameters
     ----------
-    make_link : callable
-        Makes the link to the drives, of its settings and the steady clock.
     node_arguments : dict
         Passed on to rclpy's Node (a context of its own, parameter overrides).
     """
 
-    def __init__(
-        self,
-        make_link: Callable[[LinkSettings, Callable[[], float]], CanLink] = CanLink,
-        **node_arguments: Any,
-    ) -> None:
+    def __init__(self, **node_arguments: Any) -> None:
         # A long request would hold the cycle up: `ParameterDesk` answers.
         super().__init__("device_driver", start_parameter_services=False, **node_arguments)
         self._settings = values = NodeParameters(self, DeviceDriverParameters).values
         self._sim_time = bool(self.get_parameter("use_sim_time").value)
         if values.lock_step and not self._sim_time:
             raise UserError(f"{self.get_fully_qualified_name()}: lock_step wants use_sim_time")
-        self._link = make_link(values.link_settings, time.monotonic)
-        insertion, rotation = (
-            Cia402Axis(
-                name, values.drive(name), self._link, period=PERIOD, watchdog=values.watchdog
-            )
-            for name in ("insertion", "rotation")
+        self._component = component = DeviceDriver(
+            values,
+            signature(self),
+            in_simulation=self._sim_time,
+            on_clock=self._sim_time,
+            more_health=self._cycle_health,
         )
-        self._drives = DriveCycle(self._link, (insertion, rotation))
-        self._supervisor = MotionSupervisor(
-            insertion,
-            rotation,
-            values.limits,
-            lock_step=values.lock_step,
-            path_delay=values.path_delay,
-            feedback_delay=1,
-            switching=lambda: self._drives.needs_cycles,
-            run=self._link.run,
-        )
+        component.search_after(time.monotonic() + (DISCOVERY if is_open() else 0.0))
         self._active = False
-        self._autostart = values.autostart
-        self.ended = False
-        self._waiting_for = "the driver to be activated"
-        self._refusal = ""
-        self._ends_if_refused = False
-        self._give_up_at = time.monotonic() + values.connect_timeout
-        self._retry_at = time.monotonic() + (DISCOVERY if is_open() else 0.0)
+        self._exit: Exit | None = None
         self._cycle_clock = CycleClock(PERIOD_NS, lock_step=values.lock_step)
         self._schedule = CycleSchedule(PERIOD, _SLACK)
         self._diagnostics = DiagnosticsPublisher(self)
         self._device = DeviceInterface(
             self,
-            self._supervisor,
+            component,
             self._diagnostics,
-            simulated=None,
             refuse=self._why_not_ready,
+            carry_out=self._carry_out,
         )
+        self._sources = [self._device.subscription(COMMANDS)]
         # rclpy's first line takes a tenth of a second: not once the drives wait for a heartbeat.
         self._life = LifeSigns(
             self,
@@ -138,9 +113,6 @@ class DeviceDriverNode(WholeLifecycleNode):
             f"looking for the drives on {values.link_settings}",
             lambda: self._missing() or unpublished(self, self._sources[1:]),
         )
-        self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
-        self.create_timer(1.0, self._tell_health, clock=STEADY_CLOCK)
-        self._sources = [self._device.commands]
         self._clocks: Subscription[Clock] | None = None
         if self._sim_time:
             self._clocks = self.create_subscription(Clock, "/clock", self._on_clock, RELIABLE)
@@ -148,6 +120,26 @@ class DeviceDriverNode(WholeLifecycleNode):
             self._deferred = self.create_timer(PERIOD, self._cycle_when_due, clock=STEADY_CLOCK)
             self._deferred.cancel()
         self._partners = AnsweringNodes(self)
+        cycle, health = component.timers
+        self._was_configured = False
+        self._on_cycle = cycle.handler
+        self._timer = self.create_timer(PERIOD, self._on_timer, clock=STEADY_CLOCK)
+        self.create_timer(health.period, partial(self._do, health.handler), clock=STEADY_CLOCK)
+        self._arrived: queue.SimpleQueue[Batch | PortChange] = queue.SimpleQueue()
+        self._bell = self.create_guard_condition(self._take_arrived)
+        self._port = CanPort(values.link_settings)
+        self._port.open(self._arrive)
+        self._take_arrived()
+
+    def _cycle_health(self) -> dict[str, str]:
+        # The longest since the last word on it.
+        longest = f"{self._schedule.take_longest():.4f}"
+        return {"late_cycles": str(self._schedule.late), "longest_cycle_s": longest}
+
+    @property
+    def ended(self) -> bool:
+        """Tell whether the driver has ended by itself."""
+        return self._exit is not None
 
     def _why_not_ready(self) -> str:
         missing = self._missing()
@@ -155,7 +147,7 @@ class DeviceDriverNode(WholeLifecycleNode):
 
     def _missing(self) -> list[str]:
         if not self._active:
-            return [self._waiting_for]
+            return [(self._component.waiting or NOT_ACTIVE).removeprefix("waiting for ")]
         if self._clocks is not None and one_too_many(self, self._clocks):
             return [f"one /clock: {one_too_many(self, self._clocks)}"]
         missing = []
@@ -167,159 +159,137 @@ class DeviceDriverNode(WholeLifecycleNode):
             missing += self._partners.unaware_sources(self._sources)
         return missing
 
-    # ---- the cycle ----------------------------------------------------------------------------
+    # ---- events -------------------------------------------------------------------------------
+
+    def _do(self, handler: Callable[..., Actions], *arguments: Any) -> None:
+        self._device.do(handler(*arguments, self._device.moment()))
+
+    def _carry_out(self, action: Action) -> None:
+        match action:
+            case Send(_, frames):
+                self._port.send(frames)
+            case Exit(code, text):
+                self._exit = action
+                if code == EXIT_BAD_INPUT:
+                    raise UserError(f"{self.get_fully_qualified_name()}: {text}")
+                if code != EXIT_DONE:
+                    raise RuntimeError(text)
+
+    def _arrive(self, item: Batch | PortChange) -> None:
+        """Take what comes from the port, in its thread."""
+        self._arrived.put(item)
+        self._bell.trigger()
+
+    def _take_arrived(self, wait: float = 0.0) -> None:
+        """Hand on all that has come, or what comes first within `wait` [s]."""
+        (port,) = self._component.ports
+        with contextlib.suppress(queue.Empty):
+            item = self._arrived.get(timeout=wait) if wait else self._arrived.get_nowait()
+            while True:
+                handler = port.on_change if isinstance(item, PortChange) else port.handler
+                self._do(handler, item)
+                item = self._arrived.get_nowait()
+        self._follow()
 
     def _on_timer(self) -> None:
         self._timer.timer_period_ns = round(self._schedule.begin(time.monotonic()) * NANOSECONDS)
         self._timer.reset()
-        # A stop from before the configuration does not end the search for drives.
-        if self._supervisor.state is State.UNCONFIGURED or self._autostart:
-            self._start_by_itself()
-            return
-        if self._sim_time:
-            # Simulated time may stand still; watchdogs do not.
-            self._drives.beat()
-            self._link.run(self._drives.hear_first(time.monotonic()))
-            self._supervisor.observe(time.monotonic())
-            self._device.report()
-            return
-        self._cycle(self.get_clock().now().nanoseconds, _REPLY_WAIT)
+        # What has come came before the time that goes by now.
+        self._take_arrived()
+        if self._component.searches:
+            self._device.look_around()
+        self._do(self._on_cycle)
+        self._follow()
+
+    def _follow(self) -> None:
+        """Do what the component has become ready for: be active, begin a cycle on /clock."""
+        if self._settings.autostart and self._component.is_set_up and not self._was_configured:
+            self.trigger_configure()
+            self.trigger_activate()
+        if self._clocks is not None:
+            self._cycle_when_due()
 
     def _on_clock(self, message: Clock) -> None:
-        if self._supervisor.state is State.UNCONFIGURED:
+        if not self._component.is_set_up:
             return
         assert self._clocks is not None
         too_many = one_too_many(self, self._clocks)
         if too_many:
-            self._supervisor.fail(too_many)
-            self._device.report()
+            self._component.supervisor.fail(too_many)
             return
         ros_ns = to_nanoseconds(message.clock)
         if ros_ns < 0:  # rclpy's own ear refuses it by name
             return
+        at = Moment(time.monotonic(), ros_ns)
         if self._cycle_clock.tell(ros_ns):
             # A clock that stands still is repeated for whoever comes late; so are the joints.
-            self._device.publish_joint_states(ros_ns, time.monotonic())
-        self._supervisor.note_time(ros_ns, time.monotonic())
+            self._device.do(self._component.repeat_joint_states(at))
+        self._component.supervisor.note_time(ros_ns, at.steady)
         self._cycle_when_due()
 
     def _cycle_when_due(self) -> None:
-        now = time.monotonic()
         self._deferred.cancel()
+        if not self._component.is_set_up or self._component.is_busy:
+            return
+        now = time.monotonic()
         ros_ns = self._cycle_clock.take(now)
         if ros_ns is not None:
-            self._cycle(ros_ns, self._settings.reply_age_limit)
+            at = Moment(now, ros_ns)
+            self._device.do(self._component.begin_cycle(at, self._settings.reply_age_limit))
         elif self._cycle_clock.waits:
             self._deferred.timer_period_ns = int(self._cycle_clock.wait(now) * NANOSECONDS) + 1
             self._deferred.reset()
 
-    def _cycle(self, ros_ns: int, wait: float) -> None:
-        now = time.monotonic()
-        self._supervisor.note_time(ros_ns, now)
-        self._drives.collect()
-        self._supervisor.drive(PERIOD, now)
-        self._link.run(self._drives.exchange(wait))
-        observed = time.monotonic()
-        self._supervisor.observe(observed)
-        self._device.report()
-        # Last: whoever waits for this cycle's joints has heard all that came of it.
-        self._device.publish_joint_states(ros_ns, observed)
-
-    def _tell_health(self) -> None:
-        values = {
-            "late_cycles": str(self._schedule.late),
-            # since the last word on it
-            "longest_cycle_s": f"{self._schedule.take_longest():.4f}",
-        }
-        health = self._drives.health(f"waiting for {self._waiting_for}", values)
-        self._diagnostics.set("can", health)
+    def _wait_while(self, goes_on: Callable[[], bool]) -> None:
+        """Let the component go on until something has ended: a transition answers at its end."""
+        while goes_on():
+            self._take_arrived(PERIOD / 2.0)
+            self._do(self._on_cycle)
 
     # ---- lifecycle ----------------------------------------------------------------------------
 
-    def _start_by_itself(self) -> None:
-        now = time.monotonic()
-        if not self._autostart or now < self._retry_at:
-            return
-        self._retry_at = now + _RETRY
-        if self._device.others:
-            raise UserError(f"{self.get_fully_qualified_name()}: {self._device.others}")
-        why_not = self._link.run(self._drives.probe())
-        if not why_not and self._supervisor.state is not State.UNCONFIGURED:
-            reply = self._supervisor.reset(now)
-            why_not = "" if reply.success else reply.message
-        if not why_not:
-            self._ends_if_refused = True
-            if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
-                self._ends_if_refused = False
-                self.trigger_activate()
-                return
-            raise UserError(f"{self.get_fully_qualified_name()}: {self._refusal}")
-        if now > self._give_up_at:
-            raise UserError(f"{self.get_fully_qualified_name()}: {why_not}")
-        if not self._waiting_for.endswith(why_not):
-            self._waiting_for = f"the drives: {why_not}"
-            self.get_logger().info(f"waiting for {self._waiting_for}")
-
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Open the link and set both drives up; moves nothing."""
-        if self._supervisor.state is not State.UNCONFIGURED:
-            # A fault from before the configuration; an emergency stop that is pressed stays.
-            self._supervisor.reset(time.monotonic())
-        why_not = self._link.run(self._drives.probe())
-        simulated = not why_not and self._is_simulated()
-        if self._settings.lock_step and not (why_not or simulated):
-            why_not = "lock_step: a drive does not say that it is emulated; a real motor would turn"
-        if not why_not:
-            reply = self._supervisor.configure(time.monotonic())
-            why_not = "" if reply.success else reply.message
-        self._refusal = why_not
-        if not why_not:
-            self._device.simulated = simulated
-            # Once, whoever did it: afterwards the lifecycle is in somebody's hands.
-            self._autostart = False
-        elif self._ends_if_refused:
-            return TransitionCallbackReturn.FAILURE
-        self._device.report()
-        if why_not:
-            self.get_logger().error(f"not configured: {why_not}")
-            return TransitionCallbackReturn.FAILURE
-        for text in self._drives.missing_optional_objects:
-            self._drives.beat()  # many words take longer than a watchdog waits
-            self.get_logger().warning(text)
-        self._tell_health()
-        return TransitionCallbackReturn.SUCCESS
+        """Set both drives up; moves nothing."""
+        component = self._component
+        if not component.is_set_up:
+            component.searches = False
+            self._wait_while(lambda: component.is_busy)
+            replies: list[str] = []
 
-    def _is_simulated(self) -> bool:
-        """Return whether this is part of a simulation: its time, and drives without motors."""
-        nodes = [self._settings.drive(name).node_id for name in ("insertion", "rotation")]
-        try:
-            return self._sim_time and self._link.run(are_emulated(self._link, nodes))
-        except LinkError:
-            return False
+            def then(reply: Reply, at: Moment) -> Actions:
+                replies.append("" if reply.success else reply.message)
+                return ()
+
+            self._do(component.set_up, then)
+            self._wait_while(lambda: not replies)
+            if replies[0]:
+                self.get_logger().error(f"not configured: {replies[0]}")
+                return TransitionCallbackReturn.FAILURE
+        # Once, whoever did it: afterwards the lifecycle is in somebody's hands.
+        self._was_configured = True
+        return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Answer to services from now on."""
         self._active = True
-        self.get_logger().info(f"both drives are there on {self._link.settings}")
         return TransitionCallbackReturn.SUCCESS
 
     def on_deactivate(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Stop and switch off."""
         self._active = False
-        self._waiting_for = "the driver to be activated"
-        self._supervisor.enable(False, time.monotonic())
-        self._device.report()
+        self._do(self._component.disable)
         return TransitionCallbackReturn.SUCCESS
 
     def on_cleanup(self, _: LifecycleState) -> TransitionCallbackReturn:
-        """Switch off and let go of drives and link."""
-        self._let_go()
+        """Switch off and let go of the drives."""
+        self._active = False
+        self._do(self._component.take_down)
+        self._wait_while(lambda: self._component.is_busy)
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Do as `on_cleanup` does, and end."""
-        self._let_go()
-        self.ended = True
+        self._end()
         return TransitionCallbackReturn.SUCCESS
 
     def _LifecycleNodeMixin__change_state(  # noqa: N802 - rclpy's own name for it
@@ -334,21 +304,20 @@ class DeviceDriverNode(WholeLifecycleNode):
 
     def fail(self, why: str) -> None:
         """Stop both axes: a callback ended half-way, and nobody knows what it left."""
-        self._supervisor.fail(f"internal error: {why}")
-        self._device.report()
+        self._component.supervisor.fail(f"internal error: {why}")
 
     def close(self) -> None:
-        """Stop both axes, switch them off, let go of the link."""
-        self._active = False
-        self._let_go()
+        """Stop both axes, switch them off, let go of the bus."""
+        self._end()
+        self._port.close()
         self._device.close()
 
-    def _let_go(self) -> None:
+    def _end(self) -> None:
         self._active = False
-        self._supervisor.deconfigure()
-        self._device.simulated = None
-        self._device.report()
-        self._link.close()
+        # Where the cycle is broken, nobody tells the drives that it is not.
+        if self._exit is None:
+            self._do(self._component.on_stop)
+            self._wait_while(lambda: self._exit is None)
 
 
 def main() -> int:

@@ -1,74 +1,76 @@
-"""The `device/...` interface on a node: the same for real, emulated and simulated axes."""
+"""The rows of a device on a node: the same for real, emulated and simulated axes."""
 
 from __future__ import annotations
 
-import dataclasses
+import itertools
 import time
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, Protocol
 
-from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
-from rclpy.publisher import Publisher
-from sensor_msgs.msg import JointState, Joy
-from std_msgs.msg import Bool, Header
+from rclpy.subscription import Subscription
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
-from trajectory_msgs.msg import JointTrajectory
 
+from needle_core.component import (
+    Action,
+    Actions,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Reply,
+    Service,
+)
+from needle_core.convert import Converter, from_ros, ros_type
+from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
+from needle_core.message_types import rclpy_types
 from needle_core.process.claim import WAY_OUT, Claim
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_core.ros.bounded_subscription import listen
-from needle_core.ros.conversions import (
-    ESTOPS_HEARD,
-    HOLDS_HEARD,
-    JOINT_STATES,
-    LATCHED,
-    RELIABLE,
-    to_stamp,
-)
+from needle_core.ros.conversions import to_qos
 from needle_core.ros.discovery import publishers_of, signature
-from needle_device_driver.device import device_status
-from needle_device_driver.ros.conversions import (
-    to_command,
-    to_hold_message,
-    to_joint_state,
-    to_result,
-    to_status,
-)
-from needle_device_driver.supervisor.reports import (
-    DeviceStatus,
-    Notice,
-    NoticeLimit,
-    Reply,
-    StepResult,
-)
-from needle_device_driver.supervisor.supervisor import MotionSupervisor
+from needle_device_driver.device import COMMANDS, RESULT, STATUS, STOP
 
-# Positions alone change device/status so often at most [s]; joint_states has them all.
-_STATUS_PERIOD = 0.5
 # How often to look for another device when nothing else is heard [s].
 _LOOK_PERIOD = 0.1
 
 
+class Device(Protocol):
+    """A device's rows."""
+
+    inputs: Sequence[Input]
+    outputs: Sequence[Output]
+    services: Sequence[Service]
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note who else is a device here, and how many send commands."""
+
+
 class DeviceInterface:
-    """Connects a motion supervisor to the topics and services of `device/...`.
+    """Connects a device's rows to topics and services, and carries its actions out.
 
     Parameters
     ----------
     node : Node
         The node that gets publishers, subscriptions and services.
-    supervisor : MotionSupervisor
-        What they speak for.
+    device : Device
+        Whose rows.
     diagnostics : DiagnosticsPublisher
         Where the device's health goes.
-    simulated : bool or None
-        Whether no real needle can move; None until that is known.
     refuse : callable
         Returns why services are not ready yet, empty when they are; a stop, a disabling and an
         emergency stop are never refused.
     on_step_end : callable, optional
         Called after each result was published.
+    carry_out : callable, optional
+        Takes what is left of a handler's actions.
 
     Raises
     ------
@@ -79,166 +81,144 @@ class DeviceInterface:
     def __init__(
         self,
         node: Node,
-        supervisor: MotionSupervisor,
+        device: Device,
         diagnostics: DiagnosticsPublisher,
         *,
-        simulated: bool | None,
         refuse: Callable[[], str],
         on_step_end: Callable[[], None] = lambda: None,
+        carry_out: Callable[[Action], None] = lambda action: None,
     ) -> None:
         self._node = node
-        self._supervisor = supervisor
+        self._device = device
         self._diagnostics = diagnostics
         self._refuse = refuse
         self._on_step_end = on_step_end
-        self._told: DeviceStatus | None = None
-        self._told_at = 0.0
-        self._notices = NoticeLimit()
-        self.simulated = simulated
-        self._topic = node.resolve_topic_name("device/status")
+        self._carry_out = carry_out
+        self._failures = 0
+        self._numbers = itertools.count(1)
+        self._replies: dict[int, Future[Reply]] = {}
         domain = node.context.get_domain_id()
+        topic = node.resolve_topic_name(STATUS)
         try:
             self._claim = Claim(
-                f"{self._topic} of ROS_DOMAIN_ID {domain}", node.get_fully_qualified_name()
+                f"{topic} of ROS_DOMAIN_ID {domain}", node.get_fully_qualified_name()
             )
         except UserError as error:
             raise UserError(f"another device is there: {error}; {WAY_OUT}") from None
         node.context.on_shutdown(self._claim.release)
-        node.create_timer(_LOOK_PERIOD, self._look_around, clock=STEADY_CLOCK)
-        self.joint_states = node.create_publisher(JointState, "joint_states", JOINT_STATES)
-        self.results = node.create_publisher(Header, "device/result", RELIABLE)
-        self.statuses = node.create_publisher(DiagnosticStatus, "device/status", LATCHED)
-        self.publishers: list[Publisher[Any]] = [self.joint_states, self.results, self.statuses]
-        too_long = diagnostics.refuse
-        self.commands = listen(
-            node,
-            JointTrajectory,
-            "device/joint_trajectory",
-            self._on_commands,
-            RELIABLE,
-            refuse=too_long,
-        )
-        self.holds = listen(
-            node, Joy, "device/hold", self._on_holds, HOLDS_HEARD, refuse=too_long, at_once=100
-        )
-        self.estops = listen(
-            node, Bool, "device/estop", self._on_estops, ESTOPS_HEARD, refuse=too_long, at_once=1000
-        )
-        now = time.monotonic
-        self._service("home", lambda: supervisor.home(now()))
-        self._service("retract", lambda: supervisor.retract(now()))
-        self._service("reset", lambda: supervisor.reset(now()))
-        self._service("stop", supervisor.stop, always=True)
-        self._switch("enable", lambda on: supervisor.enable(on, now()))
-        self._switch("confirm_needle_out", supervisor.confirm_needle_out)
-        self.report()
+        node.create_timer(_LOOK_PERIOD, self.look_around, clock=STEADY_CLOCK)
+        self._types = rclpy_types()
+        self._converter = Converter(self._types)
+        self._publishers = {
+            row.topic: node.create_publisher(
+                self._types.make(ros_type(row.message)), row.topic, to_qos(row.delivery)
+            )
+            for row in device.outputs
+        }
+        self.publishers = list(self._publishers.values())
+        self._subscriptions = {row.topic: self._hear(row) for row in device.inputs}
+        for service in device.services:
+            node.create_service(
+                SetBool if service.has_argument else Trigger,
+                service.name,
+                partial(self._answer, service),
+                # What is not answered at once holds up nobody.
+                callback_group=ReentrantCallbackGroup(),
+            )
+        self.look_around()
 
-    def report(self) -> None:
-        """Publish results and status changes; call it after each cycle."""
-        for event in self._supervisor.take_events():
-            if isinstance(event, StepResult):
-                self.results.publish(to_result(event))
-                self._on_step_end()
-            elif isinstance(event, Notice):
-                self._log(event)
-        now = time.monotonic()
-        status = dataclasses.replace(self._supervisor.status(now), simulated=self.simulated)
-        told = self._told
-        if told == status:
-            return
-        if (
-            told is None
-            or now - self._told_at > _STATUS_PERIOD
-            or dataclasses.replace(status, insertion=told.insertion, rotation=told.rotation) != told
-        ):
-            self._tell(status, now)
-
-    def _log(self, notice: Notice) -> None:
-        text = self._notices.admit(notice, time.monotonic())
-        # rclpy wants each place in the code to keep to one level.
-        if text and notice.fault:
-            self._node.get_logger().error(text)
-        elif text:
-            self._node.get_logger().warning(text)
-
-    @property
-    def others(self) -> str:
-        """Names of other devices on the same topics, as far as discovery tells; empty: nobody."""
-        if self._node.count_publishers(self._topic) <= 1:
-            return ""
-        names = publishers_of(self._node, self._topic)
-        own = self._node.get_fully_qualified_name()
-        if own in names:
-            names.remove(own)
-        return f"another device is there: {', '.join(names)} publishes {self._topic}; {WAY_OUT}"
+    def subscription(self, topic: str) -> Subscription[Any]:
+        """Return the subscription to a topic."""
+        return self._subscriptions[topic]
 
     def close(self) -> None:
         """Let another process be the device on these topics."""
         self._claim.release()
 
-    def _look_around(self) -> None:
-        self._supervisor.see_others(self.others)
-        self.report()
+    def moment(self) -> Moment:
+        """Return the present moment."""
+        return Moment(time.monotonic(), self._node.get_clock().now().nanoseconds)
 
-    def publish_joint_states(self, stamp_ns: int, now: float) -> None:
-        """Publish the measured joints, unless they are stale.
+    def do(self, actions: Actions) -> bool:
+        """Carry out a handler's actions; return whether it did not raise, which is told."""
+        steps = iter(actions)
+        while True:
+            try:
+                action = next(steps, None)
+            # Whatever a message may lead to.
+            except Exception as error:  # noqa: BLE001
+                self._failures += 1
+                text = f"internal error: {type(error).__name__}: {error}"
+                self._node.get_logger().error(text)
+                values = {"failures": str(self._failures)}
+                self._diagnostics.set("handlers", Diagnostic(Level.ERROR, text, values))
+                return False
+            if action is None:
+                return True
+            self._do(action)
 
-        Parameters
-        ----------
-        stamp_ns : int
-            When they were sampled [ns].
-        now : float
-            Steady time at which they must not be stale [s].
-        """
-        joints = self._supervisor.joints(now)
-        if joints is not None:
-            self.joint_states.publish(to_joint_state(joints, to_stamp(stamp_ns)))
+    def _do(self, action: Action) -> None:
+        match action:
+            case Publish(topic, message):
+                self._publishers[topic].publish(self._converter.to_ros(message))
+                if topic == RESULT:
+                    self._on_step_end()
+            case Diagnose(part, diagnostic):
+                self._diagnostics.set(part, diagnostic)
+            case Reply(number):
+                if number in self._replies:
+                    self._replies.pop(number).set_result(action)
+            # rclpy wants each place in the code to keep to one level.
+            case Log("error", text):
+                self._node.get_logger().error(text)
+            case Log("warning", text):
+                self._node.get_logger().warning(text)
+            case Log(_, text):
+                self._node.get_logger().info(text)
+            case _:
+                self._carry_out(action)
 
-    def _tell(self, status: DeviceStatus, now: float) -> None:
-        told = self._told
-        self._told, self._told_at = status, now
-        self.statuses.publish(to_status(status, signature(self._node)))
-        self._diagnostics.set("device", device_status(status, "").diagnostic)
-        if told is None or told.state is not status.state:
-            why = f" ({status.reason})" if status.reason else ""
-            self._node.get_logger().debug(f"device: {status.state.value}{why}")
+    def _hear(self, row: Input) -> Subscription[Any]:
+        return listen(
+            self._node,
+            self._types.make(ros_type(row.message)),
+            row.topic,
+            partial(self._on_messages, row),
+            to_qos(row.delivery),
+            refuse=self._diagnostics.refuse,
+            # Of commands one: each is a lot of work.
+            at_once=1 if row.topic == COMMANDS else row.delivery.depth,
+        )
 
-    def _on_commands(self, messages: list[JointTrajectory]) -> None:
-        self._supervisor.see_others(self.others)
+    def _on_messages(self, row: Input, messages: list[Any]) -> None:
+        self.look_around()
         for message in messages:
-            self._supervisor.submit(
-                to_command(message), time.monotonic(), self.commands.get_publisher_count()
-            )
-        self.report()
+            self.do(row.handler(from_ros(row.message, message), self.moment()))
 
-    def _on_holds(self, messages: list[Joy]) -> None:
-        self._supervisor.see_others(self.others)
-        for message in messages:
-            self._supervisor.receive_hold(to_hold_message(message), time.monotonic())
-        self.report()
-
-    def _on_estops(self, messages: list[Bool]) -> None:
-        for message in messages:
-            self._supervisor.receive_estop(bool(message.data))
-        self.report()
-
-    def _service(self, name: str, call: Callable[[], Reply], *, always: bool = False) -> None:
-        def answer(_: Any, response: Any) -> Any:
-            return self._answer(response, call, always=always)
-
-        self._node.create_service(Trigger, f"device/{name}", answer)
-
-    def _switch(self, name: str, call: Callable[[bool], Reply]) -> None:
-        def answer(request: Any, response: Any) -> Any:
-            on = bool(request.data)
-            return self._answer(response, lambda: call(on), always=not on)
-
-        self._node.create_service(SetBool, f"device/{name}", answer)
-
-    def _answer(self, response: Any, call: Callable[[], Reply], *, always: bool) -> Any:
-        self._supervisor.see_others(self.others)
-        why_not = "" if always else self._refuse()
-        reply = Reply(False, why_not) if why_not else call()
-        response.success, response.message = reply.success, reply.message
-        self.report()
+    async def _answer(self, service: Service, request: Any, response: Any) -> Any:
+        self.look_around()
+        argument = bool(request.data) if service.has_argument else None
+        reply = await self._ask(service, argument)
+        response.success, response.message = reply.success, reply.text
         return response
+
+    def _ask(self, service: Service, argument: bool | None) -> Future[Reply]:
+        number = next(self._numbers)
+        future = self._replies[number] = Future()
+        why_not = "" if service.name == STOP or argument is False else self._refuse()
+        if why_not:
+            self._do(Reply(number, False, why_not))
+        elif not self.do(service.handler(argument, number, self.moment())):
+            self._do(Reply(number, False, "internal error"))
+        return future
+
+    def look_around(self) -> None:
+        """Tell the device who else is one, and how many send commands."""
+        own, others = self._node.get_fully_qualified_name(), []
+        if self._node.count_publishers(STATUS) > 1:
+            others = publishers_of(self._node, STATUS)
+            if own in others:
+                others.remove(own)
+        senders = self._node.count_publishers(COMMANDS)
+        publishers = {STATUS: (signature(self._node), *others), COMMANDS: ("",) * senders}
+        self.do(self._device.on_peers(Peers(publishers), self.moment()))

@@ -7,7 +7,7 @@ from typing import Any, cast
 import pytest
 
 from needle_device_driver.cia402.drive_identity import are_emulated
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.sdo_aborts import SdoAbortedError, SdoSilenceError
 from needle_device_driver.procedure import Procedure, Wait, run
 
@@ -48,7 +48,7 @@ class Named:
 def test_one_drive_that_does_not_say_emulated_is_real(
     second: bytes | Exception, emulated: bool
 ) -> None:
-    link = cast(CanLink, Named({1: b"Emulated insertion drive", 2: second}))
+    link = cast(FrameLink, Named({1: b"Emulated insertion drive", 2: second}))
     for nodes in ((1, 2), (2, 1)):
         told = run(are_emulated(link, nodes), lambda until, _: until(), lambda: 0.0)
         assert told is emulated

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import threading
 from collections.abc import Callable
 from typing import Any
 
+from needle_core.can_frame import CanFrame
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink
-from needle_device_driver.link.frame_link import LinkError
+from needle_device_driver.link.frame_link import FrameLink
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
@@ -26,17 +27,34 @@ from .scripted_drives import ScriptedBus, ScriptedDrive
 FRAME_TIME = 0.0005
 
 
-class BenchCondition(threading.Condition):
-    """Waits in the bench's time: what is not there, nobody brings, and the time passes."""
+class BenchLink(FrameLink):
+    """A link in the bench's time, whose frames are answered while they are sent."""
 
-    def __init__(self, bench: DriveBench) -> None:
-        super().__init__()
-        self.bench = bench
+    def __init__(self, settings: LinkSettings, bench: DriveBench) -> None:
+        self._bench = bench
+        super().__init__(settings)
 
-    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
-        if not predicate():
-            self.bench.now += timeout or 0.0
-        return predicate()
+    @property
+    def now(self) -> float:
+        return self._bench.now
+
+    @now.setter
+    def now(self, value: float) -> None:
+        """Be what a component sets."""
+
+    def open(self) -> None:
+        if not self.is_open:
+            self.change("no such file" if self._bench.no_adapter else "")
+            super().open()
+            self._bench.open(lambda frame: self.receive([frame]))
+
+    def send(self, cob_id: int, data: bytes = b"") -> None:
+        super().send(cob_id, data)
+        self.take_sent()
+        if self._bench.broken:
+            self.change(self._bench.broken)
+        else:
+            self._bench.bus.send(cob_id, data)
 
 
 class DriveBench:
@@ -50,9 +68,10 @@ class DriveBench:
         self.now = 1000.0
         self.buses: list[ScriptedBus] = []
         self.no_adapter = False
+        # What the adapter does not send for; empty: it sends.
+        self.broken = ""
         self.settings = DeviceDriverParameters(link="virtual", channel="test", **parameters)
-        self.link = CanLink(self.settings.link_settings, self.clock, self.open)
-        self.link.arrival = BenchCondition(self)
+        self.link = BenchLink(self.settings.link_settings, self)
         self.axes = [
             Cia402Axis(
                 name,
@@ -70,7 +89,7 @@ class DriveBench:
             self.settings.limits,
             feedback_delay=1,
             switching=lambda: self.drives.needs_cycles,
-            run=self.link.run,
+            run=self.run,
         )
         self.ros_ns = 1_000_000_000
         self.stamps = itertools.count(1)
@@ -82,11 +101,18 @@ class DriveBench:
     def pass_frame(self) -> None:
         self.now += FRAME_TIME
 
-    def open(self, settings: Any) -> Any:
-        if self.no_adapter:
-            raise LinkError(f"cannot open {settings}: no such file")
-        self.buses.append(ScriptedBus([self.insertion, self.rotation], self.pass_frame))
-        return self.buses[-1]
+    def open(self, receive: Callable[[CanFrame], None]) -> None:
+        self.broken = ""
+        self.buses.append(ScriptedBus([self.insertion, self.rotation], receive, self.pass_frame))
+
+    def run(self, procedure: Procedure[T]) -> T:
+        """Run a procedure to its end: what is not there, nobody brings, and the time passes."""
+
+        def wait(is_there: Callable[[], bool], seconds: float) -> None:
+            if not is_there():
+                self.now += seconds
+
+        return run(procedure, wait, self.clock)
 
     @property
     def bus(self) -> ScriptedBus:
@@ -120,7 +146,7 @@ class DriveBench:
             self.drives.collect()
             self.supervisor.drive(PERIOD, self.now)
             # What is answered at once is here when the frame is sent.
-            self.link.run(self.drives.exchange(0.0))
+            self.run(self.drives.exchange(0.0))
             self.supervisor.observe(self.clock())
 
     def hold(self, pressed: bool = True, *, scale: float = 1.0) -> None:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import queue
 from collections.abc import Callable
 
-import can
+from needle_core.can_frame import CanFrame
 
 
 class ScriptedDrive:
@@ -212,64 +211,38 @@ class ScriptedDrive:
 
 
 class ScriptedBus:
-    """python-can's bus with two scripted drives behind it; remembers what was sent.
-
-    Whoever puts a frame on it goes on once the receiving thread has dealt with the frame: what the
-    driver knows after it has sent does not depend on the machine's load.
-    """
+    """A bus with two scripted drives on it, who answer at once; remembers what was sent."""
 
     def __init__(
-        self, drives: list[ScriptedDrive], sending: Callable[[], None] = lambda: None
+        self,
+        drives: list[ScriptedDrive],
+        receive: Callable[[CanFrame], None],
+        sending: Callable[[], None] = lambda: None,
     ) -> None:
+        self.receive = receive
         self.sending = sending
         self.drives = drives
         self.sent: list[tuple[int, bytes]] = []
-        self.inbox: queue.Queue[can.Message] = queue.Queue()
-        self.dealing = False
         # What the drives say waits for the next `flush`.
         self.late = False
-        self.error: Exception | None = None
         self.cut = False
-        self.closed = False
 
-    def send(self, message: can.Message) -> None:
-        if self.error is not None:
-            raise self.error
+    def send(self, cob_id: int, data: bytes) -> None:
         self.sending()
-        self.sent.append((message.arbitration_id, bytes(message.data)))
+        self.sent.append((cob_id, data))
         for drive in self.drives:
             if not self.cut:
-                drive.take(message.arbitration_id, bytes(message.data))
+                drive.take(cob_id, data)
         if not self.late:
             self.flush()
 
     def flush(self) -> None:
         for drive in self.drives:
-            for cob_id, data in drive.out:
+            out = list(drive.out)
+            drive.out.clear()
+            for cob_id, data in out:
                 if not self.cut:
                     self.put(cob_id, data)
-            drive.out.clear()
 
     def put(self, cob_id: int, data: bytes) -> None:
-        self.inbox.put(can.Message(arbitration_id=cob_id, data=data, is_extended_id=False))
-        if self.error is None:
-            with self.inbox.all_tasks_done:
-                assert self.inbox.all_tasks_done.wait_for(
-                    lambda: not self.inbox.unfinished_tasks, 30.0
-                )
-
-    def recv(self, timeout: float) -> can.Message | None:
-        if self.error is not None:
-            raise self.error
-        if self.dealing:
-            self.inbox.task_done()
-        self.dealing = False
-        try:
-            message = self.inbox.get(timeout=timeout)
-        except queue.Empty:
-            return None
-        self.dealing = True
-        return message
-
-    def shutdown(self) -> None:
-        self.closed = True
+        self.receive(CanFrame(cob_id, data))

@@ -209,7 +209,7 @@ def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: DriveBench)
 
 def test_a_drive_that_is_not_there_is_named(drive_bench: DriveBench) -> None:
     drive_bench.rotation.silent = True
-    why_not = drive_bench.link.run(drive_bench.drives.probe())
+    why_not = drive_bench.run(drive_bench.drives.probe())
     assert "rotation axis: node 2 does not answer" in why_not
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import can
 import hypothesis.strategies as st
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -41,7 +40,7 @@ def fail(bench: DriveBench) -> None:
 
 
 def lose(bench: DriveBench) -> None:
-    bench.bus.error = can.CanOperationError("gone")
+    bench.broken = "gone"
 
 
 EVENTS: dict[str, Callable[[DriveBench], object]] = {

@@ -233,7 +233,7 @@ def test_software_limits_are_taken_from_slow_drives_with_few_heartbeats(
 
 def test_a_stopped_node_is_found(drive_bench: DriveBench) -> None:
     drive_bench.insertion.nmt = drive_bench.rotation.nmt = 0x04
-    assert drive_bench.link.run(drive_bench.drives.probe()) == ""
+    assert drive_bench.run(drive_bench.drives.probe()) == ""
     steps(drive_bench)
 
 

@@ -202,7 +202,7 @@ def _breaks(*_: Any) -> Any:
 def test_a_handler_that_raises_stops_both_axes(monkeypatch: pytest.MonkeyPatch) -> None:
     bench = ComponentBench()
     bench.moving()
-    monkeypatch.setattr(bench.driver._supervisor, "submit", _breaks)
+    monkeypatch.setattr(bench.driver.supervisor, "submit", _breaks)
     bench.step()
     bench.until(lambda: bench.state == "FAULT", 0.2)
     assert "internal error: ZeroDivisionError: planted" in bench.fault

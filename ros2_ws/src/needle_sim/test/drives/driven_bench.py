@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import itertools
 import random
-import threading
 from collections.abc import Callable
 from typing import Any
 
-import can
-
-from needle_core.can_frame import CanFrame
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
-from needle_device_driver.link.can_link import CanLink
+from needle_device_driver.link.frame_link import FrameLink
+from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
+from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
@@ -29,46 +27,26 @@ PERIOD, TICK, FRAME = 0.02, 0.001, 0.0002
 UNITS = (0x608F, 0x60A8, 0x60A9, 0x60AA)
 
 
-class _Arrival(threading.Condition):
-    """Waits in the bench's time."""
+class _Link(FrameLink):
+    """The driver's link in the bench's time: what the drives say is dealt with at once."""
 
-    def __init__(self, bench: DrivenBench) -> None:
-        super().__init__()
-        self.bench = bench
-
-    def wait_for(self, predicate: Callable[[], Any], timeout: float | None = None) -> Any:
-        until = self.bench.now + (timeout or 0.0)
-        while not predicate() and self.bench.now < until:
-            self.bench.pass_time(TICK)
-        return predicate()
-
-
-class _Adapter:
-    """The part of python-can's bus that the link uses."""
-
-    def __init__(self, bench: DrivenBench) -> None:
+    def __init__(self, settings: LinkSettings, bench: DrivenBench) -> None:
         self._bench = bench
+        super().__init__(settings)
 
-    def send(self, message: can.Message) -> None:
-        frame = CanFrame(message.arbitration_id, bytes(message.data))
-        self._bench.bus.receive(frame, self._bench.now)
+    @property
+    def now(self) -> float:
+        return self._bench.now
+
+    @now.setter
+    def now(self, value: float) -> None:
+        """Be what a component sets."""
+
+    def send(self, cob_id: int, data: bytes = b"") -> None:
+        super().send(cob_id, data)
+        for frame in self.take_sent():
+            self._bench.bus.receive(frame, self._bench.now)
         self._bench.pass_time(FRAME)
-
-    def shutdown(self) -> None:
-        """Nothing to shut down."""
-
-
-class _Link(CanLink):
-    """The driver's own link, without a thread: what the drives say is dealt with at once."""
-
-    def _begin_to_receive(self, bus: can.BusABC) -> None:
-        """Nothing receives by itself."""
-
-    def hear(self, frame: CanFrame) -> None:
-        if self.is_open:
-            self._dispatch(
-                can.Message(arbitration_id=frame.identifier, data=frame.data, is_extended_id=False)
-            )
 
 
 class DrivenBench:
@@ -89,8 +67,7 @@ class DrivenBench:
                 objects._indices.difference_update(UNITS)
         self.pass_time(1.0)
         settings = DeviceDriverParameters(link="virtual", channel="test", **driver)
-        self.link = _Link(settings.link_settings, lambda: self.now, self._open)
-        self.link.arrival = _Arrival(self)
+        self.link = _Link(settings.link_settings, self)
         axes = [
             Cia402Axis(
                 name,
@@ -108,7 +85,7 @@ class DrivenBench:
             settings.limits,
             feedback_delay=1,
             switching=lambda: self.cycles.needs_cycles,
-            run=self.link.run,
+            run=self.run,
         )
         self.ros_ns = 1_000_000_000
         self.due = self.now
@@ -116,16 +93,22 @@ class DrivenBench:
         self.late: Callable[[], float] = lambda: 0.0
         self._events: list[Event] = []
 
-    def _open(self, _: Any) -> Any:
-        return _Adapter(self)
+    def run(self, procedure: Procedure[T]) -> T:
+        """Run a procedure to its end, while time goes by."""
+        return run(procedure, self._wait, lambda: self.now)
+
+    def _wait(self, is_there: Callable[[], bool], seconds: float) -> None:
+        until = self.now + seconds
+        while not is_there() and self.now < until:
+            self.pass_time(TICK)
 
     def pass_time(self, seconds: float) -> None:
         end = self.now + seconds
         while self.now < end - 1e-9:
             self.now = min(self.now + TICK, end)
-            for frame in self.bus.poll(self.now):
-                if self.link is not None:
-                    self.link.hear(frame)
+            frames = self.bus.poll(self.now)
+            if self.link is not None:
+                self.link.receive(frames)
 
     @property
     def status(self) -> DeviceStatus:
@@ -151,8 +134,7 @@ class DrivenBench:
             self.supervisor.note_time(self.ros_ns, self.now)
             self.cycles.collect()
             self.supervisor.drive(PERIOD, self.now)
-            assert self.link is not None
-            self.link.run(self.cycles.exchange(0.75 * PERIOD))
+            self.run(self.cycles.exchange(0.75 * PERIOD))
             self.supervisor.observe(self.now)
 
     def hold(self, pressed: bool, scale: float = 1.0) -> None:

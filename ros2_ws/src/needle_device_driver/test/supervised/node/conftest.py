@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from needle_device_driver.ros import device_driver as device_driver_node
+from needle_device_driver import device_driver
 from own_context import own_context
 
 from .node_bench import Rig, emulated_as
@@ -15,7 +15,7 @@ from .node_bench import Rig, emulated_as
 
 @pytest.fixture
 def make_rig(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Rig]]:
-    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(True))
+    monkeypatch.setattr(device_driver, "are_emulated", emulated_as(True))
     with own_context() as context:
         rigs: list[Rig] = []
 

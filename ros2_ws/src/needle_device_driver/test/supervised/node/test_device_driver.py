@@ -233,7 +233,7 @@ def test_an_emergency_stop_does_not_end_the_search_for_drives(make_rig: Make) ->
 
 def test_who_configures_it_meanwhile_has_it_watched_all_the_same(make_rig: Make) -> None:
     rig = waiting_for_a_drive(make_rig)
-    rig.driver._retry_at = math.inf
+    rig.driver._component.search_after(math.inf)
     rig.peer.drives[1].silent = False
     assert rig.transition(Transition.TRANSITION_CONFIGURE)
     assert rig.transition(Transition.TRANSITION_ACTIVATE)
@@ -252,7 +252,7 @@ def test_between_words_on_what_the_drives_lack_their_watchdogs_are_fed(
     said = logger.warning
 
     def warning(text: str, **more: Any) -> bool:
-        sent.append(rig.driver._link.frames_sent)
+        sent.append(rig.driver._component.link.frames_sent)
         return bool(said(text, **more))
 
     monkeypatch.setattr(logger, "warning", warning)

@@ -13,6 +13,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from needle_core.errors import UserError
 from needle_core.ros.conversions import LATCHED, RELIABLE
+from needle_device_driver import device_driver
 from needle_device_driver.ros import device_driver as device_driver_node
 
 from .node_bench import Make, emulated_as
@@ -44,7 +45,7 @@ def test_another_device_stops_everything_until_it_is_gone_and_reset(make_rig: Ma
     other = rclpy.create_node("other_rig", context=rig.partner.context)
     other.create_publisher(DiagnosticStatus, "device/status", LATCHED)
     rig.until(lambda: rig.partner.status["state"] == "FAULT", "a fault")
-    assert "/other_rig publishes /device/status" in rig.partner.status["fault"]
+    assert "/other_rig publishes device/status" in rig.partner.status["fault"]
     rig.hold(False)
     for name, data in (("home", None), ("enable", True), ("confirm_needle_out", True)):
         assert not rig.call(name, data).success
@@ -59,7 +60,7 @@ def test_a_driver_that_finds_another_device_does_not_start(make_rig: Make) -> No
     rig = make_rig()
     other = rclpy.create_node("other_rig", context=rig.partner.context)
     other.create_publisher(DiagnosticStatus, "device/status", LATCHED)
-    with pytest.raises(UserError, match="/other_rig publishes /device/status"):
+    with pytest.raises(UserError, match="/other_rig publishes device/status"):
         rig.until(lambda: False, "the refusal")
     other.destroy_node()
 
@@ -72,7 +73,7 @@ def test_on_an_open_network_it_looks_for_another_device_before_it_begins(
     monkeypatch.setattr(device_driver_node, "DISCOVERY", 0.5)
     begin = time.monotonic()
     rig = make_rig()
-    rig.until(lambda: rig.driver._link.is_open, "the first word to the drives")
+    rig.until(lambda: rig.driver._component.link.is_open, "the first word to the drives")
     # It was made before: at the earliest half a second after this test began.
     assert not opened or time.monotonic() - begin >= 0.5
 
@@ -88,7 +89,7 @@ def test_simulated_is_what_has_emulated_drives_and_simulated_time(
     use_sim_time: bool,
     simulated: str,
 ) -> None:
-    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(emulated))
+    monkeypatch.setattr(device_driver, "are_emulated", emulated_as(emulated))
     rig = make_rig(autostart=False, use_sim_time=use_sim_time, lock_step=False)
     rig.until(rig.partner.change.service_is_ready, "the driver")
     assert rig.partner.status.get("simulated", "") == ""
@@ -99,7 +100,7 @@ def test_simulated_is_what_has_emulated_drives_and_simulated_time(
 def test_lock_step_is_refused_where_a_drive_does_not_say_that_it_is_emulated(
     make_rig: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_driver_node, "are_emulated", emulated_as(False))
+    monkeypatch.setattr(device_driver, "are_emulated", emulated_as(False))
     rig = make_rig(lock_step=True)
     with pytest.raises(UserError, match="lock_step: a drive does not say that it is emulated"):
         rig.until(lambda: False, "the refusal")

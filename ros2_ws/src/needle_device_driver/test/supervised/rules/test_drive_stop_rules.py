@@ -195,7 +195,7 @@ def test_drive_emergency_a_drive_in_fault_takes_no_order_to_move(drive_bench: Dr
     bench.bus.flush()
     orders: tuple[Callable[[], None], ...] = (
         lambda: axis.power(True),
-        lambda: bench.link.run(axis.home(0.001)),
+        lambda: bench.run(axis.home(0.001)),
         lambda: axis.start_move(axis.poll(0.0).set_point, 0.001),
     )
     for order in orders:
