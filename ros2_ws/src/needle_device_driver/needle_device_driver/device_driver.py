@@ -53,8 +53,6 @@ class DeviceDriver(Component):
         The node's parameters, a `DeviceDriverParameters`.
     name : str
         How it signs what it says.
-    in_simulation : bool
-        Whether time is simulated: emulated drives are then no real needle's.
     on_clock : bool
         Whether `begin_cycle` is called when a cycle is due, not by the component's own timer.
     more_health : callable
@@ -79,7 +77,6 @@ class DeviceDriver(Component):
         settings: DriverParameters,
         name: str = name,
         *,
-        in_simulation: bool = True,
         on_clock: bool = False,
         more_health: Callable[[], Mapping[str, str]] = dict,
     ) -> None:
@@ -108,7 +105,7 @@ class DeviceDriver(Component):
         self.searches = settings.autostart
         self.is_set_up = False
         self._refusal = ""
-        self._in_simulation, self._on_clock = in_simulation, on_clock
+        self._on_clock = on_clock
         self._more_health = more_health
         self._is_ending = self._exits = False
         self._retry_at, self._give_up_at = 0.0, math.inf
@@ -293,7 +290,7 @@ class DeviceDriver(Component):
                 "lock_step: a drive does not say that it is emulated; a real motor would turn",
             )
         else:
-            self._device.simulated = emulated and self._in_simulation
+            self._device.simulated = emulated
             reply = yield from self.supervisor.configuring(now)
         # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message

@@ -88,7 +88,6 @@ class DeviceDriverNode(WholeLifecycleNode):
         self._component = component = DeviceDriver(
             values,
             signature(self),
-            in_simulation=self._sim_time,
             on_clock=self._sim_time,
             more_health=self._cycle_health,
         )
