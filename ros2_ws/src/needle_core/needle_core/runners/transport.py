@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
+from needle_core.runners.faults import Arrival, Fault, Link
 from needle_core.runners.timeline import Timeline
 
 
@@ -43,13 +43,16 @@ class Transport:
             streams = self._streams[link] = stream(name), stream(f"faults/{name}")
         timeline = self._timeline
         now = timeline.now
-        arrivals: Arrivals = (Arrival(streams[0].uniform(*latency), message),)
+        arrivals = [Arrival(streams[0].uniform(*latency), message)]
         for fault in self._faults:
-            arrivals = [
-                Arrival(sent.late + late, changed, sent.overtakes or overtakes)
-                for sent in arrivals
-                for late, changed, overtakes in fault(link, sent.message, now, streams[1])
-            ]
+            for sent in tuple(arrivals):
+                spoilt = fault(link, sent.message, now, streams[1])
+                if spoilt is not None:
+                    arrivals.remove(sent)
+                    arrivals += [
+                        Arrival(sent.late + late, changed, sent.overtakes or overtakes)
+                        for late, changed, overtakes in spoilt
+                    ]
         for late, arrived, overtakes in arrivals:
             when = now + late
             if not overtakes:
