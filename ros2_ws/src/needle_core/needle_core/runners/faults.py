@@ -35,7 +35,7 @@ class Arrival(NamedTuple):
 
 Arrivals = Sequence[Arrival]
 Fault = Callable[[Link, Any, float, random.Random], Arrivals | None]
-"""(link, message, time [s], random stream) to what arrives, none where it is lost; None: as sent."""
+"""(link, message, time [s], random stream) to what arrives, if anything; None: what was sent."""
 
 
 def drop(topic: str, share: float) -> Fault:
