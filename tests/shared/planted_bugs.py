@@ -204,7 +204,7 @@ PLANTED = {
         "hold_is_of_now", _hold_of_a_page_outlives_its_words, 30
     ),
     "a page's lost press that goes on": PlantedBug(
-        "hold_is_of_now", _lost_press_of_a_page_goes_on, 392
+        "hold_is_of_now", _lost_press_of_a_page_goes_on, 15
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a cycle that orders twice": PlantedBug("none_beyond_limits", _cycle_that_orders_twice, 1),
@@ -214,7 +214,7 @@ PLANTED = {
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
-    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 134),
+    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 608),
     "a message dropped unsaid": PlantedBug("nothing_recorded_is_lost", _drops_uncounted, 28),
     "a bag kept in memory": PlantedBug("nothing_recorded_is_lost", _never_written_out, 10),
     "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 100),

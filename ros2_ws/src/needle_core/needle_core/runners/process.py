@@ -95,6 +95,9 @@ class Process:
         """Queue an event; of one source only the newest `depth` wait."""
         if not self.is_alive:
             return
+        if not (self._is_busy or self._queue) and self._due <= self._timeline.now:
+            self._handle_now(source, work, sent_ns)
+            return
         if depth is not None and self._waiting[source] >= depth:
             oldest = next(n for n, item in enumerate(self._queue) if item[0] == source)
             del self._queue[oldest]
@@ -115,20 +118,24 @@ class Process:
     def _go_on(self) -> None:
         """Handle what waits as soon as the handler before has taken its time."""
         while self._queue and not self._is_busy:
-            due = max(self._free_at, self._frozen_until)
-            if due > self._timeline.now:
+            if self._due > self._timeline.now:
                 self._is_busy = True
-                self._timeline.call_at(due, self._get_free)
+                self._timeline.call_at(self._due, self._get_free)
             else:
-                self._handle_next()
+                source, work, sent_ns = self._queue.popleft()
+                self._waiting[source] -= 1
+                self._handle_now(source, work, sent_ns)
 
     def _get_free(self) -> None:
         self._is_busy = False
         self._go_on()
 
-    def _handle_next(self) -> None:
-        source, work, sent_ns = self._queue.popleft()
-        self._waiting[source] -= 1
+    @property
+    def _due(self) -> float:
+        """When the next event may be handled [s]."""
+        return max(self._free_at, self._frozen_until)
+
+    def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
         actions = self._handle(work, self._timeline.moment(sent_ns))
         stream = self._streams.get(source)
         if stream is None:

@@ -133,9 +133,8 @@ class VirtualRunner:
         compute = self._compute.get(name, uniform(*COMPUTE))
         process = Process(component, compute, self.timeline, self._do)
         for number, timer in enumerate(component.timers):
-            source = f"timer {number}"
-            phase = self.timeline.draw(f"{name}/{source}/phase", (0.0, timer.period))
-            self.timeline.call_after(phase, partial(self._tick, process, source, timer))
+            phase = self.timeline.draw(f"{name}/timer {number}/phase", (0.0, timer.period))
+            self.timeline.call_after(phase, self._ticking(process, f"timer {number}", timer))
         self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._tell_health, process))
         for other in self._processes.values():
             for pair in ((process, other), (other, process)):
@@ -228,11 +227,14 @@ class VirtualRunner:
                 self._remove(process)
                 self._forget(process)
 
-    def _tick(self, process: Process, source: str, timer: Timer) -> None:
-        if process.is_alive:
-            # A timer that was missed fires once, not once for each period.
-            process.offer(source, timer.handler, depth=1)
-            self.timeline.call_after(timer.period, partial(self._tick, process, source, timer))
+    def _ticking(self, process: Process, source: str, timer: Timer) -> Callable[[], None]:
+        def tick() -> None:
+            if process.is_alive:
+                # A timer that was missed fires once, not once for each period.
+                process.offer(source, timer.handler, depth=1)
+                self.timeline.call_after(timer.period, tick)
+
+        return tick
 
     # ---- topics and ports -----------------------------------------------------------------------
 

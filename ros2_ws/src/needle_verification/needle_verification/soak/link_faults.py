@@ -63,14 +63,14 @@ class LinkFaults:
         """Let the fault on a link end."""
         self._on.pop(part, None)
 
-    def __call__(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals:
-        """Return what arrives of a message that is sent now."""
+    def __call__(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals | None:
+        """Return what arrives of a message that is sent now; None: nothing befalls it."""
         if not self._on:
-            return (Arrival(0.0, message),)
+            return None
         part = _PARTS.get(link.topic, f"/{link.topic}")
         fault = self._on.get(part)
         if fault is None:
-            return (Arrival(0.0, message),)
+            return None
         resend = _RESENT.get(part)
         whole = [(frame,) for frame in message] if part == BUS else [message]
         return [arrival for one in whole for arrival in _arrivals(fault, one, now, rng, resend)]

@@ -51,6 +51,8 @@ _CONSOLE = (CONSOLE, HoldServer.name)
 _RECORDED = ("device_driver", "plane_controller", "operator", "joy_node")
 _DEPTHS = (0.003, 0.008)
 _LATEST_START = 0.2
+# What the clock of the stamps shows at the begin [ns]: it may jump back.
+_CLOCK_NS = 1_750_000_000 * 10**9
 # A node that ended is started again by whoever sees it [s].
 _RESTART = 1.0
 # What a handler takes of its component's time, but for the tracker's [s].
@@ -130,6 +132,7 @@ class SoakRig:
             taps=(self._see_published,),
         )
         timeline = self.runner.timeline
+        timeline.clock_offset_ns = _CLOCK_NS
         draw = timeline.stream("rig")
         self.steering = SteeringSettings(
             depth=draw.uniform(*_DEPTHS) if depth is None else depth,
@@ -290,7 +293,7 @@ class SoakRig:
         if line.text.startswith(_INTERNAL):
             self.crashes.append(f"{line.source}: {line.text}")
 
-    def _meet_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals:
+    def _meet_faults(self, link: Link, message: Any, now: float, rng: Any) -> Arrivals | None:
         if link.topic == CAN and link.sender == "device_driver":
             for see in () if self._adapter_is_open else self.adapter_opened:
                 see()
