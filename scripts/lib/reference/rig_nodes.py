@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import inspect
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
@@ -183,14 +182,15 @@ def _look(node: Any, noted: Noted) -> None:
 
 def _console(module: ModuleType) -> Node:
     """Make the console without its page: that wants NiceGUI and ports."""
-    node: Node = module.ConsoleNode(mock.MagicMock(), mock.MagicMock())
+    node: Node = module.ConsoleNode(mock.MagicMock())
     return node
 
 
 def _look_at_page(node: Any, _: Noted) -> None:
-    node._feed.picture("left", time.monotonic())
+    node.desk.picture("left")
     node._look()
-    node._tell_health()
+    for timer in node._component.timers:
+        node._on_timer(timer.handler)
 
 
 def _player(module: ModuleType, *more: str) -> Node:

@@ -7,6 +7,7 @@ from typing import Any
 
 from nicegui import events, ui
 
+from needle_console.hold.hold_state import OWNER
 from needle_console.page.desk import Desk
 from needle_console.view.advice import Button, advise, usable_buttons
 from needle_console.view.snapshot import Snapshot
@@ -53,13 +54,13 @@ class Controls:
 
     def show(self, snapshot: Snapshot) -> None:
         """Show what to do next, and which buttons make sense."""
-        advice = advise(snapshot, self._desk.name)
+        advice = advise(snapshot, OWNER)
         self._headline.set_text(advice.headline)
         self._text.set_text(advice.text)
         self._answer.set_text(snapshot.answer)
         possible = usable_buttons(snapshot)
         device = snapshot.device
-        must_let_go = device is not None and device.press_again == self._desk.name
+        must_let_go = device is not None and device.press_again == OWNER
         why = device.trouble if device is not None and must_let_go else ""
         self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
         for button, element in self._buttons.items():
@@ -83,7 +84,9 @@ class Controls:
                     ui.element("div").props('id="hold-words"')
             self._buttons[button] = hold
         # Grey, and no more than its name: it is no emergency stop (docs/safety.md).
-        stop = ui.button("Stop", color="grey-7", on_click=desk.stop)
+        stop = ui.button(
+            Button.STOP.value, color="grey-7", on_click=lambda: desk.press(Button.STOP)
+        )
         stop.props('id="stop" no-caps unelevated').classes("stop")
         stop.on("click", js_handler=_LET_GO)
         with ui.element("div").classes("speed"):

@@ -1,4 +1,4 @@
-"""Serves the page in a thread and loop of its own."""
+"""Servers of page and hold, each in a thread and loop of its own."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from fastapi import FastAPI, Response
 from nicegui import app, ui
 
 from needle_console.access.access import Access
+from needle_console.console_parameters import ConsoleParameters
+from needle_console.hold.hold_server import HoldServer
 from needle_console.page.console_page import ConsolePage, HoldLink
 from needle_console.page.desk import Desk
 from needle_console.page.gate import Gate
@@ -89,6 +91,40 @@ class WebServer:
 
     def _run(self) -> None:
         self._server.run(sockets=[self._socket])
+
+
+class ConsoleServers:
+    """Servers of page and hold at a desk.
+
+    Parameters
+    ----------
+    desk : Desk
+        What pages show and do.
+    settings : ConsoleParameters
+        Where, and to whom.
+
+    Raises
+    ------
+    UserError
+        A setting that cannot be, or a port that is taken.
+    """
+
+    def __init__(self, desk: Desk, settings: ConsoleParameters) -> None:
+        access = settings.access()
+        self._hold = HoldServer(access, settings.hold_port, desk.hold, desk.notice)
+        desk.refused = self._hold.counts
+        link = HoldLink(settings.hold_port, settings.token())
+        self._web = WebServer(desk, access, address=settings.address, port=settings.port, hold=link)
+
+    def start(self) -> None:
+        """Begin to serve."""
+        self._hold.start()
+        self._web.start()
+
+    def close(self) -> None:
+        """Release the hold, then end both."""
+        self._hold.close()
+        self._web.close()
 
 
 def _listen(address: str, port: int) -> socket.socket:

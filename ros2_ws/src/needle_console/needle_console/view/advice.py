@@ -26,6 +26,7 @@ class Button(enum.Enum):
     RETRACT = "Hold to retract"
     RESET = "Reset"
     SWITCH_OFF = "Switch off"
+    STOP = "Stop"
 
 
 @dataclasses.dataclass(frozen=True)

@@ -29,11 +29,11 @@ class CameraFeed:
     cameras : mapping of str to RefractedCamera
         By side; a side that is missing is shown without the needle.
     snapshot : callable
-        Returns the rig at a time.
+        Returns the rig as it is now.
     """
 
     def __init__(
-        self, cameras: Mapping[str, RefractedCamera], snapshot: Callable[[float], Snapshot]
+        self, cameras: Mapping[str, RefractedCamera], snapshot: Callable[[], Snapshot]
     ) -> None:
         self._cameras = cameras
         self._snapshot = snapshot
@@ -61,7 +61,7 @@ class CameraFeed:
             picture, drawn = self._pictures.get(side, (b"", -math.inf))
         if now - drawn < PERIOD:
             return picture
-        picture = draw_view(image, self._snapshot(now), self._cameras.get(side))
+        picture = draw_view(image, self._snapshot(), self._cameras.get(side))
         with self._lock:
             self._pictures[side] = picture, now
         return picture

@@ -1,10 +1,9 @@
-"""Collects what is heard of the rig and hands out snapshots; any thread may ask for one."""
+"""Collects what is heard of the rig and hands out snapshots."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import threading
 from collections.abc import Mapping
 
 import numpy as np
@@ -30,7 +29,6 @@ class RigPicture:
     """
 
     def __init__(self) -> None:
-        self._lock = threading.Lock()
         self._told = Snapshot()
         self._joints_at = -math.inf
         self._tip_at = -math.inf
@@ -41,21 +39,18 @@ class RigPicture:
 
     def snapshot(self, now: float) -> Snapshot:
         """Return the rig as it is known at `now`."""
-        with self._lock:
-            told = self._told
-            joints_count = now - self._joints_at <= JOINTS_COUNT_FOR
-            fresh = [
-                text for text, at in self._troubles.values() if now - at <= _TROUBLE_COUNTS_FOR
-            ]
-            return dataclasses.replace(
-                told,
-                insertion=told.insertion if joints_count else math.nan,
-                rotation=told.rotation if joints_count else math.nan,
-                tip=told.tip and dataclasses.replace(told.tip, age=now - self._tip_at),
-                tip_lost_for=0.0 if self._lost_since is None else now - self._lost_since,
-                course=tuple(self._course),
-                troubles=tuple(fresh[:_MOST_TROUBLES]),
-            )
+        told = self._told
+        joints_count = now - self._joints_at <= JOINTS_COUNT_FOR
+        fresh = [text for text, at in self._troubles.values() if now - at <= _TROUBLE_COUNTS_FOR]
+        return dataclasses.replace(
+            told,
+            insertion=told.insertion if joints_count else math.nan,
+            rotation=told.rotation if joints_count else math.nan,
+            tip=told.tip and dataclasses.replace(told.tip, age=now - self._tip_at),
+            tip_lost_for=0.0 if self._lost_since is None else now - self._lost_since,
+            course=tuple(self._course),
+            troubles=tuple(fresh[:_MOST_TROUBLES]),
+        )
 
     def states(self) -> Snapshot:
         """Return what device and controller last said; all else may be old."""
@@ -72,13 +67,12 @@ class RigPicture:
     def see_controller(self, values: Mapping[str, str]) -> None:
         """Take the key-values of `needle/controller_status`; a new start begins a new course."""
         state = controller_state(values)
-        with self._lock:
-            before = self._told.controller
-            if before is not None and state.starts != before.starts:
-                self._course.clear()
-            self._told = dataclasses.replace(
-                self._told, controller=state, T_rig_plane=self._plane(state.target_offset)
-            )
+        before = self._told.controller
+        if before is not None and state.starts != before.starts:
+            self._course.clear()
+        self._told = dataclasses.replace(
+            self._told, controller=state, T_rig_plane=self._plane(state.target_offset)
+        )
 
     def lose_controller(self) -> None:
         """Take that there is no controller any more: what it said last holds no longer."""
@@ -121,51 +115,47 @@ class RigPicture:
         """
         if not (np.isfinite(position).all() and np.isfinite(covariance).all()):
             return
-        with self._lock:
-            depth = self._told.insertion
-            if not math.isfinite(depth):
-                return
-            rotation, origin = self._told.T_rig_plane[:3, :3], self._told.T_rig_plane[:3, 3]
-            point = CoursePoint(
-                depth=depth,
-                r1=float(position[0]),
-                sigma=math.sqrt(max(float(covariance[0, 0]), 0.0)),
-                position=rotation @ position + origin,
-                covariance=rotation @ covariance @ rotation.T,
-            )
-            # Of estimates at one place, and where the needle was drawn back, the last counts.
-            while self._course and self._course[-1].depth > depth - SPACING:
-                self._course.pop()
-            self._course.append(point)
-            del self._course[:-MOST_POINTS]
+        depth = self._told.insertion
+        if not math.isfinite(depth):
+            return
+        rotation, origin = self._told.T_rig_plane[:3, :3], self._told.T_rig_plane[:3, 3]
+        point = CoursePoint(
+            depth=depth,
+            r1=float(position[0]),
+            sigma=math.sqrt(max(float(covariance[0, 0]), 0.0)),
+            position=rotation @ position + origin,
+            covariance=rotation @ covariance @ rotation.T,
+        )
+        # Of estimates at one place, and where the needle was drawn back, the last counts.
+        while self._course and self._course[-1].depth > depth - SPACING:
+            self._course.pop()
+        self._course.append(point)
+        del self._course[:-MOST_POINTS]
 
     def see_plane(self, T_rig_plane: Array) -> None:  # noqa: N803
         """Take the pose that somebody sent as `target_plane`, shape (4, 4)."""
         if not np.isfinite(T_rig_plane).all():
             return
-        with self._lock:
-            self._heard_plane = T_rig_plane
-            state = self._told.controller
-            if state is not None:
-                plane = self._plane(state.target_offset)
-                self._told = dataclasses.replace(self._told, T_rig_plane=plane)
+        self._heard_plane = T_rig_plane
+        state = self._told.controller
+        if state is not None:
+            plane = self._plane(state.target_offset)
+            self._told = dataclasses.replace(self._told, T_rig_plane=plane)
 
     def see_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
         """Take one line of /diagnostics: `node: part`, whether it warns, and what it says."""
-        with self._lock:
-            self._troubles.pop(name, None)
-            if bad:
-                self._troubles[name] = (f"{plain(name)}: {plain(message, 160)}", now)
-            while len(self._troubles) > MOST_POINTS:
-                del self._troubles[next(iter(self._troubles))]
+        self._troubles.pop(name, None)
+        if bad:
+            self._troubles[name] = (f"{plain(name)}: {plain(message, 160)}", now)
+        while len(self._troubles) > MOST_POINTS:
+            del self._troubles[next(iter(self._troubles))]
 
     def see_answer(self, text: str) -> None:
         """Take what a service call was answered."""
         self._tell(answer=plain(text, 200))
 
     def _tell(self, **news: object) -> None:
-        with self._lock:
-            self._told = dataclasses.replace(self._told, **news)  # type: ignore[arg-type]
+        self._told = dataclasses.replace(self._told, **news)  # type: ignore[arg-type]
 
     def _plane(self, offset: float) -> Array:
         """Return the plane in force: what was sent if the controller took it, else the default."""

@@ -78,11 +78,11 @@ def test_points_that_a_camera_cannot_see_do_no_harm(left: RefractedCamera) -> No
 
 
 def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
-    drawn: list[float] = []
+    drawn: list[Snapshot] = []
 
-    def snapshot(now: float) -> Snapshot:
-        drawn.append(now)
-        return Snapshot()
+    def snapshot() -> Snapshot:
+        drawn.append(Snapshot())
+        return drawn[-1]
 
     feed = CameraFeed({}, snapshot)
     assert not feed.wanted(0.0)

@@ -37,6 +37,7 @@ class Timeline:
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._serial = itertools.count()
         self._streams: dict[str, random.Random] = {}
+        self._is_interrupted = False
 
     def stream(self, name: str) -> random.Random:
         """Return the random stream of one thing: a draw for one shifts nothing of another."""
@@ -66,20 +67,22 @@ class Timeline:
         """Stamp of now [ns]."""
         return START_NS + self.clock_offset_ns + round(self.now * 1e9)
 
-    def run(self, seconds: float, ended: Callable[[], bool], real_time_factor: float) -> bool:
-        """Run what is due, for some time [s] or until `ended`; return whether it has ended.
+    def interrupt(self) -> None:
+        """Let `run` return after the present event."""
+        self._is_interrupted = True
+
+    def run(self, seconds: float, real_time_factor: float) -> bool:
+        """Run what is due, for some time [s] or until an interrupt; return whether there was one.
 
         Parameters
         ----------
         seconds : float
             How long at most [s].
-        ended : callable
-            Asked after each event.
         real_time_factor : float
             Virtual over real time; 0: as fast as possible.
         """
         end, wall, begin = self.now + seconds, time.monotonic(), self.now
-        heap = self._heap
+        heap, self._is_interrupted = self._heap, False
         while heap and heap[0][0] <= end:
             if real_time_factor > 0.0:
                 ahead = (heap[0][0] - begin) / real_time_factor - (time.monotonic() - wall)
@@ -87,7 +90,7 @@ class Timeline:
                     time.sleep(ahead)
             self.now, _, event = heapq.heappop(heap)
             event()
-            if ended():
+            if self._is_interrupted:
                 return True
         self.now = end
         return False

@@ -1,0 +1,277 @@
+"""console as a component: the rig into a picture for pages, a person's wishes into messages."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from needle_console.console_parameters import ConsoleParameters
+from needle_console.hold.hold_state import OWNER, HoldState
+from needle_console.hold.retraction import RETRACT, STOP_STEERING, Retraction
+from needle_console.view.advice import STEERING, Button
+from needle_console.view.camera_feed import SIDES
+from needle_console.view.rig_picture import RigPicture
+from needle_console.view.snapshot import Array, Snapshot
+from needle_core import messages as m
+from needle_core.component import (
+    BEST_EFFORT,
+    LATCHED,
+    Actions,
+    Answer,
+    Call,
+    Component,
+    Delivery,
+    Diagnose,
+    Input,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Port,
+    Publish,
+    Send,
+    Timer,
+)
+from needle_core.diagnostics import Diagnostic, Level
+from needle_tracker.optics.calibration import rotation_matrix
+from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
+
+PAGE = "page"
+"""Name of the port."""
+DEVICE_STATUS, CONTROLLER_STATUS = "device/status", "needle/controller_status"
+OF_BUTTON: Mapping[Button, Call] = {
+    Button.CONFIRM: Call("device/confirm_needle_out", True),
+    Button.HOME: Call("device/home"),
+    Button.ENABLE: Call("device/enable", True),
+    Button.SWITCH_OFF: Call("device/enable", False),
+    Button.START: Call("plane_controller/start"),
+    Button.RESET: Call("device/reset"),
+    Button.STOP: Call("device/stop"),
+}
+"""Button to the call that it makes."""
+CALLS = {call.service: call for call in (*OF_BUTTON.values(), Call(RETRACT), Call(STOP_STEERING))}
+"""Service to a call of it."""
+_HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "rig"
+_IMAGES = Delivery(depth=2, reliable=False)
+_SHOW_PERIOD, _HEALTH_PERIOD = 0.1, 1.0
+_HAND_WITHIN = 1.0
+"""The hold's server says at least 12 times a second that it is there [s]."""
+_LAG_GROWS = 0.05
+"""A simulation that falls behind by so much from one report to the next is named [s]."""
+
+
+# ---- what the page's port hands over, beside a Button, a target (Pose, Point) and a Log ----------
+
+
+@dataclasses.dataclass(frozen=True)
+class Hand:
+    """The hold that a person asks for, and how often the hold's server refused or lost what."""
+
+    state: HoldState
+    refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Lag:
+    """Time by which a simulation is behind the clock up to now [s]."""
+
+    seconds: float
+
+
+# ---- what it takes ------------------------------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """A camera's image, grey, shape (height, width)."""
+
+    side: str
+    image: NDArray[np.uint8]
+
+
+PageEvent = Hand | Lag | Button | m.Pose | m.Point | Log
+Shown = Snapshot | View
+
+
+class Console(Component):
+    """Shows the rig on pages, and does what a person at one asks for.
+
+    Parameters
+    ----------
+    settings : ConsoleParameters
+        The node's parameters.
+    """
+
+    name = OWNER
+
+    def __init__(self, settings: ConsoleParameters) -> None:
+        self.settings = settings
+        self._picture = RigPicture()
+        self._retraction = Retraction()
+        self._hold_stamp_ns = 0
+        self._hand_at = -math.inf
+        self._refused: Mapping[str, int] = {}
+        self._lag = 0.0
+        self.inputs = (
+            Input(DEVICE_STATUS, m.Status, self._on_device, LATCHED),
+            Input(CONTROLLER_STATUS, m.Status, self._on_controller, LATCHED),
+            Input("joint_states", m.JointState, self._on_joints),
+            Input("needle/tip_pose", m.PoseWithCovariance, self._on_tip),
+            Input("needle/estimate", m.PoseWithCovariance, self._on_estimate),
+            Input(_PLANE, m.Pose, self._on_plane, LATCHED),
+            Input("/diagnostics", m.Diagnostics, self._on_health),
+            *(
+                Input(image_topic(side), m.Image, partial(self._on_image, side), _IMAGES)
+                for side in SIDES
+            ),
+        )
+        self.outputs = (
+            Output(_HOLD, m.HoldState, BEST_EFFORT),
+            Output(_PLANE, m.Pose, LATCHED),
+            Output(_POINT, m.Point, LATCHED),
+        )
+        self.ports = (Port(PAGE, self._on_page),)
+        self.timers = (Timer(_SHOW_PERIOD, self._show), Timer(_HEALTH_PERIOD, self._tell_health))
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note whether a controller is there.
+
+        One that was killed while it steered must not keep the needle in: a press to retract waits
+        until steering has ended.
+        """
+        if CONTROLLER_STATUS not in peers.publishers:
+            self._picture.lose_controller()
+        return ()
+
+    def on_answer(self, answer: Answer, at: Moment) -> Actions:
+        """Show what a call was answered."""
+        refused = "refused: " if answer.answered and not answer.success else ""
+        self._picture.see_answer(f"{answer.service}: {refused}{answer.text}")
+        return ()
+
+    # ---- the page -------------------------------------------------------------------------------
+
+    def _on_page(self, events: Sequence[PageEvent], at: Moment) -> Actions:
+        for event in events:
+            match event:
+                case Hand():
+                    yield from self._on_hand(event, at)
+                case Button():
+                    yield OF_BUTTON[event]
+                case m.Pose():
+                    yield Publish(_PLANE, event)
+                case m.Point():
+                    yield Publish(_POINT, event)
+                case Log():
+                    yield event
+                case Lag(seconds):
+                    self._on_lag(seconds, at)
+
+    def _on_hand(self, hand: Hand, at: Moment) -> Actions:
+        is_back = at.steady - self._hand_at > _HAND_WITHIN
+        self._hand_at, self._refused = at.steady, hand.refused
+        rig, state = self._picture.states(), hand.state
+        todo = self._retraction.update(
+            state,
+            at.steady,
+            steering=rig.controller is not None and rig.controller.state in STEERING,
+            hold_counts=rig.device is not None
+            and rig.device.hold_owner == OWNER
+            and rig.device.activity == "none",
+        )
+        # Stamps must increase whatever the clock does.
+        self._hold_stamp_ns = max(at.stamp_ns, self._hold_stamp_ns + 1)
+        speed = state.speed if todo.press else 0.0
+        yield Publish(
+            _HOLD, m.HoldState(self._hold_stamp_ns, OWNER, todo.press, speed, m.HOLD_LIFETIME)
+        )
+        yield from map(Call, todo.calls)
+        if is_back:
+            yield from self._tell_health(at)
+
+    def _on_lag(self, seconds: float, at: Moment) -> None:
+        if seconds - self._lag >= _LAG_GROWS:
+            text = f"too slow for this computer, {seconds:.1f} s behind the clock"
+            self._picture.see_health("simulation", bad=True, message=text, now=at.steady)
+        self._lag = seconds
+
+    def _show(self, at: Moment) -> Actions:
+        yield Send(PAGE, (self._picture.snapshot(at.steady),))
+
+    def _tell_health(self, at: Moment) -> Actions:
+        served = at.steady - self._hand_at <= _HAND_WITHIN
+        message = "served" if served else "the hold's server does not answer"
+        counts = {f"refused {reason}": str(count) for reason, count in self._refused.items()}
+        level = Level.OK if served else Level.ERROR
+        yield Diagnose("hold", Diagnostic(level, message, counts))
+
+    # ---- the rig --------------------------------------------------------------------------------
+
+    def _on_device(self, message: m.Status, at: Moment) -> Actions:
+        self._picture.see_device(message.values)
+        return ()
+
+    def _on_controller(self, message: m.Status, at: Moment) -> Actions:
+        self._picture.see_controller(message.values)
+        return ()
+
+    def _on_joints(self, message: m.JointState, at: Moment) -> Actions:
+        places = dict(zip(message.names, message.positions, strict=False))
+        insertion, rotation = (
+            places.get(name, math.nan) for name in (m.INSERTION_JOINT, m.ROTATION_JOINT)
+        )
+        self._picture.see_joints(insertion, rotation, at.steady)
+        return ()
+
+    def _on_tip(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
+        if message.frame_id == _RIG:
+            self._picture.see_tip(*_position(message), at.steady)
+        return ()
+
+    def _on_estimate(self, message: m.PoseWithCovariance, at: Moment) -> Actions:
+        if message.frame_id == _PLANE:
+            self._picture.see_estimate(*_position(message))
+        return ()
+
+    def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
+        quaternion = np.array(message.orientation)
+        norm = float(np.linalg.norm(quaternion))
+        if message.frame_id == _RIG and 0.5 < norm < 2.0:
+            pose = np.eye(4)
+            pose[:3, :3] = rotation_matrix(quaternion / norm)
+            pose[:3, 3] = message.position
+            self._picture.see_plane(pose)
+        return ()
+
+    def _on_health(self, message: m.Diagnostics, at: Moment) -> Actions:
+        for status in message.statuses:
+            bad = status.level in (Level.WARN, Level.ERROR)
+            part = ": ".join(filter(None, (status.source, status.part)))
+            self._picture.see_health(part, bad=bad, message=status.text, now=at.steady)
+        return ()
+
+    def _on_image(self, side: str, message: m.Image, at: Moment) -> Actions:
+        if message.encoding not in ENCODINGS:
+            return
+        least = message.width * bytes_per_pixel(message.encoding)
+        if not 0 < least <= message.step or len(message.data) != message.step * message.height:
+            return
+        rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
+        image = grey_image(rows, message.width, message.encoding)
+        yield Send(PAGE, (View(side, np.ascontiguousarray(image)),))
+
+
+def image_topic(side: str) -> str:
+    """Return the topic of a camera's images."""
+    return f"stereo/{side}/image_raw"
+
+
+def _position(message: m.PoseWithCovariance) -> tuple[Array, Array]:
+    """Return a pose's position and its covariance, shapes (3,) and (3, 3), nothing checked."""
+    covariance = np.asarray(message.covariance, dtype=float).reshape(6, 6)
+    return np.array(message.position), covariance[:3, :3]
