@@ -275,7 +275,7 @@ def _emergency_stop_ends_the_search(patch: pytest.MonkeyPatch) -> None:
     set_up = DeviceDriver._setting_up
 
     def unless_stopped(driver: DeviceDriver, now: float) -> Any:
-        driver._searches = driver._supervisor.state is not State.ESTOPPED
+        driver.searches = driver.supervisor.state is not State.ESTOPPED
         return (yield from set_up(driver, now))
 
     patch.setattr(DeviceDriver, "_setting_up", unless_stopped)

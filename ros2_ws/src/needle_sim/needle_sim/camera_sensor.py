@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from needle_core import messages as m
-from needle_core.component import Actions, Delivery, Output, Publish, Send
+from needle_core.component import Actions, Delivery, Output, Port, Publish, Send
 from needle_core.files.installed import find_shared
 from needle_sim.camera.image_folder import ImageFolder, truth_of
 from needle_sim.camera.renderer import StereoRenderer
@@ -121,6 +121,8 @@ class CameraSensor:
         The rig's.
     """
 
+    ports: tuple[Port, ...] = ()
+
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
         self._bench = bench
         self._cameras = StereoCameras(settings)
@@ -147,6 +149,7 @@ class DistantCameras:
     """
 
     outputs: tuple[Output, ...] = ()
+    ports: tuple[Port, ...] = ()
 
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
         self._bench = bench

@@ -6,7 +6,7 @@ import math
 from typing import Protocol
 
 from needle_core import messages as m
-from needle_core.component import Actions, Output, Publish
+from needle_core.component import Actions, Output, Port, Publish
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
@@ -25,11 +25,14 @@ class Sensor(Protocol):
     ----------
     outputs : tuple of Output
         What it sends.
+    ports : tuple of Port
+        What it is wired to.
     half_sizes : tuple of float
         Ends of the phantom, either way, along x and y [m].
     """
 
     outputs: tuple[Output, ...]
+    ports: tuple[Port, ...]
     half_sizes: tuple[float, float]
 
     def expose(self, number: int, stamp_ns: int) -> Actions:
@@ -51,6 +54,7 @@ class TipSensor:
     """
 
     half_sizes = (math.inf, math.inf)
+    ports: tuple[Port, ...] = ()
 
     def __init__(self, bench: SimulatedBench, settings: SimRigParameters) -> None:
         self._bench = bench

@@ -78,7 +78,7 @@ class SimRig(Component):
             Output("sim/tip_pose", m.Pose),
             *self._sensor.outputs,
         )
-        self.services = self._device.services
+        self.services, self.ports = self._device.services, self._sensor.ports
         self.timers = (
             Timer(CYCLE, self._cycle),
             Timer(1.0 / settings.camera_rate, self._expose_if_due),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 
+from needle_core.ros.component_node import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -24,9 +26,27 @@ Services    levels tip and camera: device/{home,retract,stop,reset},
 """
 
 
+def _make(settings: SimRigParameters, name: str) -> SimRig:
+    if settings.level == "tip":
+        return SimRig(settings, name)
+    # The renderer takes longer to load than all else: not where nothing is drawn.
+    from needle_sim.rendering import RenderedCameras  # noqa: PLC0415
+
+    return SimRig(settings, name, RenderedCameras)
+
+
+def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:
+    if settings.level == "tip":
+        return {}
+    from needle_sim.camera_sensor import CAMERAS  # noqa: PLC0415
+    from needle_sim.rendering import RenderingProcess  # noqa: PLC0415
+
+    return {CAMERAS: RenderingProcess(settings)}
+
+
 def main() -> int:
     """Run the node; returns its exit code."""
-    return run_component("sim_rig", SimRigParameters, SimRig, help_text=HELP)
+    return run_component("sim_rig", SimRigParameters, _make, help_text=HELP, ports=_ports)
 
 
 if __name__ == "__main__":
