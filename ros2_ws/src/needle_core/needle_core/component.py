@@ -141,11 +141,12 @@ class Input:
 
 @dataclass(frozen=True)
 class Output:
-    """A topic that the component sends."""
+    """A topic that the component sends; `alone`: that one process of a machine may send."""
 
     topic: str
     message: type[Any]
     delivery: Delivery = RELIABLE
+    alone: bool = False
 
 
 @dataclass(frozen=True)

@@ -114,7 +114,7 @@ class DeviceRows:
         self.outputs: Sequence[Output] = (
             Output(JOINTS, m.JointState, _JOINT_STATES),
             Output(RESULT, m.CommandResult),
-            Output(STATUS, m_status.DeviceStatus, LATCHED),
+            Output(STATUS, m_status.DeviceStatus, LATCHED, alone=True),
         )
         call = supervisor
         self.services: Sequence[Service] = (

@@ -36,7 +36,9 @@ from needle_core.component import (
 )
 from needle_core.convert import Converter, from_ros, ros_type
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
+from needle_core.process.claim import WAY_OUT, Claim
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_core.ros.conversions import to_qos
 from needle_core.ros.discovery import full_name, publishers_of, signature, subscribers_of
@@ -157,6 +159,14 @@ class ComponentNode(WholeNode):
     # ---- rows ---------------------------------------------------------------------------------
 
     def _advertise(self, row: Output) -> Any:
+        if row.alone:
+            topic = self.resolve_topic_name(self._name_of(row.topic))
+            name = f"{topic} of ROS_DOMAIN_ID {self.context.get_domain_id()}"
+            try:
+                claim = Claim(name, self.get_fully_qualified_name())
+            except UserError as error:
+                raise UserError(f"another {row.topic} is there: {error}; {WAY_OUT}") from None
+            self.context.on_shutdown(claim.release)
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
 
