@@ -46,6 +46,8 @@ STOP = "device/stop"
 # Every message counts, also while somebody floods the topic.
 _HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
+# Turning a message into Python takes up to 200 ns a byte [bytes].
+_LONGEST = 4096
 # A lock-step simulation sends the 25 joint states of a step at once: more than a depth of 10 keeps.
 _JOINT_STATES = Delivery(depth=200)
 # Positions alone change device/status so often at most [s]; joint_states has them all.
@@ -107,9 +109,15 @@ class DeviceRows:
         self._notices = NoticeLimit()
         self._order: _Order | None = None
         self.inputs: Sequence[Input] = (
-            Input(COMMANDS, m.Trajectory, self._on_command),
-            Input(HOLD, m.HoldState, self._on_hold, _HOLDS),
-            Input(EMERGENCY_STOP, m.EmergencyStop, self._on_emergency_stop, _EMERGENCY_STOPS),
+            Input(COMMANDS, m.Trajectory, self._on_command, longest=_LONGEST),
+            Input(HOLD, m.HoldState, self._on_hold, _HOLDS, _LONGEST),
+            Input(
+                EMERGENCY_STOP,
+                m.EmergencyStop,
+                self._on_emergency_stop,
+                _EMERGENCY_STOPS,
+                _LONGEST,
+            ),
         )
         self.outputs: Sequence[Output] = (
             Output(JOINTS, m.JointState, _JOINT_STATES),

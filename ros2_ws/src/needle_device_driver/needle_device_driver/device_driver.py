@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from needle_core.can_frame import CAN, CanErrors, CanFrame
@@ -23,6 +23,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
+from needle_device_driver.cia402.cycle_times import CycleTimes
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
 from needle_device_driver.device import DeviceRows
@@ -35,7 +36,7 @@ from needle_device_driver.supervisor.supervisor import MotionSupervisor
 
 PERIOD = 0.02
 """Of the cycle: set-points, SYNC, answers [s]."""
-NOT_ACTIVE = "waiting for the driver to be activated"
+_NO_DRIVES = "waiting for the drives"
 _REPLY_WAIT = 0.75 * PERIOD
 _RETRY = 0.25
 EXIT_BROKEN = 3
@@ -53,10 +54,8 @@ class DeviceDriver(Component):
         The node's parameters, a `DeviceDriverParameters`.
     name : str
         How it signs what it says.
-    on_clock : bool
-        Whether `begin_cycle` is called when a cycle is due, not by the component's own timer.
-    more_health : callable
-        Returns what else to tell of the bus's health.
+    look_around : float
+        How long another device has to show itself before the drives are looked for [s].
 
     Attributes
     ----------
@@ -77,8 +76,7 @@ class DeviceDriver(Component):
         settings: DriverParameters,
         name: str = name,
         *,
-        on_clock: bool = False,
-        more_health: Callable[[], Mapping[str, str]] = dict,
+        look_around: float = 0.0,
     ) -> None:
         self.settings = settings
         self.link = FrameLink(settings.link_settings)
@@ -93,22 +91,19 @@ class DeviceDriver(Component):
             insertion,
             rotation,
             settings.limits,
-            lock_step=settings.lock_step,
-            path_delay=settings.path_delay,
             feedback_delay=1,
             switching=lambda: self._drives.needs_cycles,
         )
         self._device = DeviceRows(
             self.supervisor, name, simulated=None, refuse=lambda: self.waiting
         )
-        self.waiting = NOT_ACTIVE
-        self.searches = settings.autostart
+        self.waiting = _NO_DRIVES
+        self.searches = True
         self.is_set_up = False
         self._refusal = ""
-        self._on_clock = on_clock
-        self._more_health = more_health
-        self._is_ending = self._exits = False
-        self._retry_at, self._give_up_at = 0.0, math.inf
+        self._times = CycleTimes(PERIOD)
+        self._is_ending = False
+        self._retry_at, self._give_up_at = look_around, math.inf
         self._cycle: tuple[Running[Any], Moment] | None = None
         self.inputs = tuple(
             dataclasses.replace(row, handler=self._guarded(row.handler))
@@ -135,8 +130,7 @@ class DeviceDriver(Component):
 
     def on_stop(self, at: Moment) -> Actions:
         """Stop both axes, switch them off, and exit."""
-        self._exits = True
-        return self.take_down(at)
+        return self._guarded(self._take_down)(at)
 
     def _guarded(
         self, handler: Callable[..., Actions], *, ends: bool = False
@@ -180,17 +174,6 @@ class DeviceDriver(Component):
         """Tell whether an order or a cycle is under way."""
         return self._device.is_busy or self._cycle is not None
 
-    def begin_cycle(self, at: Moment, wait: float) -> Actions:
-        """Send set-points and SYNC; the cycle ends with both drives' answers, or after `wait` [s].
-
-        Call it only while nothing is under way.
-        """
-        return self._guarded(self._begin_cycle)(wait, at)
-
-    def repeat_joint_states(self, at: Moment) -> Actions:
-        """Tell the joints again, as those of this moment."""
-        return self._device.joint_states(at)
-
     def _on_frames(self, items: Sequence[CanFrame | CanErrors], at: Moment) -> Actions:
         self.link.receive(items)
         yield from self._go_on(at)
@@ -202,6 +185,7 @@ class DeviceDriver(Component):
         yield from self._go_on(at)
 
     def _on_cycle(self, at: Moment) -> Actions:
+        self._times.begin(at.steady)
         yield from self._go_on(at)
         if self._is_ending:
             return
@@ -209,12 +193,8 @@ class DeviceDriver(Component):
             # A drive takes its time, and the SDO client sends the heartbeat: the rest goes on, too.
             yield from self._observe(at)
             yield from self._device.advance(at)
-        elif self.is_set_up and self._on_clock:
-            # Simulated time may stand still; watchdogs do not.
-            self._drives.beat()
-            yield from self._observe(at)
         elif self.is_set_up:
-            yield from self._begin_cycle(_REPLY_WAIT, at)
+            yield from self._begin_cycle(at)
         elif self.searches and at.steady >= self._retry_at:
             self._retry_at = at.steady + _RETRY
             self._give_up_at = min(self._give_up_at, at.steady + self.settings.connect_timeout)
@@ -225,11 +205,11 @@ class DeviceDriver(Component):
             self.supervisor.observe(at.steady)
         yield from self._device.report(at)
 
-    def _begin_cycle(self, wait: float, at: Moment) -> Actions:
+    def _begin_cycle(self, at: Moment) -> Actions:
         self.supervisor.note_time(at.stamp_ns, at.steady)
         self._drives.collect()
         self.supervisor.drive(PERIOD, at.steady)
-        self._cycle = Running(self._drives.exchange(wait)), at
+        self._cycle = Running(self._drives.exchange(_REPLY_WAIT)), at
         yield from self._go_on(at)
 
     def _go_on(self, at: Moment) -> Actions:
@@ -251,10 +231,6 @@ class DeviceDriver(Component):
         yield from self._device.joint_states(dataclasses.replace(at, stamp_ns=begun.stamp_ns))
 
     # ---- begin and end ------------------------------------------------------------------------
-
-    def search_after(self, steady: float) -> None:
-        """Look for the drives not before this steady time [s]."""
-        self._retry_at = steady
 
     def set_up(self, then: Then, at: Moment) -> Actions:
         """Look for the drives and set them up; moves nothing. `then` gets the outcome."""
@@ -284,14 +260,8 @@ class DeviceDriver(Component):
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
         emulated = yield from are_emulated(self.link, nodes)
-        if self.settings.lock_step and not emulated:
-            reply = Reply(
-                False,
-                "lock_step: a drive does not say that it is emulated; a real motor would turn",
-            )
-        else:
-            self._device.simulated = emulated
-            reply = yield from self.supervisor.configuring(now)
+        self._device.simulated = emulated
+        reply = yield from self.supervisor.configuring(now)
         # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message
         return reply
@@ -305,22 +275,9 @@ class DeviceDriver(Component):
             self.waiting = f"waiting for the drives: {reply.message}"
             yield Log("info", self.waiting)
 
-    def disable(self, at: Moment) -> Actions:
-        """Stop and switch off, as `device/enable` false does."""
-        return self._guarded(self._disable)(at)
-
-    def _disable(self, at: Moment) -> Actions:
-        yield from self._device.call_off("disabled on request", at)
-        self.supervisor.enable(False, at.steady)
-        yield from self._device.report(at)
-
-    def take_down(self, at: Moment) -> Actions:
-        """Stop both axes, switch them off, and let go of the bus."""
-        return self._guarded(self._take_down)(at)
-
     def _take_down(self, at: Moment) -> Actions:
         self._is_ending, self.is_set_up, self.searches = True, False, False
-        self.waiting = NOT_ACTIVE
+        self.waiting = _NO_DRIVES
         yield from self._device.call_off("the driver ends", at)
         if self._cycle is not None:
             self._cycle[0].cancel()
@@ -333,8 +290,7 @@ class DeviceDriver(Component):
         yield from self._device.report(at)
         yield from self._send()
         self.link.close()
-        if self._exits:
-            yield Exit(EXIT_DONE)
+        yield Exit(EXIT_DONE)
 
     def _tell_health(self, at: Moment) -> Actions:
-        yield Diagnose("can", self._drives.health(self.waiting, self._more_health()))
+        yield Diagnose("can", self._drives.health(self.waiting, self._times.take()))

@@ -13,7 +13,6 @@ from needle_device_driver.link.link_settings import LINKS, LinkSettings
 from needle_device_driver.supervisor.limits import (
     SafetyLimits,
     limit_parameter,
-    path_delay_parameter,
 )
 
 # Beyond the supervisor's own limits, a drive's limits leave room for its following error.
@@ -44,11 +43,8 @@ class DriverParameters:
     )
     host: str = fixed_parameter("localhost", "-", "Where socketcand runs.")
     port: int = fixed_parameter(29536, "-", "Where socketcand listens.", 1, 65535)
-    autostart: bool = fixed_parameter(
-        True, "-", "Configure and activate at start; false: a lifecycle manager does."
-    )
     connect_timeout: float = fixed_parameter(
-        10.0, "s", "Autostart: how long adapter and drives may take to be there.", 0.0, 3600.0
+        10.0, "s", "How long adapter and drives may take to be there.", 0.0, 3600.0
     )
     insertion_drive: str = fixed_parameter(
         "motor",
@@ -57,22 +53,12 @@ class DriverParameters:
         "and the rotation follows.",
         choices=("motor", "hand"),
     )
-    lock_step: bool = fixed_parameter(
-        False, "-", "Simulation with use_sim_time only: a hold that falls silent pauses."
-    )
-    path_delay: float = path_delay_parameter()
-    wait_for_recorder: bool = fixed_parameter(
-        False,
-        "-",
-        "Refuse services until a node named recorder listens to everything, and all partners know "
-        "this node.",
-    )
     watchdog: float = fixed_parameter(
         0.1,
         "s",
-        "A drive stops without the computer's heartbeat for so long; over 0.5 s in lock step only.",
+        "A drive stops without the computer's heartbeat for so long.",
         0.05,
-        10.0,
+        LONGEST_WATCHDOG,
     )
     reply_age_limit: float = limit_parameter("reply_age_limit")
     hold_timeout: float = limit_parameter("hold_timeout")
@@ -99,11 +85,10 @@ class DriverParameters:
         check_fields(self)
         if self.drive("insertion").node_id == self.drive("rotation").node_id:
             raise UserError("insertion_node_id and rotation_node_id are the same")
-        for name in ("watchdog", "reply_age_limit"):
-            value = getattr(self, name)
-            # In lock step motors stand still while nobody sends SYNC; real ones do not.
-            if value > LONGEST_WATCHDOG and not self.lock_step:
-                raise OutOfBoundsError(name, value, 0.05, LONGEST_WATCHDOG, "s")
+        if self.reply_age_limit > LONGEST_WATCHDOG:
+            raise OutOfBoundsError(
+                "reply_age_limit", self.reply_age_limit, 0.05, LONGEST_WATCHDOG, "s"
+            )
         _ = self.link_settings, self.limits
 
     @property

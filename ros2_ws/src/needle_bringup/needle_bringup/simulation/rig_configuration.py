@@ -120,7 +120,6 @@ def command_line_parameters(
     driver: dict[str, Any] = {
         "link": "slcan",
         "channel": str(can_adapter()),
-        "autostart": True,
     }
     if options.graph:
         driver["watchdog"] = driver["reply_age_limit"] = GRAPH_WATCHDOG

@@ -125,6 +125,7 @@ class ComponentNode(WholeNode):
         self._service_clients: dict[str, Client[Any, Any]] = {}
         self._ports = dict(ports(settings))
         self._arrived: deque[tuple[str, Any]] = deque()
+        self._claims: list[Claim] = []
         self._bell = self.create_guard_condition(self._take_arrived)
         self.outputs = {row.topic: self._advertise(row) for row in self.component.outputs}
         for row in self.component.inputs:
@@ -143,7 +144,9 @@ class ComponentNode(WholeNode):
         self._handle(lambda: self.component.on_stop(self._moment()))
 
     def close(self) -> None:
-        """Close the ports."""
+        """Close the ports, and let go of what one process alone may have."""
+        for claim in self._claims:
+            claim.release()
         for port in self._ports.values():
             port.close()
 
@@ -163,10 +166,10 @@ class ComponentNode(WholeNode):
             topic = self.resolve_topic_name(self._name_of(row.topic))
             name = f"{topic} of ROS_DOMAIN_ID {self.context.get_domain_id()}"
             try:
-                claim = Claim(name, self.get_fully_qualified_name())
+                self._claims.append(Claim(name, self.get_fully_qualified_name()))
             except UserError as error:
                 raise UserError(f"another {row.topic} is there: {error}; {WAY_OUT}") from None
-            self.context.on_shutdown(claim.release)
+            self.context.on_shutdown(self._claims[-1].release)
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
 
@@ -250,14 +253,17 @@ class ComponentNode(WholeNode):
         """Carry out the actions of a handler; one that raises is reported and ends nothing."""
         if self.exit is not None:
             return
+        actions: list[Action] = []
         try:
-            actions: Iterable[Action] = list(work())
+            # One by one: what a handler did before it failed is done.
+            for action in work():
+                actions.append(action)
         except Exception as error:  # noqa: BLE001 - whatever a message may lead to
             self._failures += 1
             text = f"internal error: {type(error).__name__}: {error}"
             values = {"failures": str(self._failures)}
             failed = Diagnose("handlers", Diagnostic(Level.ERROR, text, values))
-            actions = [Log("error", text, kind=text), failed]
+            actions += [Log("error", text, kind=text), failed]
         for action in actions:
             self._do(action)
 

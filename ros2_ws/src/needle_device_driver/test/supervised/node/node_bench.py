@@ -1,4 +1,4 @@
-"""device_driver on scripted drives behind python-can's virtual bus, with a clock of the test's."""
+"""device_driver on scripted drives behind python-can's virtual bus, in real time."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from typing import Any
 
 import can
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState, Joy
 from std_msgs.msg import Bool, Header
 from std_srvs.srv import SetBool, Trigger
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from needle_core.can_frame import CAN
+from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.conversions import (
     HOLD,
     JOINT_STATES,
     LATCHED,
     RELIABLE,
-    to_nanoseconds,
     to_stamp,
     values_of,
 )
+from needle_device_driver.link.can_port import CanPort
+from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure
-from needle_device_driver.ros.device_driver import DeviceDriverNode
+from needle_device_driver.ros.device_driver import make_driver
 
 from ..scripted_drives import ScriptedDrive
 
@@ -88,7 +88,7 @@ class Peer:
 
 
 class Partner(Node):
-    """Plays clock, operator and controller, and keeps what it hears."""
+    """Plays operator and controller, and keeps what it hears."""
 
     def __init__(self, context: Context) -> None:
         super().__init__("partner", context=context)
@@ -96,7 +96,6 @@ class Partner(Node):
         self.results: list[Header] = []
         self.status: dict[str, str] = {}
         self.refused: dict[str, int] = {}
-        self.clock = self.create_publisher(Clock, "/clock", RELIABLE)
         self.commands = self.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
         self.holds = self.create_publisher(Joy, "device/hold", HOLD)
         self.estops = self.create_publisher(Bool, "device/estop", RELIABLE)
@@ -112,8 +111,6 @@ class Partner(Node):
             )
             for name in names
         }
-        self.change = self.create_client(ChangeState, "device_driver/change_state")
-        self.get = self.create_client(GetState, "device_driver/get_state")
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         self.status = values_of(message)
@@ -129,7 +126,7 @@ class Partner(Node):
 
 
 class Rig:
-    """Driver, drives and partner on one executor; time is what the test says."""
+    """Driver, drives and partner on one executor."""
 
     def __init__(self, context: Context, **parameters: Any) -> None:
         channel = f"node-{next(CHANNELS)}"
@@ -137,19 +134,20 @@ class Rig:
         overrides = {
             "link": "virtual",
             "channel": channel,
-            "use_sim_time": True,
-            "lock_step": parameters.get("use_sim_time", True),
             # A machine under load is no reason to stop.
             "reply_age_limit": 0.5,
             "hold_timeout": 0.5,
             **parameters,
         }
-        self.driver = DeviceDriverNode(
+        self.driver = ComponentNode(
+            "device_driver",
+            DeviceDriverParameters,
+            make_driver,
+            lambda settings: {CAN: CanPort(settings.link_settings)},
             context=context,
             parameter_overrides=[Parameter(k, value=v) for k, v in overrides.items()],
         )
         self.partner = Partner(context)
-        self.time_ns = 1_000_000_000
         self.stamps = itertools.count(1)
         self.holding = False
         self._held_at = 0.0
@@ -173,7 +171,6 @@ class Rig:
                 all(
                     publisher.get_subscription_count() > 0
                     for publisher in (
-                        self.partner.clock,
                         self.partner.commands,
                         self.partner.holds,
                         self.partner.estops,
@@ -192,36 +189,11 @@ class Rig:
         message.header.stamp = to_stamp(next(self.stamps))
         self.partner.holds.publish(message)
 
-    def tell_time(self) -> None:
-        self.partner.clock.publish(Clock(clock=to_stamp(self.time_ns)))
-
-    def tick(self, count: int = 1) -> None:
-        """Let 20 ms go by, `count` times, each when the driver is through with the last."""
-        for _ in range(count):
-            self.time_ns += 20_000_000
-            if self.holding:
-                self.hold()
-            self.tell_time()
-            self.until(
-                lambda: (
-                    bool(self.partner.joints)
-                    and to_nanoseconds(self.partner.joints[-1].header.stamp) == self.time_ns
-                ),
-                "joints of this tick",
-            )
-
     def until_refused(self, count: int) -> None:
         self.until(lambda: self.partner.status["commands_refused"] == str(count), "counted")
 
     def until_answered(self, before: int) -> None:
         self.until(lambda: len(self.partner.results) > before, "an answer")
-
-    def tick_until(self, condition: Callable[[], bool], what: str, most: int = 200) -> None:
-        for _ in range(most):
-            if condition():
-                return
-            self.tick()
-        raise AssertionError(f"not within {most} ticks: {what}; {self.partner.status}")
 
     def call(self, name: str, data: bool | None = None) -> Any:
         request = Trigger.Request() if data is None else SetBool.Request(data=data)
@@ -229,31 +201,22 @@ class Rig:
         self.until(future.done, name)
         return future.result()
 
-    def transition(self, number: int) -> bool:
-        future = self.partner.change.call_async(
-            ChangeState.Request(transition=Transition(id=number))
-        )
-        self.until(future.done, "transition")
-        return bool(future.result().success)
-
-    @property
-    def label(self) -> str:
-        future = self.partner.get.call_async(GetState.Request())
-        self.until(future.done, "state")
-        return str(future.result().current_state.label)
+    def insist(self, name: str, data: bool | None = None) -> None:
+        """Call a service until it agrees: it refuses while the axes switch off."""
+        self.until(lambda: bool(self.call(name, data).success), name)
 
     def ready(self) -> None:
         self.matched()
         self.until(lambda: self.partner.status.get("state") == "DISABLED", "configured")
-        self.tick(2)
-        assert self.call("confirm_needle_out", True).success
-        answer = self.call("home")
-        assert answer.success, answer.message
-        self.tick_until(lambda: self.partner.status["homed"] == "true", "homed")
-        self.tick_until(lambda: self.partner.status["needs_time"] == "false", "off")
-        answer = self.call("enable", True)
-        assert answer.success, answer.message
-        self.tick_until(lambda: self.partner.status["needs_time"] == "false", "on")
+        self.insist("confirm_needle_out", True)
+        self.insist("home")
+        self.until(lambda: self.partner.status["homed"] == "true", "homed")
+        self.insist("enable", True)
+        self.until(
+            lambda: all(drive.state == "enabled" for drive in self.peer.drives), "power"
+        )
+        joints = len(self.partner.joints)
+        self.until(lambda: len(self.partner.joints) > joints + 5, "some cycles")
         self.hold(False)
         self.hold(True)
         self.until(lambda: self.partner.status["hold_owner"] == "partner", "hold")
@@ -272,18 +235,14 @@ class Rig:
         point = JointTrajectoryPoint(positions=wanted)
         point.time_from_start.nanosec = round(duration * 1e9)
         message = JointTrajectory(joint_names=names, points=[point] * points)
-        message.header.stamp = to_stamp(self.time_ns if stamp_ns is None else stamp_ns)
+        message.header.stamp = to_stamp(time.time_ns() if stamp_ns is None else stamp_ns)
         return message
 
     def send(self, message: JointTrajectory) -> Header:
-        """Send a command and return what was answered, time going by as long as it takes."""
+        """Send a command and return what was answered."""
         before = len(self.partner.results)
         self.partner.commands.publish(message)
-        self.until(
-            lambda: self.partner.status["state"] == "MOVING" or len(self.partner.results) > before,
-            "an answer",
-        )
-        self.tick_until(lambda: len(self.partner.results) > before, "the step's end")
+        self.until(lambda: len(self.partner.results) > before, "the step's end")
         return self.partner.results[-1]
 
     @property

@@ -33,7 +33,7 @@ def test_undecodable_bytes_on_hold_and_commands_end_nothing(make_rig: Make) -> N
     for publisher in (rig.partner.commands, rig.partner.holds):
         publisher.publish(UNDECODABLE)
     rig.hold()
-    rig.tick_until(lambda: bool(rig.partner.results), "the step's end")
+    rig.until(lambda: bool(rig.partner.results), "the step's end")
     assert rig.partner.results[-1].stamp == message.header.stamp
     assert rig.partner.results[-1].frame_id == "succeeded"
     rig.until(
