@@ -132,7 +132,7 @@ class Process:
 
     @property
     def _due(self) -> float:
-        """When the next event may be handled [s]."""
+        """Time at which the next event may be handled [s]."""
         return max(self._free_at, self._frozen_until)
 
     def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
