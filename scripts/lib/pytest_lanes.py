@@ -37,7 +37,7 @@ LONG_FILES = (
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
     "ros2_ws/src/needle_bringup/test/graph/test_console.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
-    "ros2_ws/src/needle_verification/test/ros/soak/test_rig_run.py",
+    "ros2_ws/src/needle_verification/test/soak/test_rig_run.py",
     "ros2_ws/src/needle_verification/test/studies/test_obstacle_study.py",
     "ros2_ws/src/needle_tracker/test/calibrating/test_calibration_commands.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_control.py",
@@ -51,7 +51,7 @@ IN_BACKGROUND = re.compile(
     r".*/needle_bags/test/(reading|recovery)/.*|"
     r".*/needle_analysis/test/(report/|run/|rerun/|ros/test_(rerun|hostile)).*|"
     r".*/needle_verification/test/(studies|tracking|training|paper)/.*|"
-    r".*/needle_verification/test/(checks/test_check_control|ros/soak/test_rig_run)\.py"
+    r".*/needle_verification/test/(checks/test_check_control|soak/test_rig_run)\.py"
 )
 """Test files without processes or watchdogs of their own."""
 BACKGROUND_LIMIT = 900.0

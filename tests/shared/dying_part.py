@@ -7,8 +7,8 @@ import os
 import signal
 from pathlib import Path
 
-from needle_verification.ros.soak.many_runs import run_part as run_seeds
-from needle_verification.ros.soak.rig_run import RunResult
+from needle_verification.soak.many_runs import run_part as run_seeds
+from needle_verification.soak.rig_run import RunResult
 from needle_verification.studies.cluster_study import ClusterPart, PartDone, run_part
 
 

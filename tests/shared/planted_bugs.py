@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import pytest
@@ -21,16 +20,15 @@ from needle_controller.laws.roll_law import RollLaw
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
-from needle_device_driver.ros.device_driver import DeviceDriverNode
-from needle_device_driver.ros.device_interface import DeviceInterface
+from needle_device_driver.device import DeviceRows
+from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.supervisor.device_core import DeviceCore
 from needle_device_driver.supervisor.hold import Hold, HoldMessage
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drives.emulated_bus import AxisState, EmulatedBus
-from needle_verification.ros.soak import rig_run
-from needle_verification.ros.soak.virtual_topics import VirtualPublisher, VirtualSubscription
+from needle_verification.soak import link_faults, rig_run
 from needle_verification.soak.judging import limit_witness
 from needle_verification.soak.judging.hold_witness import HoldWitness
 from needle_verification.soak.judging.invariants import Watch
@@ -124,13 +122,12 @@ def _cycle_that_orders_twice(patch: pytest.MonkeyPatch) -> None:
 
 
 def _motion_kept_quiet(patch: pytest.MonkeyPatch) -> None:
-    tell = DeviceInterface._tell
+    is_news = DeviceRows._is_news
 
-    def some(interface: DeviceInterface, status: Any, now: float) -> None:
-        if status.state is not State.MOVING:
-            tell(interface, status, now)
+    def some(rows: DeviceRows, status: Any, now: float) -> bool:
+        return status.state is not State.MOVING and is_news(rows, status, now)
 
-    patch.setattr(DeviceInterface, "_tell", some)
+    patch.setattr(DeviceRows, "_is_news", some)
 
 
 def _fault_without_a_word(patch: pytest.MonkeyPatch) -> None:
@@ -162,7 +159,11 @@ def _estop_unheard(patch: pytest.MonkeyPatch) -> None:
 
 
 def _reset_refused(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(MotionSupervisor, "reset", lambda *_: Reply(False, "no"))
+    def refuse(*_: Any) -> Any:
+        yield from ()
+        return Reply(False, "no")
+
+    patch.setattr(MotionSupervisor, "resetting", refuse)
 
 
 def _law_turns_away(patch: pytest.MonkeyPatch) -> None:
@@ -194,16 +195,16 @@ PLANTED = {
     "a hold that never lapses": PlantedBug("no_motion_without_hold", _hold_never_lapses, 56),
     "a press from before": PlantedBug("no_motion_by_itself", _old_press_counts, 143),
     "a press beside the owner waits": PlantedBug(
-        "no_motion_by_another", _press_beside_the_owner_waits, 362
+        "no_motion_by_another", _press_beside_the_owner_waits, 235
     ),
     "a hold that anybody keeps": PlantedBug(
-        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 34, faults_of=466
+        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 3, faults_of=466
     ),
     "a page's hold that outlives its words": PlantedBug(
-        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 2
+        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 30
     ),
     "a page's lost press that goes on": PlantedBug(
-        "hold_is_of_now", _lost_press_of_a_page_goes_on, 88
+        "hold_is_of_now", _lost_press_of_a_page_goes_on, 15
     ),
     "a screw of twice the lead": PlantedBug("none_beyond_limits", _screw_of_twice_the_lead, 1),
     "a cycle that orders twice": PlantedBug("none_beyond_limits", _cycle_that_orders_twice, 1),
@@ -213,10 +214,10 @@ PLANTED = {
     "rotation the wrong way": PlantedBug("turns_as_commanded", _rotation_wired_the_wrong_way, 1),
     "an emergency stop unheard": PlantedBug("estop_stops", _estop_unheard, 40),
     "a reset refused": PlantedBug("the_way_goes_on", _reset_refused, 7),
-    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 134),
+    "a queue without a bound": PlantedBug("queues_are_bounded", _queue_without_a_bound, 608),
     "a message dropped unsaid": PlantedBug("nothing_recorded_is_lost", _drops_uncounted, 28),
     "a bag kept in memory": PlantedBug("nothing_recorded_is_lost", _never_written_out, 10),
-    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 200),
+    "a law that turns away": PlantedBug("undisturbed_converges", _law_turns_away, 100),
 }
 
 
@@ -250,15 +251,15 @@ def _blocked_axis_keeps_its_power(patch: pytest.MonkeyPatch) -> None:
 def _start_within_set_up_forgotten(patch: pytest.MonkeyPatch) -> None:
     await_start = drive_upkeep.await_start
 
-    def forgetful(link: Any, monitor: Any, *others: Any) -> None:
-        await_start(link, monitor, *others)
+    def forgetful(link: Any, monitor: Any, *others: Any) -> Any:
+        yield from await_start(link, monitor, *others)
         monitor.forget_start()
 
     patch.setattr(cia402_axis, "await_start", forgetful)
 
 
 def _reliable_messages_overtake(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(VirtualPublisher, "_keeps_order", lambda *at: not at[1].overtakes)
+    patch.setattr(link_faults, "_RESENT", {})
 
 
 def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
@@ -271,13 +272,13 @@ def _overtaken_joystick_counts(patch: pytest.MonkeyPatch) -> None:
 
 
 def _emergency_stop_ends_the_search(patch: pytest.MonkeyPatch) -> None:
-    start = DeviceDriverNode._start_by_itself
+    set_up = DeviceDriver._setting_up
 
-    def unless_stopped(node: DeviceDriverNode) -> None:
-        if node._supervisor.state is not State.ESTOPPED:
-            start(node)
+    def unless_stopped(driver: DeviceDriver, now: float) -> Any:
+        driver._searches = driver._supervisor.state is not State.ESTOPPED
+        return (yield from set_up(driver, now))
 
-    patch.setattr(DeviceDriverNode, "_start_by_itself", unless_stopped)
+    patch.setattr(DeviceDriver, "_setting_up", unless_stopped)
 
 
 def _set(owner: Any, **values: Any) -> Plant:
@@ -296,16 +297,6 @@ def _judge_forgets(**values: float) -> Plant:
         vars(watch).update(values)
 
     return _set(Watch, see_device=forgetful)
-
-
-def _each_loss_is_told_by_itself(patch: pytest.MonkeyPatch) -> None:
-    def lose(subscription: Any) -> None:
-        subscription.graph.overflows[subscription.node_name, subscription.topic_name] += 1
-        subscription._lost += 1
-        told = SimpleNamespace(total_count=subscription._lost)
-        subscription.process.do(lambda: subscription._on_lost and subscription._on_lost(told))
-
-    patch.setattr(VirtualSubscription, "_lose_one", lose)
 
 
 def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
@@ -336,9 +327,6 @@ MENDED = {
     "old_set_points_come_after_new_ones": MendedBug(
         "none_beyond_limits", _judge_of_drives_never_behind
     ),
-    "a_flood_while_the_recorder_stands_still": MendedBug(
-        "nothing_recorded_is_lost", _each_loss_is_told_by_itself
-    ),
     "a_fault_ends_homing_on_a_late_bus": MendedBug(
         "no_motion_without_hold", _judge_forgets(_homing_until=-1.0)
     ),
@@ -350,4 +338,4 @@ MENDED = {
         "no_motion_by_another", _set(HoldWitness, lose_device=lambda *_: None)
     ),
 }
-"""By the schedule, in test/ros/soak/schedules, that found them."""
+"""By the schedule, in test/soak/schedules, that found them."""

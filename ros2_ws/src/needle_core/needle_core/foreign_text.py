@@ -20,7 +20,9 @@ def plain(text: str, longest: int = 64) -> str:
     str
         The text, `?` for each character that does not print.
     """
-    kept = "".join(sign if sign.isprintable() else "?" for sign in text[:longest])
+    kept = text[:longest]
+    if not kept.isprintable():
+        kept = "".join(sign if sign.isprintable() else "?" for sign in kept)
     return kept if len(text) <= longest else kept + "..."
 
 

@@ -6,6 +6,7 @@ It is the same for real, emulated and simulated axes; a component adds its cycle
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable
 
 from needle_core import messages as m
@@ -45,6 +46,9 @@ _HOLDS = Delivery(depth=100, reliable=False)
 _EMERGENCY_STOPS = Delivery(depth=1000)
 # Positions alone change device/status so often at most [s]; joint_states has them all.
 _STATUS_PERIOD = 0.5
+_BUT_FOR_PLACES = operator.attrgetter(
+    *({row.name for row in dataclasses.fields(DeviceStatus)} - {"insertion", "rotation"})
+)
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
 
 
@@ -177,8 +181,7 @@ class DeviceRows:
                     text = self._notices.admit(event, at.steady)
                     if text:
                         yield Log("error" if event.fault else "warning", text)
-        status = self._supervisor.status(at.steady)
-        status = dataclasses.replace(status, simulated=self.simulated)
+        status = self._supervisor.status(at.steady, simulated=self.simulated)
         if self._is_news(status, at.steady):
             self._told, self._told_at = status, at.steady
             told = device_status(status, self._name)
@@ -202,7 +205,7 @@ class DeviceRows:
         told = self._told
         if told is None or now - self._told_at > _STATUS_PERIOD:
             return told != status
-        return told != dataclasses.replace(status, insertion=told.insertion, rotation=told.rotation)
+        return _BUT_FOR_PLACES(told) != _BUT_FOR_PLACES(status)
 
     def _on_command(self, message: m.Trajectory, at: Moment) -> Actions:
         points = tuple(

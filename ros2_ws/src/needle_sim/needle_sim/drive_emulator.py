@@ -13,6 +13,7 @@ from needle_core.component import (
     Log,
     Moment,
     Output,
+    Peers,
     Port,
     Publish,
     Send,
@@ -49,9 +50,15 @@ class DriveEmulator(Component):
         clock = MotionClock(settings.motion_clock)
         self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, 0.0)
         self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
+        self._is_heard = False
         self.outputs = (Output(POSITIONS, m.JointState),)
         self.ports = (Port(CAN, self._on_frames),)
         self.timers = (Timer(_LOOK, self._look), Timer(_PERIOD, self._tell_positions))
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Note whether anybody wants to hear where the motors are."""
+        self._is_heard = POSITIONS in peers.subscribers
+        return ()
 
     def _on_frames(self, frames: Sequence[CanFrame], at: Moment) -> Actions:
         for frame in frames:
@@ -75,6 +82,8 @@ class DriveEmulator(Component):
             yield Send(CAN, tuple(frames))
 
     def _tell_positions(self, at: Moment) -> Actions:
+        if not self._is_heard:
+            return
         axes = self.bus.axes(at.steady)
         positions = tuple(axis.position for axis in axes.values())
         velocities = tuple(axis.velocity for axis in axes.values())

@@ -81,6 +81,8 @@ class Recording:
     waiting_limit : int
         What waits for a slow disk at most [B], but for an eighth more of what is small; what is
         beyond is dropped, and counted.
+    clock : callable
+        Steady time [s].
 
     Attributes
     ----------
@@ -98,8 +100,10 @@ class Recording:
         space: FreeSpace,
         make_worker: Callable[[Do, Job], Worker] = WorkerThread,
         waiting_limit: int = WAITING_LIMIT,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.space = space
+        self._clock = clock
         self._bag = bag
         self._waiting_limit = waiting_limit
         self._numbers: dict[str, int] = {}
@@ -111,7 +115,7 @@ class Recording:
         self.messages_received = 0
         self._bytes_done = 0
         self._looked_at = self._flushed = 0
-        self._next_flush = time.monotonic() + FLUSH_PERIOD
+        self._next_flush = self._clock() + FLUSH_PERIOD
         self._worker = make_worker(self._do, self._end)
 
     @property
@@ -204,7 +208,7 @@ class Recording:
             self._write_on(job)
         else:
             job()
-        return self._next_flush if self.error is None else time.monotonic() + FLUSH_PERIOD
+        return self._next_flush if self.error is None else self._clock() + FLUSH_PERIOD
 
     def _write_on(self, job: Job) -> None:
         try:
@@ -222,7 +226,7 @@ class Recording:
 
     def _tend_disk(self) -> None:
         """Write out where it is time; end the recording where there is no room for more."""
-        is_due = time.monotonic() >= self._next_flush
+        is_due = self._clock() >= self._next_flush
         if is_due or self._bytes_done - self._looked_at >= _LOOK_EVERY:
             self._looked_at = self._bytes_done
             unwritten = min(CHUNK_SIZE, self._bytes_done - self._flushed)
@@ -233,7 +237,7 @@ class Recording:
         if is_due:
             self._bag.flush()
             self._flushed = self._bytes_done
-            self._next_flush = time.monotonic() + FLUSH_PERIOD
+            self._next_flush = self._clock() + FLUSH_PERIOD
 
     def _end(self) -> None:
         self._name_lost()

@@ -34,8 +34,8 @@ class Arrival(NamedTuple):
 
 
 Arrivals = Sequence[Arrival]
-Fault = Callable[[Link, Any, float, random.Random], Arrivals]
-"""(link, message, time [s], random stream) to what arrives; nothing: it is lost."""
+Fault = Callable[[Link, Any, float, random.Random], Arrivals | None]
+"""(link, message, time [s], random stream) to what arrives, if anything; None: what was sent."""
 
 
 def drop(topic: str, share: float) -> Fault:

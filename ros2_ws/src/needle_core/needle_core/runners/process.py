@@ -19,6 +19,7 @@ from needle_core.component import (
     Publish,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.runners.faults import Link
 from needle_core.runners.timeline import Timeline
 
 Compute = Callable[[Sequence[Action], random.Random], float]
@@ -53,6 +54,8 @@ class Process:
         What each handler takes longer than usual [s].
     known : list of Process
         Those that it knows.
+    routes : dict of str to list
+        Topic to those of them that receive it, each with its row and the link; made when needed.
     latched : dict of str to object
         Topic to its last message, for those that come late.
     health : dict of str to Diagnostic
@@ -69,17 +72,15 @@ class Process:
         self.component = component
         self.name = component.name
         self.outputs = {output.topic: output for output in component.outputs}
-        self.inputs: dict[str, list[Input]] = {}
-        for row in component.inputs:
-            self.inputs.setdefault(row.topic, []).append(row)
         self.is_alive = True
         self.slowness = 0.0
         self.known: list[Process] = []
+        self.routes: dict[str, list[tuple[Process, Input, Link]]] = {}
         self.latched: dict[str, Any] = {}
         self.health: dict[str, Diagnostic] = {}
         self._compute, self._timeline, self._carry_out = compute, timeline, carry_out
-        self._busy = False
-        self._frozen_until = 0.0
+        self._is_busy = False
+        self._free_at = self._frozen_until = 0.0
         self._queue: deque[tuple[str, Work, int]] = deque()
         self._waiting: Counter[str] = Counter()
         self._streams: dict[str, random.Random] = {}
@@ -94,36 +95,56 @@ class Process:
         """Queue an event; of one source only the newest `depth` wait."""
         if not self.is_alive:
             return
+        if not (self._is_busy or self._queue) and self._due <= self._timeline.now:
+            self._handle_now(source, work, sent_ns)
+            return
         if depth is not None and self._waiting[source] >= depth:
             oldest = next(n for n, item in enumerate(self._queue) if item[0] == source)
             del self._queue[oldest]
             self._waiting[source] -= 1
         self._waiting[source] += 1
         self._queue.append((source, work, sent_ns))
-        self._work_off()
+        self._go_on()
 
     def freeze(self, seconds: float) -> None:
         """Stand still from now on, as a stopped process does."""
         self._frozen_until = max(self._frozen_until, self._timeline.now + seconds)
-        self._timeline.call_at(self._frozen_until, self._work_off)
 
     def end(self) -> None:
         """Do nothing any more."""
         self.is_alive = False
         self._queue.clear()
 
-    def _work_off(self) -> None:
-        if self._busy or not self._queue or self.stands_still:
-            return
-        self._busy = True
-        source, work, sent_ns = self._queue.popleft()
-        self._waiting[source] -= 1
+    def _go_on(self) -> None:
+        """Handle what waits as soon as the handler before has taken its time."""
+        while self._queue and not self._is_busy:
+            if self._due > self._timeline.now:
+                self._is_busy = True
+                self._timeline.call_at(self._due, self._get_free)
+            else:
+                source, work, sent_ns = self._queue.popleft()
+                self._waiting[source] -= 1
+                self._handle_now(source, work, sent_ns)
+
+    def _get_free(self) -> None:
+        self._is_busy = False
+        self._go_on()
+
+    @property
+    def _due(self) -> float:
+        """Time at which the next event may be handled [s]."""
+        return max(self._free_at, self._frozen_until)
+
+    def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
         actions = self._handle(work, self._timeline.moment(sent_ns))
         stream = self._streams.get(source)
         if stream is None:
             stream = self._streams[source] = self._timeline.stream(f"{self.name}/{source}")
         seconds = self._compute(actions, stream) + self.slowness
-        self._timeline.call_after(seconds, partial(self._finish, actions))
+        self._free_at = self._timeline.now + seconds
+        if actions:
+            self._is_busy = True
+            self._timeline.call_at(self._free_at, partial(self._finish, actions))
 
     def _handle(self, work: Work, at: Moment) -> list[Action]:
         """Return the actions of a handler; one that raises is reported and ends nothing."""
@@ -145,8 +166,7 @@ class Process:
         if self.stands_still:
             self._timeline.call_at(self._frozen_until, partial(self._finish, actions))
             return
-        self._busy = False
         for action in actions:
             if self.is_alive:
                 self._carry_out(self, action)
-        self._work_off()
+        self._get_free()

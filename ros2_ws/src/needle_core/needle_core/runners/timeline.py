@@ -36,6 +36,7 @@ class Timeline:
         self._heap: list[tuple[float, int, Callable[[], None]]] = []
         self._serial = itertools.count()
         self._streams: dict[str, random.Random] = {}
+        self._is_interrupted = False
 
     def stream(self, name: str) -> random.Random:
         """Return the random stream of one thing: a draw for one shifts nothing of another."""
@@ -65,28 +66,29 @@ class Timeline:
         """Stamp of now [ns]."""
         return START_NS + self.clock_offset_ns + round(self.now * 1e9)
 
-    def run(
-        self, seconds: float, ended: Callable[[], bool], reach: Callable[[float], bool]
-    ) -> bool:
-        """Run what is due, for some time [s] or until `ended`; return whether it has ended.
+    def interrupt(self) -> None:
+        """Let `run` return after the present event."""
+        self._is_interrupted = True
+
+    def run(self, seconds: float, reach: Callable[[float], bool] | None = None) -> bool:
+        """Run what is due, for some time [s] or until an interrupt; return whether there was one.
 
         Parameters
         ----------
         seconds : float
             How long at most [s].
-        ended : callable
-            Asked after each event.
-        reach : callable
+        reach : callable, optional
             Takes the time of the next event [s], may wait for it, and returns False where another
             may have come before it.
         """
-        end, heap = self.now + seconds, self._heap
+        end = self.now + seconds
+        heap, self._is_interrupted = self._heap, False
         while heap and heap[0][0] <= end:
-            if not reach(heap[0][0]):
+            if reach is not None and not reach(heap[0][0]):
                 continue
             self.now, _, event = heapq.heappop(heap)
             event()
-            if ended():
+            if self._is_interrupted:
                 return True
         self.now = end
         return False

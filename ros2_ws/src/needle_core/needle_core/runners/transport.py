@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from needle_core.runners.faults import Arrival, Arrivals, Fault, Link
+from needle_core.runners.faults import Arrival, Fault, Link
 from needle_core.runners.timeline import Timeline
 
 
@@ -17,7 +17,7 @@ class Transport:
     Parameters
     ----------
     timeline : Timeline
-        Its time and chance: every link has a random stream of its own, and its faults another.
+        Its time and chance: every link has a random stream of its own.
     faults : sequence of Fault
         Applied to each message, one after the other.
     """
@@ -25,7 +25,7 @@ class Transport:
     def __init__(self, timeline: Timeline, faults: Sequence[Fault]) -> None:
         self._timeline = timeline
         self._faults = faults
-        self._streams: dict[Link, tuple[random.Random, random.Random]] = {}
+        self._streams: dict[Link, random.Random] = {}
         self._arrived: dict[Link, float] = {}
 
     def send(
@@ -36,21 +36,23 @@ class Transport:
         arrive: Callable[[Any], None],
     ) -> None:
         """Send a message; `arrive` is called with whatever arrives in its place."""
-        streams = self._streams.get(link)
-        if streams is None:
-            name = f"{link.sender}/{link.topic}/{link.receiver}"
-            stream = self._timeline.stream
-            streams = self._streams[link] = stream(name), stream(f"faults/{name}")
+        stream = self._streams.get(link)
+        if stream is None:
+            stream = self._streams[link] = self._timeline.stream("/".join(link))
         timeline = self._timeline
-        arrivals: Arrivals = (Arrival(streams[0].uniform(*latency), message),)
+        now = timeline.now
+        arrivals = [Arrival(stream.uniform(*latency), message)]
         for fault in self._faults:
-            arrivals = [
-                Arrival(sent.late + late, changed, sent.overtakes or overtakes)
-                for sent in arrivals
-                for late, changed, overtakes in fault(link, sent.message, timeline.now, streams[1])
-            ]
+            for sent in tuple(arrivals):
+                spoilt = fault(link, sent.message, now, stream)
+                if spoilt is not None:
+                    arrivals.remove(sent)
+                    arrivals += [
+                        Arrival(sent.late + late, changed, sent.overtakes or overtakes)
+                        for late, changed, overtakes in spoilt
+                    ]
         for late, arrived, overtakes in arrivals:
-            when = timeline.now + late
+            when = now + late
             if not overtakes:
                 when = max(when, self._arrived.get(link, 0.0))
                 self._arrived[link] = when

@@ -25,6 +25,7 @@ from needle_core.component import (
     Output,
     Peers,
     Port,
+    PortChange,
     Publish,
     Reply,
     Send,
@@ -93,12 +94,12 @@ class VirtualRunner:
     ) -> None:
         self.timeline = Timeline(seed)
         self.exits: dict[str, Exit] = {}
-        self._has_exited = False
         self._compute, self._taps = compute or {}, taps
         self._transport = Transport(self.timeline, faults)
         self._serial = itertools.count(1)
         self._calls: dict[int, tuple[Process, str]] = {}
         self._processes: dict[str, Process] = {}
+        self._lost_ports: dict[tuple[str, str], str] = {}
         for component in components:
             self.start(component)
 
@@ -109,12 +110,7 @@ class VirtualRunner:
 
     def run(self, seconds: float) -> bool:
         """Run until another component exits, or for `seconds`; return whether one did."""
-        self._has_exited = False
-        return self.timeline.run(seconds, lambda: self._has_exited, self._reach)
-
-    def _reach(self, due: float) -> bool:
-        """Return whether the time of the next event has come: at once, in virtual time."""
-        return True
+        return self.timeline.run(seconds)
 
     # ---- what befalls components ----------------------------------------------------------------
 
@@ -133,15 +129,17 @@ class VirtualRunner:
         compute = self._compute.get(name, uniform(*COMPUTE))
         process = Process(component, compute, self.timeline, self._do)
         for number, timer in enumerate(component.timers):
-            source = f"timer {number}"
-            phase = self.timeline.draw(f"{name}/{source}/phase", (0.0, timer.period))
-            self.timeline.call_after(phase, partial(self._tick, process, source, timer))
+            phase = self.timeline.draw(f"{name}/timer {number}/phase", (0.0, timer.period))
+            self.timeline.call_after(phase, self._ticking(process, f"timer {number}", timer))
         self.timeline.call_after(_DIAGNOSTICS_PERIOD, partial(self._tell_health, process))
         for other in self._processes.values():
             for pair in ((process, other), (other, process)):
                 found = self.timeline.draw(f"discovery/{pair[0].name}/{pair[1].name}", DISCOVERY)
                 self.timeline.call_after(found, partial(self._discover, *pair))
         self._processes[name] = process
+        for owner, port in self._lost_ports:
+            if owner == name:
+                self._tell_port(name, port)
 
     def kill(self, name: str) -> None:
         """End a component at once, as SIGKILL does: others count it for `LEASE`."""
@@ -163,6 +161,22 @@ class VirtualRunner:
         process = self._named(name)
         process.slowness = extra
         self.timeline.call_after(seconds, partial(setattr, process, "slowness", 0.0))
+
+    def lose_port(self, name: str, port: str, why: str) -> None:
+        """Let nothing pass a component's port any more, and tell it why."""
+        self._lost_ports[name, port] = why
+        self._tell_port(name, port)
+
+    def open_port(self, name: str, port: str) -> None:
+        """Open a port that was lost, and tell its component."""
+        if self._lost_ports.pop((name, port), None) is not None:
+            self._tell_port(name, port)
+
+    def _tell_port(self, name: str, port: str) -> None:
+        change = PortChange(self._lost_ports.get((name, port), ""))
+        for row in self._processes[name].component.ports if self.runs(name) else ():
+            if row.name == port:
+                self._processes[name].offer(port, partial(row.on_change, change))
 
     def configure(self, name: str, settings: Any) -> None:
         """Change a component's settings."""
@@ -205,40 +219,49 @@ class VirtualRunner:
                 self._diagnose(process, part, diagnostic)
             case Exit():
                 self.exits[process.name] = action
-                self._has_exited = True
+                self.timeline.interrupt()
                 self._remove(process)
                 self._forget(process)
 
-    def _tick(self, process: Process, source: str, timer: Timer) -> None:
-        if process.is_alive:
-            # A timer that was missed fires once, not once for each period.
-            process.offer(source, timer.handler, depth=1)
-            self.timeline.call_after(timer.period, partial(self._tick, process, source, timer))
+    def _ticking(self, process: Process, source: str, timer: Timer) -> Callable[[], None]:
+        def tick() -> None:
+            if process.is_alive:
+                # A timer that was missed fires once, not once for each period.
+                process.offer(source, timer.handler, depth=1)
+                self.timeline.call_after(timer.period, tick)
+
+        return tick
 
     # ---- topics and ports -----------------------------------------------------------------------
 
     def _publish(self, process: Process, output: Output, message: Any) -> None:
         for tap in self._taps:
             tap(self.timeline.stamp_ns, process.name, message, output)
+        topic = output.topic
         if output.delivery.latched:
-            process.latched[output.topic] = message
-        for receiver in process.known:
-            self._send(process, receiver, output.topic, message)
+            process.latched[topic] = message
+        routes = process.routes.get(topic)
+        if routes is None:
+            routes = process.routes[topic] = [
+                route for other in process.known for route in _routes(process, topic, other)
+            ]
+        for route in routes:
+            self._send(route, message)
 
-    def _send(self, sender: Process, receiver: Process, topic: str, message: Any) -> None:
-        for row in receiver.inputs.get(topic, ()):
-            link = Link(sender.name, topic, receiver.name)
-            arrive = partial(self._deliver, receiver, row, self.timeline.stamp_ns)
-            self._transport.send(link, message, LATENCY, arrive)
+    def _send(self, route: tuple[Process, Input, Link], message: Any) -> None:
+        receiver, row, link = route
+        arrive = partial(self._deliver, receiver, row, self.timeline.stamp_ns)
+        self._transport.send(link, message, LATENCY, arrive)
 
     def _deliver(self, receiver: Process, row: Input, sent_ns: int, message: Any) -> None:
         depth = row.delivery.depth
         receiver.offer(row.topic, partial(row.handler, message), depth=depth, sent_ns=sent_ns)
 
     def _send_through(self, sender: Process, port: str, batch: tuple[Any, ...]) -> None:
+        lost = self._lost_ports.keys()
         for receiver in self._processes.values():
             for row in receiver.component.ports if receiver is not sender else ():
-                if row.name == port:
+                if row.name == port and not {(sender.name, port), (receiver.name, port)} & lost:
                     link = Link(sender.name, port, receiver.name)
                     arrive = partial(self._arrive, receiver, row)
                     self._transport.send(link, batch, PORT_LATENCY, arrive)
@@ -254,7 +277,8 @@ class VirtualRunner:
             return
         process.known.append(other)
         for topic, message in process.latched.items():
-            self._send(process, other, topic, message)
+            for route in _routes(process, topic, other):
+                self._send(route, message)
         self._tell_peers(process)
 
     def _forget(self, gone: Process) -> None:
@@ -265,6 +289,7 @@ class VirtualRunner:
                 self._tell_peers(process)
 
     def _tell_peers(self, process: Process) -> None:
+        process.routes.clear()
         peers = Peers.of(p.component for p in (process, *process.known))
         process.offer("peers", partial(process.component.on_peers, peers))
 
@@ -325,3 +350,10 @@ class VirtualRunner:
         if number in self._calls:
             caller, _ = self._calls.pop(number)
             caller.offer("answer", partial(caller.component.on_answer, answer))
+
+
+def _routes(sender: Process, topic: str, receiver: Process) -> list[tuple[Process, Input, Link]]:
+    """Return how a topic's messages get from one component to another."""
+    link = Link(sender.name, topic, receiver.name)
+    rows = receiver.component.inputs
+    return [(receiver, row, link) for row in rows if row.topic == topic]

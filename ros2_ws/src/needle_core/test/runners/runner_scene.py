@@ -17,7 +17,9 @@ from needle_core.component import (
     Moment,
     Output,
     Peers,
+    Port,
     Publish,
+    Send,
     Service,
     Timer,
 )
@@ -78,6 +80,26 @@ class Once(Component):
 
     def on_answer(self, answer: Answer, at: Moment) -> Actions:
         self.answers.append(answer)
+        return ()
+
+
+class Wired(Component):
+    """Sends two batches in each of its ticks, and keeps what arrives, with the time."""
+
+    def __init__(self, name: str, *, sends: bool = False) -> None:
+        self.name = name
+        self.count = 0
+        self.arrived: list[tuple[float, int]] = []
+        self.ports = (Port("wire", self._take),)
+        self.timers = (Timer(0.0005, self._send),) if sends else ()
+
+    def _send(self, at: Moment) -> Actions:
+        for _ in range(2):
+            self.count += 2
+            yield Send("wire", (self.count - 1, self.count))
+
+    def _take(self, batch: Sequence[int], at: Moment) -> Actions:
+        self.arrived += [(at.steady, number) for number in batch]
         return ()
 
 

@@ -13,6 +13,8 @@ from needle_core.component import (
     Call,
     Log,
     Moment,
+    Port,
+    PortChange,
     Reply,
 )
 from needle_core.runners.faults import (
@@ -26,7 +28,7 @@ from needle_core.runners.faults import (
 from needle_core.runners.timeline import START_NS
 from needle_core.runners.virtual import LEASE, VirtualRunner
 
-from .runner_scene import Once, Receiver, Sender, Server, run
+from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 
 
 def senders(receiver: Receiver) -> list[str]:
@@ -134,3 +136,31 @@ def test_faults_apply_to_calls_and_their_answers() -> None:
     once = Once([Call("serve", True)])
     assert numbers(drop("serve", 1.0)) == []
     assert once.answers == []
+
+
+def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
+    def wired(name: str, *, sends: bool = False) -> Wired:
+        component = Wired(name, sends=sends)
+        component.ports = (Port("wire", component._take, note),)
+        return component
+
+    def note(change: PortChange, at: Moment) -> Actions:
+        changes.append(change.lost)
+        return ()
+
+    changes: list[str] = []
+    one, other = wired("one", sends=True), wired("other")
+    runner = VirtualRunner([one, other])
+    runner.run(0.1)
+    runner.lose_port("other", "wire", "unplugged")
+    runner.run(0.1)
+    assert 0 < len(other.arrived) < one.count - 100
+    runner.kill("other")
+    anew = wired("other")
+    runner.start(anew)
+    runner.run(0.1)
+    assert anew.arrived == []
+    runner.open_port("other", "wire")
+    runner.run(0.1)
+    assert anew.arrived
+    assert changes == ["unplugged", "unplugged", ""]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import pytest
 
 from needle_core.component import (
@@ -12,7 +10,6 @@ from needle_core.component import (
     Actions,
     Answer,
     Call,
-    Component,
     Delivery,
     Diagnose,
     Exit,
@@ -21,8 +18,6 @@ from needle_core.component import (
     Port,
     Publish,
     Reply,
-    Send,
-    Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.messages import EmergencyStop
@@ -36,7 +31,7 @@ from needle_core.runners.faults import (
 from needle_core.runners.timeline import START_NS
 from needle_core.runners.virtual import ANSWER_TIMEOUT, DISCOVERY, VirtualRunner
 
-from .runner_scene import Once, Receiver, Sender, Server, run
+from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 
 
 def test_the_same_seed_is_the_same_run_and_another_seed_another() -> None:
@@ -196,26 +191,6 @@ def test_a_component_that_is_asked_to_end_exits() -> None:
     assert runner.exits == {"sender": Exit(0)}
     with pytest.raises(ValueError, match="no component 'nobody'"):
         runner.stop("nobody")
-
-
-class Wired(Component):
-    """Sends two batches in each of its ticks, and keeps what arrives, with the time."""
-
-    def __init__(self, name: str, *, sends: bool = False) -> None:
-        self.name = name
-        self.count = 0
-        self.arrived: list[tuple[float, int]] = []
-        self.ports = (Port("wire", self._take),)
-        self.timers = (Timer(0.0005, self._send),) if sends else ()
-
-    def _send(self, at: Moment) -> Actions:
-        for _ in range(2):
-            self.count += 2
-            yield Send("wire", (self.count - 1, self.count))
-
-    def _take(self, batch: Sequence[int], at: Moment) -> Actions:
-        self.arrived += [(at.steady, number) for number in batch]
-        return ()
 
 
 def test_what_goes_through_a_port_arrives_at_the_others_of_its_name_in_order() -> None:

@@ -344,9 +344,7 @@ class Cia402Axis(Axis):
     # ---- set-up, reset, shut-down -------------------------------------------------------------
 
     def _set_up(self, *, survived: bool) -> Procedure[None]:
-        if not survived:
-            self._homed = False
-            self._origin += 1
+        self._homed = self._homed and survived
         self.monitor.begin_set_up()
         self._settings, self.missing_optional_objects = yield from set_up(
             self._link, self.monitor, self._given, period=self._period, homed=self._homed
@@ -371,6 +369,8 @@ class Cia402Axis(Axis):
             (yield from access.read(od.POSITION_ACTUAL)),
         )
         self._machine.begin_anew(self.monitor.feedback)
+        # From one reading to the next it may count from elsewhere.
+        self._origin += 1
         self._speed.forget()
         self._velocity = 0.0
         if self._machine.state in FAULTS:

@@ -120,8 +120,8 @@ class MotionSupervisor:
             return True
         return self._core.activity is not Activity.NONE and self.held(now)
 
-    def status(self, now: float) -> DeviceStatus:
-        """Return the device's status."""
+    def status(self, now: float, *, simulated: bool | None = None) -> DeviceStatus:
+        """Return the device's status; `simulated` is known to its owner alone."""
         joints = self.joints(now)
         return DeviceStatus(
             state=self._core.state,
@@ -140,6 +140,7 @@ class MotionSupervisor:
             needs_time=self.may_move(now) or self._switching() or self._commands.needs_time(now),
             command_ns=self.command_ns,
             rotation_owed=self._core.rotation_owed,
+            simulated=simulated,
         )
 
     # ---- what comes from outside --------------------------------------------------------------

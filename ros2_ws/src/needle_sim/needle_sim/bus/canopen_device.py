@@ -109,6 +109,10 @@ class CanopenDevice:
         self._forget()
         self._on_power_up()
 
+    def reads(self, frame: CanFrame) -> bool:
+        """Tell whether a frame asks this device for the content of an object."""
+        return frame.identifier == SDO_REQUEST + self.node_id or frame.remote
+
     def receive(self, frame: CanFrame, now: float) -> bool:
         """Take a frame from the bus, SYNC excepted; returns whether it was for this device."""
         if self.state is NetworkState.BOOTING:

@@ -162,7 +162,7 @@ class ObjectDictionary:
         entry = self._entries[index, subindex]
         assert entry.kind is not None
         lower, upper = entry.kind.bounds
-        entry.value = min(max(value, lower), upper)
+        entry.value = value if lower <= value <= upper else min(max(value, lower), upper)
 
     def read(self, index: int, subindex: int) -> bytes:
         """Return a value as bytes, lowest first.

@@ -60,6 +60,9 @@ class _Pdo:
         dictionary.on_write(parameters, 1, check=self._check_cob_id)
         dictionary.on_write(mapping, 0, check=self._check_count)
         # Asked for at every frame and every tick: kept at hand.
+        self._mapping_entries = [dictionary.entry(mapping, k) for k in range(_MOST_ENTRIES + 1)]
+        self._mapped_by: tuple[int, list[int]] | None = None
+        self._mapped: list[tuple[int, int, int]] = []
         self._cob_id = dictionary.entry(parameters, 1)
         self._transmission_type = dictionary.entry(parameters, 2)
 
@@ -77,9 +80,11 @@ class _Pdo:
     @property
     def mapped(self) -> list[tuple[int, int, int]]:
         """(index, subindex, bytes) of each object that it carries."""
-        count = self._dictionary.value(self._mapping, 0)
-        values = [self._dictionary.value(self._mapping, k) for k in range(1, count + 1)]
-        return [(value >> 16, value >> 8 & 0xFF, (value & 0xFF) // 8) for value in values]
+        count, *values = (entry.value for entry in self._mapping_entries)
+        if (count, values) != self._mapped_by:
+            self._mapped_by = count, values
+            self._mapped = [(v >> 16, v >> 8 & 0xFF, (v & 0xFF) // 8) for v in values[:count]]
+        return self._mapped
 
     def _check_cob_id(self, value: int) -> None:
         changed = (value ^ self._dictionary.value(self._parameters, 1)) & 0x1FFFFFFF

@@ -122,7 +122,8 @@ class EmulatedDrive:
     def receive(self, frame: CanFrame, now: float) -> None:
         """Take a frame from the bus, SYNC excepted."""
         if not self.hung:
-            self._show()
+            if self.device.reads(frame):
+                self._show()
             self._stale |= self.device.receive(frame, now)
 
     def sync(self) -> None:

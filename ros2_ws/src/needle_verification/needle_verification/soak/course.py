@@ -7,8 +7,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from needle_core.runners.timeline import Timeline
 from needle_verification.soak.faults import Fault, Moment
-from needle_verification.soak.virtual_world import NANOSECONDS, VirtualWorld
 
 Undo = Callable[[], None]
 
@@ -23,13 +23,13 @@ class Meeting:
         Which.
     nth : int
         For the how manyth time, from 1.
-    at_ns : int
-        When, steady clock [ns].
+    at : float
+        When [s].
     """
 
     moment: Moment
     nth: int
-    at_ns: int
+    at: float
 
 
 class Course:
@@ -37,7 +37,7 @@ class Course:
 
     Parameters
     ----------
-    world : VirtualWorld
+    timeline : Timeline
         Its clock.
     faults : sequence of Fault
         The schedule.
@@ -48,20 +48,20 @@ class Course:
     ----------
     met : list of Meeting
         All moments that came, in their order.
-    begun : list of tuple of Fault and int
-        Faults that happened, and when they began, steady clock [ns].
+    begun : list of tuple of Fault and float
+        Faults that happened, and when they began [s].
     """
 
     def __init__(
-        self, world: VirtualWorld, faults: Sequence[Fault], begin: Callable[[Fault], Undo]
+        self, timeline: Timeline, faults: Sequence[Fault], begin: Callable[[Fault], Undo]
     ) -> None:
-        self._world = world
+        self._timeline = timeline
         self._begin = begin
         self._waiting = list(faults)
         self._under_way = 0
         self._count: Counter[Moment] = Counter()
         self.met: list[Meeting] = []
-        self.begun: list[tuple[Fault, int]] = []
+        self.begun: list[tuple[Fault, float]] = []
 
     @property
     def is_under_way(self) -> bool:
@@ -77,19 +77,19 @@ class Course:
         """Take note that a moment has come."""
         self._count[moment] += 1
         this = moment, self._count[moment]
-        self.met.append(Meeting(*this, self._world.steady_ns))
+        self.met.append(Meeting(*this, self._timeline.now))
         for fault in [one for one in self._waiting if (one.after, one.nth) == this]:
             self._waiting.remove(fault)
             self._under_way += 1
-            self._world.call_after(_ns(fault.at), partial(self._happen, fault))
+            self._timeline.call_after(fault.at, partial(self._happen, fault))
 
     def give_up(self) -> None:
         """Wait for no moment any more."""
         self._waiting.clear()
 
     def _happen(self, fault: Fault) -> None:
-        self.begun.append((fault, self._world.steady_ns))
-        self._world.call_after(_ns(fault.lasts), partial(self._end, self._begin(fault)))
+        self.begun.append((fault, self._timeline.now))
+        self._timeline.call_after(fault.lasts, partial(self._end, self._begin(fault)))
 
     def _end(self, undo: Undo) -> None:
         undo()
@@ -102,12 +102,7 @@ def told_by_moments(course: Course) -> list[Fault]:
     So a change that shifts what a run does shifts its faults with it.
     """
     told = []
-    for fault, begun_ns in course.begun:
-        last = [one for one in course.met if one.at_ns <= begun_ns][-1]
-        at = (begun_ns - last.at_ns) / NANOSECONDS
-        told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=at))
+    for fault, begun in course.begun:
+        last = [one for one in course.met if one.at <= begun][-1]
+        told.append(dataclasses.replace(fault, after=last.moment, nth=last.nth, at=begun - last.at))
     return told
-
-
-def _ns(seconds: float) -> int:
-    return round(seconds * NANOSECONDS)

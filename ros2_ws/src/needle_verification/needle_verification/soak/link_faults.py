@@ -1,105 +1,93 @@
-"""Faults of messages on their way."""
+"""Faults of messages, calls and frames on their way."""
 
 from __future__ import annotations
 
 import dataclasses
+import random
+from typing import Any
 
-from needle_verification.soak.virtual_world import VirtualWorld
+from needle_core.can_frame import CAN
+from needle_core.runners.faults import Arrival, Arrivals, Link
+from needle_verification.soak.faults import BUS, PAGE_LINE, TOPICS
+
+# From sending what was lost to sending it again [s]: a reliable topic, and TCP.
+_RESEND, _RESEND_TCP = (0.02, 0.1), (0.2, 0.4)
+_BEST_EFFORT = ("/joy", "/device/hold")
+_PARTS = {CAN: BUS, PAGE_LINE: PAGE_LINE}
+_RESENT = {
+    **{topic: _RESEND for topic in TOPICS if topic not in _BEST_EFFORT},
+    PAGE_LINE: _RESEND_TCP,
+}
 
 
 @dataclasses.dataclass(frozen=True)
-class Delivery:
-    """One arrival of a message.
-
-    Attributes
-    ----------
-    data : bytes
-        What arrives.
-    late_ns : int
-        How much later than usual [ns].
-    overtakes : bool
-        Whether it may arrive before what was sent earlier.
-    """
-
-    data: bytes
-    late_ns: int = 0
-    overtakes: bool = False
-
-
-@dataclasses.dataclass
 class LinkFault:
     """Fault of one topic, service or bus while it lasts.
 
     Attributes
     ----------
+    until : float
+        When it ends [s].
     loss : float
         Share of messages that do not arrive.
-    late_ns : int
-        How much later they arrive at most [ns].
+    late : float
+        How much later they arrive at most [s].
     duplicates : float
         Share that arrives twice.
     reorders : bool
         Whether later ones may overtake earlier ones.
     """
 
+    until: float
     loss: float = 0.0
-    late_ns: int = 0
+    late: float = 0.0
     duplicates: float = 0.0
     reorders: bool = False
 
 
-class Way:
-    """Chance on one link: what a fault draws shifts nothing of how long messages take.
-
-    Parameters
-    ----------
-    world : VirtualWorld
-        Its chance.
-    span_ns : tuple of int
-        What a message takes at least and at most [ns].
-    names : str
-        From whom, what, to whom.
-
-    Attributes
-    ----------
-    faults : Random
-        Draws for what goes wrong.
-    """
-
-    def __init__(self, world: VirtualWorld, span_ns: tuple[int, int], *names: str) -> None:
-        self.faults = world.chance("faults on the way", *names)
-        self._span_ns = span_ns
-        self._chance = world.chance("way", *names)
-
-    def takes_ns(self) -> int:
-        """Return how long the next message takes [ns]."""
-        return self._chance.randint(*self._span_ns)
-
-
 class LinkFaults:
-    """The faults that are on, by the name of what they are on."""
+    """The faults that are on, by the part that they are on; a fault of the virtual runner.
+
+    What is sent again when it is lost (reliable topics, TCP) comes late instead, and in order. On
+    the bus each frame of a batch meets its own.
+    """
 
     def __init__(self) -> None:
         self._on: dict[str, LinkFault] = {}
 
-    def begin(self, name: str, fault: LinkFault) -> None:
+    def begin(self, part: str, fault: LinkFault) -> None:
         """Let a fault begin; it takes the place of another on the same link."""
-        self._on[name] = fault
+        self._on[part] = fault
 
-    def end(self, name: str) -> None:
+    def end(self, part: str) -> None:
         """Let the fault on a link end."""
-        self._on.pop(name, None)
+        self._on.pop(part, None)
 
-    def deliveries(self, name: str, data: bytes, way: Way) -> list[Delivery]:
-        """Return all arrivals of a message that is sent now."""
-        fault = self._on.get(name)
+    def __call__(self, link: Link, message: Any, now: float, rng: random.Random) -> Arrivals | None:
+        """Return what arrives of a message that is sent now; None: nothing befalls it."""
+        if not self._on:
+            return None
+        part = _PARTS.get(link.topic, f"/{link.topic}")
+        fault = self._on.get(part)
         if fault is None:
-            return [Delivery(data)]
-        draw = way.faults.random
-        deliveries = []
-        for _ in range(2 if draw() < fault.duplicates else 1):
-            if draw() < fault.loss:
-                continue
-            late_ns = way.faults.randint(0, fault.late_ns)
-            deliveries.append(Delivery(data, late_ns, fault.reorders))
-        return deliveries
+            return None
+        resend = _RESENT.get(part)
+        whole = [(frame,) for frame in message] if part == BUS else [message]
+        return [arrival for one in whole for arrival in _arrivals(fault, one, now, rng, resend)]
+
+
+def _arrivals(
+    fault: LinkFault,
+    message: Any,
+    now: float,
+    rng: random.Random,
+    resend: tuple[float, float] | None,
+) -> Arrivals:
+    arrivals = []
+    for _ in range(2 if rng.random() < fault.duplicates else 1):
+        late = rng.uniform(0.0, fault.late)
+        while resend and now + late < fault.until and rng.random() < fault.loss:
+            late += rng.uniform(*resend)
+        if resend or rng.random() >= fault.loss:
+            arrivals.append(Arrival(late, message, fault.reorders and resend is None))
+    return arrivals

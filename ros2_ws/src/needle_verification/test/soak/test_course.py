@@ -1,12 +1,12 @@
-"""Faults begin by what they meet, wherever on the clock that is; chance is of one thing alone."""
+"""Faults begin by what they meet, wherever on the clock that is."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
+from needle_core.runners.timeline import Timeline
 from needle_verification.soak.course import Course, told_by_moments
 from needle_verification.soak.faults import Fault, Kind, Moment
-from needle_verification.soak.virtual_world import NANOSECONDS, STEADY_START_NS, VirtualWorld
 
 SECOND_PRESS = Fault("bus", Kind.OFF, 0.5, 1.0, 0.5, Moment.PRESSED, 2)
 EARLY = Fault("operator", Kind.STUCK, 2.25, 0.5, 0.5)
@@ -16,13 +16,13 @@ class Happening:
     """A course, and when its faults began and ended [s]."""
 
     def __init__(self, *faults: Fault) -> None:
-        self.world = VirtualWorld(1)
+        self.timeline = Timeline(1)
         self.told: list[tuple[str, str, float]] = []
-        self.course = Course(self.world, faults, self._begin)
+        self.course = Course(self.timeline, faults, self._begin)
         self.course.meet(Moment.START)
 
     def until(self, at: float) -> None:
-        self.world.run_until(STEADY_START_NS + round(at * NANOSECONDS))
+        self.timeline.run(at - self.timeline.now, 0.0)
 
     @property
     def state(self) -> tuple[bool, bool]:
@@ -33,8 +33,7 @@ class Happening:
         return lambda: self._note(fault, "ends")
 
     def _note(self, fault: Fault, what: str) -> None:
-        at = (self.world.steady_ns - STEADY_START_NS) / NANOSECONDS
-        self.told.append((fault.part, what, at))
+        self.told.append((fault.part, what, self.timeline.now))
 
 
 def test_a_fault_follows_the_moment_that_it_tells() -> None:
@@ -83,16 +82,3 @@ def test_a_fault_is_told_by_the_last_moment_it_met() -> None:
     run.until(5.0)
     (told,) = told_by_moments(run.course)
     assert told == Fault("operator", Kind.STUCK, 0.25, 0.5, 0.5, Moment.PRESSED, 2)
-
-
-def test_a_draw_for_one_thing_shifts_no_other() -> None:
-    alone, beside = VirtualWorld(3), VirtualWorld(3)
-    drawn = []
-    for world in (alone, beside):
-        first = world.chance("way", "/joy").random()
-        if world is beside:
-            world.chance("way", "/tip").random()
-        drawn.append((first, world.chance("way", "/joy").random()))
-    assert drawn[0] == drawn[1]
-    assert len({*drawn[0], VirtualWorld(4).chance("way", "/joy").random()}) == 3
-    assert alone.chance("way", "/tip").random() == VirtualWorld(3).chance("way", "/tip").random()

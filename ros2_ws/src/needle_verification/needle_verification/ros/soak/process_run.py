@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import random
+import shutil
 import signal
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -17,12 +19,13 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_core.errors import UserError
 from needle_core.process.ros_domain import own_domain
 from needle_core.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
+from needle_core.status_messages import DeviceStatus
 from needle_verification.ros.drive_hand import JOINTS, DriveHand
 from needle_verification.ros.listening_node import ros
-from needle_verification.ros.soak.rig_run import RunResult, bounds_of_the_rig
-from needle_verification.ros.soak.virtual_person import OUT
 from needle_verification.soak.faults import Fault, Kind
 from needle_verification.soak.judging.invariants import RELEASE_BOUND, Watch
+from needle_verification.soak.parts.person import OUT
+from needle_verification.soak.rig_run import RunResult, bounds_of_the_rig
 from needle_verification.trials.trial_processes import TrialProcesses, graph_in_real_time
 
 PERSON = "simulated_operator"
@@ -121,7 +124,7 @@ class Witness(DriveHand):
 
     def _on_status(self, message: DiagnosticStatus) -> None:
         super()._on_status(message)
-        self.watch.see_device(self.now, values_of(message))
+        self.watch.see_device(self.now, DeviceStatus.parse(values_of(message)))
 
 
 def processes_schedule_of(seed: int) -> list[Fault]:
@@ -140,6 +143,16 @@ def processes_schedule_of(seed: int) -> list[Fault]:
         ),
         key=lambda fault: fault.at,
     )
+
+
+def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
+    """Yield the results of runs of real processes; what they leave is kept if they violate."""
+    for seed in seeds:
+        with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
+            result = run_processes(seed, Path(name))
+            if result.violations and folder is not None:
+                shutil.copytree(name, folder / f"processes_{seed}", dirs_exist_ok=True)
+            yield result
 
 
 def run_processes(seed: int, folder: Path) -> RunResult:

@@ -17,14 +17,11 @@ from needle_core.commands.cli import (
     write_json,
 )
 from needle_core.errors import UserError
-from needle_verification.ros.soak.many_runs import (
-    results_here,
-    results_of_cluster,
-    results_of_processes,
-)
-from needle_verification.ros.soak.rig_run import RunResult, run
+from needle_verification.ros.soak.process_run import results_of_processes
 from needle_verification.soak.faults import Fault, read_schedule, write_schedule
 from needle_verification.soak.judging.invariants import Violation
+from needle_verification.soak.many_runs import results_here, results_of_cluster
+from needle_verification.soak.rig_run import RunResult, run
 from needle_verification.soak.shrinking import shrink
 from needle_verification.soak.tally import Tally
 

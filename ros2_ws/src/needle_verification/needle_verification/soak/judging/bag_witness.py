@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Mapping
 from pathlib import Path
 
 from mcap.reader import make_reader
@@ -14,9 +13,11 @@ from needle_bags.recovery.bag_recovery import recover_bag
 from needle_core.files.bag_path import METADATA_FILE
 from needle_core.files.plain_yaml import load_plain
 
-# A killed recorder's bag has what it took so long before [ns]: it writes out every 0.1 s
+WAITING_LIMIT = 400_000
+"""What waits for the soak's disk at most [B]; a real recorder may keep far more."""
+# A killed recorder's bag has what it took so long before [s]: it writes out every 0.1 s
 # (docs/architecture.md), and a burst takes its time.
-_WRITTEN_OUT_NS = 300_000_000
+_WRITTEN_OUT = 0.3
 
 
 class BagWitness:
@@ -26,45 +27,33 @@ class BagWitness:
     ----------
     bag : Path
         Its bag.
-    overflows : Counter of str
-        Messages of each topic that its queues had no room for before it began.
     """
 
-    def __init__(self, bag: Path, overflows: Mapping[str, int]) -> None:
+    def __init__(self, bag: Path) -> None:
         self._bag = bag
-        self._before = Counter(overflows)
-        # When each was taken, by what tells two messages of a topic apart; one that comes twice,
-        # as after another subscription was made, may be taken for one.
-        self._taken: defaultdict[str, dict[tuple[int, int], int]] = defaultdict(dict)
+        # Topic to the times at which its messages were taken [s].
+        self._taken: defaultdict[str, list[float]] = defaultdict(list)
 
-    def take(self, at_ns: int, topic: str, sent_ns: int, number: int) -> None:
-        """Take a message: when it was taken, when sent, and its publisher's number of it."""
-        self._taken[topic].setdefault((sent_ns, number), at_ns)
+    def take(self, at: float, topic: str) -> None:
+        """Take a message at a time [s]."""
+        self._taken[topic].append(at)
 
-    def losses_of_ended(self, overflows: Mapping[str, int]) -> list[str]:
-        """Return what the bag of a recorder that ended in order lacks and does not name.
-
-        Parameters
-        ----------
-        overflows : mapping of str to int
-            As at its begin.
-        """
+    def losses_of_ended(self) -> list[str]:
+        """Return what the bag of a recorder that ended in order lacks and does not name."""
         kept, told = _counts(self._bag), _said_lost(self._bag)
-        wanted = Counter({topic: len(taken) for topic, taken in self._taken.items()})
-        wanted += Counter(overflows) - self._before
         return [
-            f"{topic}: {count} came, {kept[topic]} are in the bag, {told[topic]} said to be lost"
-            for topic, count in sorted(wanted.items())
-            if kept[topic] + told[topic] < count
+            f"{topic}: {len(taken)} came, {kept[topic]} are in the bag, {told[topic]} said to be "
+            "lost"
+            for topic, taken in sorted(self._taken.items())
+            if kept[topic] + told[topic] < len(taken)
         ]
 
-    def losses_of_killed(self, killed_ns: int) -> list[str]:
+    def losses_of_killed(self, killed_at: float) -> list[str]:
         """Return what the recovered bag of a recorder lacks that it had long enough."""
         recover_bag(self._bag)
         kept = _counts(self._bag)
-        until_ns = killed_ns - _WRITTEN_OUT_NS
         wanted = {
-            topic: sum(at_ns <= until_ns for at_ns in taken.values())
+            topic: sum(at <= killed_at - _WRITTEN_OUT for at in taken)
             for topic, taken in self._taken.items()
         }
         return [

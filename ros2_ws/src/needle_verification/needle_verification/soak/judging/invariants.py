@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
+from needle_core.status_messages import ControllerStatus, DeviceStatus
+from needle_verification.soak.judging.bag_witness import WAITING_LIMIT
 from needle_verification.soak.judging.hold_witness import HoldWitness
 from needle_verification.soak.judging.limit_witness import Bounds, LimitWitness
-from needle_verification.soak.virtual_disk import WAITING_LIMIT
 
 # A motor that goes no farther in a tick rests [m], [rad].
 _REST_INSERTION, _REST_ROTATION = 2e-7, 5e-4
@@ -90,7 +92,8 @@ class Watch:
         self._page_holds = False
         self._page_ended = -1.0
         self._must_press_after = 0.0
-        self._status: Mapping[str, str] = {}
+        self._stopped_at = -math.inf
+        self._status = DeviceStatus()
         self._status_at = 0.0
         self._homing_until = -1.0
         self._silent_since: float | None = None
@@ -106,7 +109,7 @@ class Watch:
         if all(one.invariant != invariant for one in self.violations):
             self.violations.append(Violation(invariant, at, text))
 
-    # ---- what happens -------------------------------------------------------------------------
+    # ---- what happens ---------------------------------------------------------------------------
 
     def see_hand(self, at: float, *, holds: bool) -> None:
         """Take whether the hand presses what could move the needle."""
@@ -145,10 +148,10 @@ class Watch:
             self._other_since = at + DISCOVERED_WITHIN
         self._other_until = at
 
-    def see_device(self, at: float, values: Mapping[str, str]) -> None:
+    def see_device(self, at: float, status: DeviceStatus) -> None:
         """Take a device/status as it is published."""
-        state, before = values.get("state", ""), self._status.get("state", "")
-        if state in ("FAULT", "ESTOPPED") and not values.get("fault"):
+        state, before = status.state, self._status.state
+        if state in ("FAULT", "ESTOPPED") and not status.fault:
             self.violate("faults_are_named", at, f"{state} without a word why")
         if (
             state != before
@@ -157,14 +160,16 @@ class Watch:
         ):
             # Enabled, or reset: a press from before may not count.
             self._must_press_after = at
+        if state != before and state in ("FAULT", "ESTOPPED"):
+            self._stopped_at = at
         if self._is_homing:
             # Whatever ends it, the drives' own watchdog bounds what is under way.
             self._homing_until = at + WATCHDOG_BOUND
-            if values.get("homed") == "true" and self._before is not None:
+            if status.homed and self._before is not None:
                 # The rotation is homed where it stands.
                 self._zero = self._before[2]
-        self._status, self._status_at = values, at
-        self.witness.see_owner(at, values.get("hold_owner", ""))
+        self._status, self._status_at = status, at
+        self.witness.see_owner(at, status.hold_owner)
 
     def see_command(self, points: Sequence[tuple[float, float]]) -> None:
         """Take a command for the joints, whoever sent it: insertion [m] and rotation [rad]."""
@@ -229,30 +234,26 @@ class Watch:
         if waiting > _WAITING:
             self.violate("queues_are_bounded", at, f"{waiting} bytes wait, at most {_WAITING}")
 
-    def see_belief(self, at: float, values: Mapping[str, str], *, joints_heard: bool) -> None:
+    def see_belief(self, at: float, status: ControllerStatus, *, joints_heard: bool) -> None:
         """Take a needle/controller_status as it is published, while joints reach the controller."""
         # Before its first step it has nothing but the needle's place of before.
-        steers = values.get("state") == "STEERING" and values.get("step", "0") != "0"
+        steers = status.state == "STEERING" and status.step != 0
         if not (steers and joints_heard) or self._before is None:
             return
-        try:
-            told = float(values["insertion_m"])
-        except (KeyError, ValueError):
-            return
-        off = self._before[1] - told
+        off = self._before[1] - status.insertion_m
         if not -0.0005 <= off <= _BELIEF:
             self.violate(
                 "belief_equals_joints",
                 at,
-                f"the controller says {told * 1e3:.2f} mm, the needle is "
+                f"the controller says {status.insertion_m * 1e3:.2f} mm, the needle is "
                 f"{self._before[1] * 1e3:.2f} mm in",
             )
 
-    # ---- judgement ----------------------------------------------------------------------------
+    # ---- judgement ------------------------------------------------------------------------------
 
     @property
     def _is_homing(self) -> bool:
-        return self._status.get("activity") == "homing"
+        return self._status.activity == "homing"
 
     def _judge_hold(self, at: float, *, begins: bool) -> None:
         if self._estop_since is not None and at - self._estop_since > self._release_bound:
@@ -275,7 +276,9 @@ class Watch:
                 f"motion {by_others:.3f} s after the last press of an owner reached the device",
             )
         since = max(self._pressed_since, self._other_since)
-        if begins and since < self._must_press_after:
+        # An axis that was blocked may come free before its drive has stopped, reset or not.
+        stops = at <= self._stopped_at + WATCHDOG_BOUND
+        if begins and not stops and since < self._must_press_after:
             self.violate(
                 "no_motion_by_itself",
                 at,
@@ -304,7 +307,7 @@ class Watch:
             )
 
     def _judge_status(self, at: float) -> None:
-        state = self._status.get("state", "")
+        state = self._status.state
         if state not in ("HOLDING", "DISABLED") or self._silent_since is not None:
             return
         lag = at - max(self._status_at, self._moving_since or at)

@@ -11,9 +11,9 @@ import pytest
 
 from needle_core.commands.cli import EXIT_INTERRUPTED
 from needle_verification.ros.soak import soak
-from needle_verification.ros.soak.rig_run import RunResult
 from needle_verification.soak.faults import Fault, Kind, read_schedule
 from needle_verification.soak.judging.invariants import Violation
+from needle_verification.soak.rig_run import RunResult
 
 FAULTS = (Fault("bus", Kind.OFF, 1.0, 1.0, 0.5),)
 GOOD = RunResult(1, (), (), (), 12.0)

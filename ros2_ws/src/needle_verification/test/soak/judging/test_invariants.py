@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from needle_core.status_messages import DeviceStatus
 from needle_verification.soak.judging.invariants import PAGE_LIFETIME, WATCHDOG_BOUND, Watch
 from needle_verification.soak.judging.limit_witness import Bounds
 
@@ -14,8 +15,8 @@ def moves_after_homing_for(time: float) -> set[str]:
     for tick in range(1000):
         at = tick * 0.005
         # After that it says nothing of what would be expected of its status.
-        homing = {"state": "MOVING", "activity": "homing"}
-        watch.see_device(at, homing if at < 1.0 else {"state": "FAULT", "fault": "a fault"})
+        homing = DeviceStatus(state="MOVING", activity="homing")
+        watch.see_device(at, homing if at < 1.0 else DeviceStatus(state="FAULT", fault="a fault"))
         watch.see_motors(at, 0.01 - 0.001 * min(at, 1.0 + time), 0.0)
     return {violation.invariant for violation in watch.violations}
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from dask_cluster import NEEDED, Cluster
 from dying_part import end_the_first_soak
 from needle_verification.cluster import on_cluster
-from needle_verification.ros.soak.many_runs import results_of_cluster, run_part
-from needle_verification.ros.soak.rig_run import RunResult
+from needle_verification.soak.many_runs import results_of_cluster, run_part
+from needle_verification.soak.rig_run import RunResult
 
 SEEDS = range(4, 6)
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from needle_verification.ros.soak import rig_run
-from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
+from needle_verification.soak import rig_run
 from needle_verification.soak.faults import read_schedule
+from needle_verification.soak.rig_run import RunResult, run, schedule_of
 from planted_bugs import MENDED, PLANTED
 
 SCHEDULES = Path(__file__).parent / "schedules"

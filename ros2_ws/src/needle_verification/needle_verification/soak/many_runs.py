@@ -7,18 +7,15 @@ import gc
 import itertools
 import multiprocessing
 import os
-import shutil
 import signal
 import tempfile
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 from tqdm import tqdm
 
 from needle_verification.cluster import on_cluster
-from needle_verification.ros.soak.process_run import run_processes
-from needle_verification.ros.soak.rig_run import RunResult, run, schedule_of
+from needle_verification.soak.rig_run import RunResult, run, schedule_of
 
 # Runs that a worker of a cluster does at once: some ten seconds.
 _PART = 10
@@ -49,16 +46,6 @@ def run_part(seeds: range) -> list[RunResult]:
     """Run some seeds, on a worker."""
     _settle_in()
     return [_run_seed(seed) for seed in seeds]
-
-
-def results_of_processes(seeds: range, folder: Path | None) -> Iterator[RunResult]:
-    """Yield the results of runs of real processes; what they leave is kept if they violate."""
-    for seed in seeds:
-        with tempfile.TemporaryDirectory(prefix="needle_soak_") as name:
-            result = run_processes(seed, Path(name))
-            if result.violations and folder is not None:
-                shutil.copytree(name, folder / f"processes_{seed}", dirs_exist_ok=True)
-            yield result
 
 
 def _begin_worker(folder: str) -> None:

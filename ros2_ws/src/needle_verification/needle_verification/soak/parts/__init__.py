@@ -1,0 +1,1 @@
+"""Components of the soak beside the rig's own: bench, person, strangers, page."""

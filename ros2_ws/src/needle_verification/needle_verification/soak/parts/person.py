@@ -1,0 +1,223 @@
+"""The person at the rig: prepares it, inserts, mends what a fault left, draws the needle out."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+from collections.abc import Callable
+
+from needle_core import messages as m
+from needle_core.component import (
+    BEST_EFFORT,
+    LATCHED,
+    Action,
+    Actions,
+    Call,
+    Component,
+    Input,
+    Moment,
+    Output,
+    Publish,
+    Timer,
+)
+from needle_core.status_messages import ControllerStatus, DeviceStatus
+
+INSERT, RETRACT, STOP = 0, 1, 2
+_LOOK = 0.1
+_JOY_RATE = 50.0
+# Between two calls of one service [s].
+_CALL_AGAIN = 0.5
+# How long a finger stays off before it presses again, and how long it presses in vain [s].
+_PAUSE, _IN_VAIN = 0.3, 3.0
+OUT = 3e-4
+"""A needle that is in no farther looks as if it were out [m]."""
+
+
+class Wish(enum.Enum):
+    """Aim of the person."""
+
+    INSERT = "insert"
+    DRAW_OUT = "draw out"
+    LEAVE = "leave"
+
+
+@dataclasses.dataclass
+class Hand:
+    """Buttons that are down.
+
+    Attributes
+    ----------
+    insert, retract, stop : bool
+        Each of them.
+    """
+
+    insert: bool = False
+    retract: bool = False
+    stop: bool = False
+
+    @property
+    def holds(self) -> bool:
+        """Whether it presses what could move the needle."""
+        return self.insert or self.retract
+
+    @property
+    def button(self) -> str:
+        """The button of a page that a finger is on; empty: none, or more than one."""
+        if self.insert is self.retract or self.stop:
+            return ""
+        return "insert" if self.insert else "retract"
+
+
+class Joystick(Component):
+    """Publishes what the hand does.
+
+    Parameters
+    ----------
+    hand : Hand
+        The person's.
+    name, topic : str
+        Of the component, and where it publishes.
+    """
+
+    def __init__(self, hand: Hand, name: str = "joy_node", topic: str = "joy") -> None:
+        self.name = name
+        self.outputs = (Output(topic, m.Joystick, BEST_EFFORT),)
+
+        def tell(at: Moment) -> Actions:
+            buttons = (int(hand.insert), int(hand.retract), int(hand.stop))
+            yield Publish(topic, m.Joystick(at.stamp_ns, (), buttons))
+
+        self.timers = (Timer(1.0 / _JOY_RATE, tell),)
+
+
+class Person(Component):
+    """Acts by what the rig says of itself, and by where the needle is seen to be.
+
+    Parameters
+    ----------
+    hand : Hand
+        Its own.
+    insertion : callable
+        Returns how far the needle is in, as anybody can see [m].
+    source : str
+        Name of the node by which it holds, as the device knows it.
+
+    Attributes
+    ----------
+    wish : Wish
+        What it wants now.
+    device, controller : DeviceStatus, ControllerStatus
+        What they said last.
+    done : bool
+        Whether the controller has said once that it is done.
+    absent : bool
+        Whether it minds nothing, whatever its hand does.
+    sees_lost_press : callable
+        Returns whether what it holds by shows that a press is lost.
+    asides : list of Action
+        What it does beside, at its next look.
+    """
+
+    name = "person"
+
+    def __init__(self, hand: Hand, insertion: Callable[[], float], source: str) -> None:
+        self._hand = hand
+        self._insertion = insertion
+        self._source = source
+        self.wish = Wish.INSERT
+        self.device, self.controller = DeviceStatus(), ControllerStatus()
+        self.done = False
+        self.absent = False
+        self.sees_lost_press: Callable[[float], bool] = lambda _: False
+        self.asides: list[Action] = []
+        self._called: dict[str, float] = {}
+        self._changed_at = 0.0
+        self.inputs = (
+            Input("device/status", DeviceStatus, self._see_device, LATCHED),
+            Input("needle/controller_status", ControllerStatus, self._see_controller, LATCHED),
+        )
+        self.outputs = (Output("device/estop", m.EmergencyStop),)
+        self.timers = (Timer(_LOOK, self._look),)
+
+    def _see_device(self, message: DeviceStatus, at: Moment) -> Actions:
+        self.device = message
+        return ()
+
+    def _see_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+        self.controller = message
+        self.done = self.done or message.state == "DONE"
+        return ()
+
+    def _look(self, at: Moment) -> Actions:
+        yield from self.asides
+        self.asides = []
+        if self.absent:
+            return
+        state = self.device.state
+        insert, retract = False, False
+        if state in ("FAULT", "ESTOPPED"):
+            if state == "ESTOPPED":
+                yield Publish("device/estop", m.EmergencyStop(False))
+            yield from self._try("device/reset", at)
+        elif state == "DISABLED":
+            yield from self._prepare(at)
+        elif state in ("HOLDING", "MOVING"):
+            insert, retract, call = self._wanted(state)
+            if call is not None:
+                yield from self._try(call[0], at, call[1])
+        self._press(at.steady, insert=insert, retract=retract)
+
+    def _prepare(self, at: Moment) -> Actions:
+        is_out = self._insertion() < OUT
+        if self.device.homed or not is_out:
+            if self.wish is not Wish.LEAVE:
+                yield from self._try("device/enable", at, True)
+        elif not self.device.needle_out_confirmed:
+            yield from self._try("device/confirm_needle_out", at, True)
+        else:
+            yield from self._try("device/home", at)
+
+    def _wanted(self, state: str) -> tuple[bool, bool, tuple[str, bool | None] | None]:
+        """Return whether to press to insert, to draw out, and what to call."""
+        if self.device.activity == "homing":
+            return False, False, None
+        is_out = self._insertion() < OUT
+        steering = self.controller.state
+        if self.wish is Wish.INSERT and self.device.homed:
+            if steering in ("STEERING", "WAITING_FOR_TIP"):
+                return True, False, None
+            if is_out and steering in ("IDLE", "DONE", "FAULT") and not self.done:
+                return False, False, ("plane_controller/start", None)
+        if not is_out and self.wish is not Wish.LEAVE:
+            return False, True, None
+        if is_out and (self.done or self.wish is Wish.DRAW_OUT):
+            self.wish = Wish.LEAVE
+        # Homing is for axes that are off.
+        off = state == "HOLDING" and is_out and not self.device.homed
+        return False, False, ("device/enable", False) if off else None
+
+    def _press(self, now: float, *, insert: bool, retract: bool) -> None:
+        """Let go of what is not wanted; press what is, from neutral, anew where asked to."""
+        hand = self._hand
+        lost = self.device.press_again == self._source or self.sees_lost_press(now)
+        stale = hand.holds and (insert, retract) != (hand.insert, hand.retract)
+        if hand.holds and (stale or lost):
+            self._let_go(now)
+            return
+        for_so_long = now - self._changed_at
+        if hand.holds:
+            # Who holds in vain lets go after a while, and tries again.
+            if for_so_long > _IN_VAIN and self.device.hold_owner != self._source:
+                self._let_go(now)
+        elif (insert or retract) and for_so_long > _PAUSE:
+            hand.insert, hand.retract = insert, retract
+            self._changed_at = now
+
+    def _let_go(self, now: float) -> None:
+        self._hand.insert = self._hand.retract = False
+        self._changed_at = now
+
+    def _try(self, name: str, at: Moment, on: bool | None = None) -> Actions:
+        if at.steady - self._called.get(name, -_CALL_AGAIN) >= _CALL_AGAIN:
+            self._called[name] = at.steady
+            yield Call(name, on)
