@@ -62,9 +62,7 @@ class Scene:
         if isinstance(message, m.HoldState):
             self.holds.append(message)
 
-    def then(
-        self, reading: Reading | None = None, buttons: tuple[int, ...] = (0, 0)
-    ) -> m.HoldState:
+    def then(self, reading: Reading = NEUTRAL, buttons: tuple[int, ...] = (0, 0)) -> m.HoldState:
         self.held.reading = reading
         self.held.joystick = m.Joystick(0, (0.6,), buttons)
         self.runner.run(0.1)
