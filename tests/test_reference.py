@@ -18,8 +18,12 @@ from reference.markdown import cell, code
 from reference.node_pages import node_page, topics_page
 from reference.rig_nodes import RigNode, executables, rig_nodes
 
-# Of every node, or of a command that ends by itself.
-BESIDE_NODES = ("needle_core/ros/base_node.py", "needle_tracker/ros/check_calibration.py")
+# Of every node or component, or of a command that ends by itself.
+BESIDE_NODES = (
+    "needle_core/ros/base_node.py",
+    "needle_core/ros/component_node.py",
+    "needle_tracker/ros/check_calibration.py",
+)
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,14 @@ from rclpy.signals import SignalHandlerOptions
 from code_lines import ROOT
 from needle_bags.player.player_options import parse_options
 from needle_bags.reading.bag_files import read_contents
+from needle_console.console import OF_BUTTON, PAGE, Console
+from needle_console.console_parameters import ConsoleParameters
+from needle_console.hold.hold_state import HoldState, Mode
+from needle_console.page.desk import Desk
+from needle_console.view.advice import Button
+from needle_core.component import Call
 from needle_core.process.ros_domain import own_domain
+from needle_core.ros.component_node import ComponentNode
 from needle_core.ros.executor import NodeExecutor
 from reference.endpoints import PUBLISHES, SOURCES, Endpoint, Noted, noting
 
@@ -185,17 +192,29 @@ def _look(node: Any, noted: Noted) -> None:
     module.TransformPublishers(_Unmade(node, noted), kind)
 
 
-def _console(module: ModuleType) -> Node:
+def _console(_: ModuleType) -> Node:
     """Make the console without its page: that wants NiceGUI and ports."""
-    node: Node = module.ConsoleNode(mock.MagicMock())
-    return node
+
+    def make(settings: ConsoleParameters, _: str) -> Console:
+        return Console(settings)
+
+    return ComponentNode(
+        Console.name, ConsoleParameters, make, lambda settings: {PAGE: Desk(settings)}
+    )
 
 
-def _look_at_page(node: Any, _: Noted) -> None:
-    node.desk.picture("left")
-    node._look()
-    for timer in node._component.timers:
-        node._on_timer(timer.handler)
+def _look_at_page(node: Any, noted: Noted) -> None:
+    desk = node._ports[PAGE]
+    desk.picture("left")
+    for button in Button:
+        if button in OF_BUTTON:
+            desk.press(button)
+    desk.hold(HoldState(True, 1.0, Mode.RETRACT))
+    node._take_arrived()
+    for timer in node.component.timers:
+        node._handle(lambda timer=timer: timer.handler(node._moment()))
+    for service in ("device/retract", "plane_controller/stop"):
+        node._do(Call(service))
 
 
 def _player(module: ModuleType, *more: str) -> Node:
@@ -226,6 +245,13 @@ def _tick(node: Any, noted: Noted) -> None:
     _turn(node, noted)
 
 
+def _hold(node: Any, noted: Noted) -> None:
+    """Let a hand's timer go by, and have the operator look at its joystick."""
+    timers = node._component.timers
+    node._on_timer(timers[0].handler if timers else lambda at: ())
+    _turn(node, noted)
+
+
 def _camera(module: ModuleType) -> Node:
     """Make what publishes images, without any."""
     with mock.patch.object(module, "open_source"):
@@ -234,15 +260,12 @@ def _camera(module: ModuleType) -> Node:
 
 WAYS: dict[str, tuple[Way, ...]] = {
     "console": (Way(make=_console, then=_look_at_page),),
-    "device_driver": (
-        Way(then=lambda node, _: node._tell_health()),
-        Way("in simulated time", ("use_sim_time:=true",)),
-    ),
+    "device_driver": (Way(then=_tick),),
     "live_view": (Way(then=_look),),
     "openigtlink": (Way("", ("port:=0",), then=lambda node, _: node._show()),),
     "operator": (
-        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), _with_pedal, _tick),
-        Way("source joy", ("source:=joy", "key:=0"), then=_tick),
+        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), _with_pedal, _hold),
+        Way("source joy", ("source:=joy", "key:=0"), then=_hold),
     ),
     "player": (
         Way(make=_player, then=_make_and_look),

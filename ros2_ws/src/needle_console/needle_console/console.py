@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import OWNER, HoldState
-from needle_console.hold.retraction import RETRACT, STOP_STEERING, Retraction
+from needle_console.hold.retraction import Retraction
 from needle_console.view.advice import STEERING, Button
 from needle_console.view.camera_feed import SIDES
 from needle_console.view.rig_picture import RigPicture
@@ -27,7 +27,9 @@ from needle_core.component import (
     Component,
     Delivery,
     Diagnose,
+    Exit,
     Input,
+    Listen,
     Log,
     Moment,
     Output,
@@ -54,13 +56,14 @@ OF_BUTTON: Mapping[Button, Call] = {
     Button.STOP: Call("device/stop"),
 }
 """Button to the call that it makes."""
-CALLS = {call.service: call for call in (*OF_BUTTON.values(), Call(RETRACT), Call(STOP_STEERING))}
-"""Service to a call of it."""
+_VIEWS = {side: f"stereo/{side}/image_raw" for side in SIDES}
 _HOLD, _PLANE, _POINT, _RIG = "device/hold", "target_plane", "target_point", "rig"
 _IMAGES = Delivery(depth=2, reliable=False)
-_SHOW_PERIOD, _HEALTH_PERIOD = 0.1, 1.0
+_SHOW_PERIOD, _CHECK_PERIOD = 0.1, 1.0
 _HAND_WITHIN = 1.0
 """The hold's server says at least 12 times a second that it is there [s]."""
+_LOOKS_WITHIN = 2.0
+"""Who has a page open asks for views again within this time [s]."""
 _LAG_GROWS = 0.05
 """A simulation that falls behind by so much from one report to the next is named [s]."""
 
@@ -74,6 +77,11 @@ class Hand:
 
     state: HoldState
     refused: Mapping[str, int] = dataclasses.field(default_factory=dict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """Somebody has asked for a camera's view."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,7 +102,7 @@ class View:
     image: NDArray[np.uint8]
 
 
-PageEvent = Hand | Lag | Button | m.Pose | m.Point | Log
+PageEvent = Hand | Looked | Lag | Button | m.Pose | m.Point | Log
 Shown = Snapshot | View
 
 
@@ -113,9 +121,10 @@ class Console(Component):
         self.settings = settings
         self._picture = RigPicture()
         self._retraction = Retraction()
-        self._hold_stamp_ns = 0
+        self._stamp_ns = 0
         self._hand_at = -math.inf
         self._refused: Mapping[str, int] = {}
+        self._looked_at = -math.inf
         self._lag = 0.0
         self.inputs = (
             Input(DEVICE_STATUS, m.Status, self._on_device, LATCHED),
@@ -126,8 +135,8 @@ class Console(Component):
             Input(_PLANE, m.Pose, self._on_plane, LATCHED),
             Input("/diagnostics", m.Diagnostics, self._on_health),
             *(
-                Input(image_topic(side), m.Image, partial(self._on_image, side), _IMAGES)
-                for side in SIDES
+                Input(topic, m.Image, partial(self._on_image, side), _IMAGES, lazy=True)
+                for side, topic in _VIEWS.items()
             ),
         )
         self.outputs = (
@@ -136,7 +145,7 @@ class Console(Component):
             Output(_POINT, m.Point, LATCHED),
         )
         self.ports = (Port(PAGE, self._on_page),)
-        self.timers = (Timer(_SHOW_PERIOD, self._show), Timer(_HEALTH_PERIOD, self._tell_health))
+        self.timers = (Timer(_SHOW_PERIOD, self._show), Timer(_CHECK_PERIOD, self._check))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note whether a controller is there.
@@ -154,11 +163,20 @@ class Console(Component):
         self._picture.see_answer(f"{answer.service}: {refused}{answer.text}")
         return ()
 
+    def on_stop(self, at: Moment) -> Actions:
+        """Release the hold, and end."""
+        yield self._hold(at, pressed=False)
+        yield Exit(0)
+
     # ---- the page -------------------------------------------------------------------------------
 
     def _on_page(self, events: Sequence[PageEvent], at: Moment) -> Actions:
+        hands = [event for event in events if isinstance(event, Hand)]
         for event in events:
             match event:
+                case Hand(HoldState(pressed=True)) if event is not hands[-1]:
+                    # A press that had to wait is none of now; a release always counts.
+                    continue
                 case Hand():
                     yield from self._on_hand(event, at)
                 case Button():
@@ -169,6 +187,9 @@ class Console(Component):
                     yield Publish(_POINT, event)
                 case Log():
                     yield event
+                case Looked():
+                    self._looked_at = at.steady
+                    yield from (Listen(topic, True) for topic in _VIEWS.values())
                 case Lag(seconds):
                     self._on_lag(seconds, at)
 
@@ -184,15 +205,16 @@ class Console(Component):
             and rig.device.hold_owner == OWNER
             and rig.device.activity == "none",
         )
-        # Stamps must increase whatever the clock does.
-        self._hold_stamp_ns = max(at.stamp_ns, self._hold_stamp_ns + 1)
-        speed = state.speed if todo.press else 0.0
-        yield Publish(
-            _HOLD, m.HoldState(self._hold_stamp_ns, OWNER, todo.press, speed, m.HOLD_LIFETIME)
-        )
+        yield self._hold(at, pressed=todo.press, speed=state.speed)
         yield from map(Call, todo.calls)
         if is_back:
-            yield from self._tell_health(at)
+            yield from self._check(at)
+
+    def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
+        # Stamps must increase whatever the clock does.
+        self._stamp_ns = stamp_ns = max(at.stamp_ns, self._stamp_ns + 1)
+        speed = speed if pressed else 0.0
+        return Publish(_HOLD, m.HoldState(stamp_ns, OWNER, pressed, speed, m.HOLD_LIFETIME))
 
     def _on_lag(self, seconds: float, at: Moment) -> None:
         if seconds - self._lag >= _LAG_GROWS:
@@ -203,12 +225,14 @@ class Console(Component):
     def _show(self, at: Moment) -> Actions:
         yield Send(PAGE, (self._picture.snapshot(at.steady),))
 
-    def _tell_health(self, at: Moment) -> Actions:
+    def _check(self, at: Moment) -> Actions:
         served = at.steady - self._hand_at <= _HAND_WITHIN
         message = "served" if served else "the hold's server does not answer"
         counts = {f"refused {reason}": str(count) for reason, count in self._refused.items()}
         level = Level.OK if served else Level.ERROR
         yield Diagnose("hold", Diagnostic(level, message, counts))
+        if at.steady - self._looked_at > _LOOKS_WITHIN:
+            yield from (Listen(topic, False) for topic in _VIEWS.values())
 
     # ---- the rig --------------------------------------------------------------------------------
 
@@ -264,11 +288,6 @@ class Console(Component):
         rows = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)
         image = grey_image(rows, message.width, message.encoding)
         yield Send(PAGE, (View(side, np.ascontiguousarray(image)),))
-
-
-def image_topic(side: str) -> str:
-    """Return the topic of a camera's images."""
-    return f"stereo/{side}/image_raw"
 
 
 def _position(message: m.PoseWithCovariance) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from needle_console.console import PAGE, Console, Hand, Lag, PageEvent, View, image_topic
+from needle_console.console import PAGE, Console, Hand, Lag, PageEvent, View
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.page.desk import Desk
@@ -20,7 +20,9 @@ from needle_core.component import (
     LATCHED,
     Actions,
     Component,
+    Exit,
     Input,
+    Listen,
     Moment,
     Output,
     Port,
@@ -129,10 +131,29 @@ class Rig(Component):
         yield Publish("device/status", self._status("device", self.device))
         yield Publish("needle/controller_status", self._status("controller", self.controller))
         image = m.Image(at.stamp_ns, "left", 2, 3, "mono8", 4, bytes(range(8)))
-        yield Publish(image_topic("left"), image)
+        yield Publish("stereo/left/image_raw", image)
 
     def _status(self, part: str, values: dict[str, str]) -> m.Status:
         return m.Status("rig", part, Level.OK, "", dict(values))
+
+
+class Taken:
+    """A desk, its clock, and what it hands over."""
+
+    def __init__(self) -> None:
+        self.now = 10.0
+        self.batches: list[Any] = []
+        self.desk = Desk(ConsoleParameters(), lambda: self.now)
+        self.desk.open(self.batches.append)
+
+    def events(self) -> list[PageEvent]:
+        """Return what is handed over now."""
+        batches = [batch() for batch in self.batches]
+        self.batches.clear()
+        return [event for batch in batches for event in batch]
+
+    def hands(self) -> list[HoldState]:
+        return [event.state for event in self.events() if isinstance(event, Hand)]
 
 
 class Scene:
@@ -189,7 +210,7 @@ def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(scene: Sc
     scene.rig.controller["state"] = "STEERING"
     scene.forward(0.1)
     scene.page.hand = RETRACT
-    assert not any(hold.pressed for hold in scene.holds(0.5))
+    assert not any(hold.pressed or hold.speed_scale for hold in scene.holds(0.5))
     assert scene.rig.calls == [("plane_controller/stop", None)]
     scene.rig.controller["state"] = "IDLE"
     scene.rig.device["hold_owner"] = "console"
@@ -240,10 +261,10 @@ def test_the_hands_server_that_falls_silent_is_named(scene: Scene) -> None:
 
 
 def test_targets_and_images_go_through(scene: Scene) -> None:
-    desk = Desk("", lambda: None)
-    desk.send_plane(plane_pose(4.0, 30.0))
-    desk.send_point(target_point(10.0, -5.0, 100.0))
-    scene.page.wishes = list(desk.take())
+    taken = Taken()
+    taken.desk.send_plane(plane_pose(4.0, 30.0))
+    taken.desk.send_point(target_point(10.0, -5.0, 100.0))
+    scene.page.wishes = taken.events()
     scene.forward(0.3)
     plane, point = scene.rig.targets
     assert plane.orientation == pytest.approx((0.0, np.sin(np.pi / 12), 0.0, np.cos(np.pi / 12)))
@@ -262,56 +283,64 @@ def test_a_simulation_that_lags_is_named_while_it_does(scene: Scene) -> None:
     (text,) = scene.page.snapshot.troubles
     assert "1.0 s behind the clock" in text
     # It lags no more than it did.
+    scene.forward(2.0)
     scene.page.wishes = [Lag(1.0)]
-    scene.forward(5.0)
+    scene.forward(2.0)
     assert scene.page.snapshot.troubles == ()
 
 
 # ---- the desk, with its own clock ---------------------------------------------------------------
 
 
-class Clock:
-    def __init__(self) -> None:
-        self.now = 10.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
-def hands(desk: Desk) -> list[HoldState]:
-    return [event.state for event in desk.take() if isinstance(event, Hand)]
-
-
 def test_of_holds_that_wait_the_newest_counts_unless_one_was_a_release() -> None:
-    rung: list[bool] = []
-    clock = Clock()
-    desk = Desk("", lambda: rung.append(True), clock)
+    taken = Taken()
     for state in (RETRACT, INSERT):
-        desk.hold(state)
-    assert len(rung) == 2
-    assert hands(desk) == [INSERT]
-    assert hands(desk) == []
+        taken.desk.hold(state)
+    assert taken.hands() == [INSERT]
+    assert taken.hands() == []
     for state in (INSERT, RELEASED, INSERT):
-        desk.hold(state)
-    assert hands(desk) == [RELEASED]
-    desk.hold(INSERT)
-    assert hands(desk) == [INSERT]
+        taken.desk.hold(state)
+    assert taken.hands() == [RELEASED]
+    taken.desk.hold(INSERT)
+    assert taken.hands() == [INSERT]
 
 
 def test_a_hold_that_has_waited_for_longer_than_it_counts_is_a_release() -> None:
-    clock = Clock()
-    desk = Desk("", lambda: None, clock)
-    desk.hold(INSERT)
-    clock.now += m.HOLD_LIFETIME
-    assert hands(desk) == [INSERT]
-    desk.hold(INSERT)
-    clock.now += 1.01 * m.HOLD_LIFETIME
-    assert hands(desk) == [RELEASED]
+    taken = Taken()
+    taken.desk.hold(INSERT)
+    taken.now += m.HOLD_LIFETIME
+    assert taken.hands() == [INSERT]
+    taken.desk.hold(INSERT)
+    taken.now += 1.01 * m.HOLD_LIFETIME
+    assert taken.hands() == [RELEASED]
 
 
 def test_wishes_of_pages_that_nobody_takes_are_not_piled_up() -> None:
-    desk = Desk("", lambda: None)
+    taken = Taken()
     for _ in range(1000):
-        desk.press(Button.HOME)
-    assert 0 < len(desk.take()) < 100
-    assert desk.take() == []
+        taken.desk.press(Button.HOME)
+    assert 0 < len(taken.events()) < 100
+    assert taken.events() == []
+
+
+def test_images_are_wanted_while_a_page_asks_for_views() -> None:
+    console = Console(ConsoleParameters())
+    (port,) = console.ports
+    taken = Taken()
+
+    def listens(actions: Actions) -> dict[str, bool]:
+        return {act.topic: act.on for act in actions if isinstance(act, Listen)}
+
+    both = ("stereo/left/image_raw", "stereo/right/image_raw")
+    taken.desk.picture("left")
+    assert listens(port.handler(taken.events(), Moment(5.0, 1))) == dict.fromkeys(both, True)
+    check = console.timers[1].handler
+    assert listens(check(Moment(6.9, 1))) == {}
+    assert listens(check(Moment(7.1, 1))) == dict.fromkeys(both, False)
+
+
+def test_its_end_releases_the_hold() -> None:
+    release, end = Console(ConsoleParameters()).on_stop(Moment(5.0, 1))
+    assert isinstance(release, Publish)
+    assert not release.message.pressed
+    assert end == Exit(0)

@@ -55,10 +55,10 @@ class Scene:
         self.device = SlowDevice(self.wall)
         self.echoes = self.is_held = True
         self._age = age
-        self.desk = Desk("", self.wall.set, clock=self.now)
+        self.desk = Desk(ConsoleParameters(), self.now)
         self.runner = PacedRunner(
             [self.device, Console(ConsoleParameters())],
-            outside={PAGE: self.desk},
+            ports={PAGE: self.desk},
             bell=self.wall,
             clock=self.wall,
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from needle_core.diagnostics import Diagnostic
 
@@ -106,6 +106,14 @@ class Log:
 
 
 @dataclass(frozen=True)
+class Listen:
+    """Receive a lazy input from now on, or no longer."""
+
+    topic: str
+    on: bool
+
+
+@dataclass(frozen=True)
 class Diagnose:
     """Report the health of one part of the component."""
 
@@ -121,7 +129,7 @@ class Exit:
     text: str = ""
 
 
-Action = Publish | Send | Call | Reply | Log | Diagnose | Exit
+Action = Publish | Send | Call | Reply | Log | Listen | Diagnose | Exit
 Actions = Iterable[Action]
 
 
@@ -130,13 +138,17 @@ Actions = Iterable[Action]
 
 @dataclass(frozen=True)
 class Input:
-    """A topic that the component receives; what has more than `longest` bytes is refused."""
+    """A topic that the component receives; what has more than `longest` bytes is refused.
+
+    A lazy one need not be received before the component listens.
+    """
 
     topic: str
     message: type[Any]
     handler: Callable[[Any, Moment], Actions]
     delivery: Delivery = RELIABLE
     longest: int = 1 << 26
+    lazy: bool = False
 
 
 @dataclass(frozen=True)
@@ -177,6 +189,23 @@ class Port:
     name: str
     handler: Callable[[Sequence[Any], Moment], Actions]
     on_change: Callable[[PortChange, Moment], Actions] = _ignore
+
+
+Batch = tuple[Any, ...] | Callable[[], tuple[Any, ...]]
+"""What comes in at a port, or what returns it when it is handled: it may have aged until then."""
+
+
+class RealPort(Protocol):
+    """The real implementation of a component's port; it may have a reader thread."""
+
+    def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+        """Begin; `arrive` takes what has come in, from any thread."""
+
+    def send(self, batch: tuple[Any, ...]) -> None:
+        """Send a batch; never waits."""
+
+    def close(self) -> None:
+        """End, after what was sent is out."""
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import sys
-import threading
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,8 +16,7 @@ from needle_core.process.end_request import EndRequest
 from needle_core.settings.parameter_files import Parameters
 
 if TYPE_CHECKING:
-    from needle_core.component import Component
-    from needle_core.runners.paced import Outside
+    from needle_core.component import Component, RealPort
 
 LOOPBACK = "127.0.0.1"
 # As often as a page shows them [Hz].
@@ -54,32 +52,23 @@ def console(options: ConsoleOptions) -> int:
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415
     from needle_console.console_parameters import ConsoleParameters  # noqa: PLC0415
-    from needle_console.page.desk import Desk  # noqa: PLC0415
-    from needle_console.page.web_server import ConsoleServers  # noqa: PLC0415
+    from needle_console.page.web_server import ServedDesk  # noqa: PLC0415
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    bell = threading.Event()
-    with EndRequest(None) as end, contextlib.ExitStack() as stack:
-        desk = Desk(settings.calibration_file, bell.set)
-        servers = ConsoleServers(desk, settings)
-        rig, outside = _rig(rig_parameters(options), bell, stack)
-        runner = PacedRunner(
-            [*rig, Console(settings)],
-            options.rig.seed,
-            outside={PAGE: desk, **outside},
-            bell=bell,
-        )
-        servers.start()
-        # First of all: nobody holds any more.
-        stack.callback(servers.close)
-        print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
-        while not end.wanted:
-            if runner.run(_SLICE):
-                (name, ended), *_ = runner.exits.items()
-                print(f"error: {name} ended: {ended.text}", file=sys.stderr)
-                return EXIT_MISSED
-            desk.note_lag(runner.lag)
+    with EndRequest(None) as end:
+        desk = ServedDesk(settings)
+        rig, ports = _make_rig(rig_parameters(options))
+        components = [*rig, Console(settings)]
+        runner = PacedRunner(components, options.rig.seed, ports={PAGE: desk, **ports})
+        with contextlib.closing(runner):
+            print(f"http://{LOOPBACK}:{options.port}/   (Ctrl-C ends all)", flush=True)
+            while not end.wanted:
+                if runner.run(_SLICE):
+                    (name, ended), *_ = runner.exits.items()
+                    print(f"error: {name} ended: {ended.text}", file=sys.stderr)
+                    return EXIT_MISSED
+                desk.note_lag(runner.lag)
         return EXIT_INTERRUPTED
 
 
@@ -90,10 +79,8 @@ def rig_parameters(options: ConsoleOptions) -> Parameters:
     return parameters
 
 
-def _rig(
-    parameters: Parameters, bell: threading.Event, stack: contextlib.ExitStack
-) -> tuple[list[Component], dict[str, Outside]]:
-    """Return the rig, and what is outside of this process; `stack` ends that."""
+def _make_rig(parameters: Parameters) -> tuple[list[Component], dict[str, RealPort]]:
+    """Return the rig, and its ports to other processes."""
     from needle_bringup.simulation.virtual_run import make_rig  # noqa: PLC0415
 
     if parameters["sim_rig"]["level"] == "tip":
@@ -105,9 +92,8 @@ def _rig(
     )
     from needle_sim.camera_sensor import DistantCameras  # noqa: PLC0415
 
-    eyes = EyesProcess(parameters, bell.set)
-    stack.callback(eyes.close)
-    return make_rig(parameters, DistantCameras, lambda _: DistantTracker()), {EYES: eyes}
+    rig = make_rig(parameters, DistantCameras, lambda _: DistantTracker())
+    return rig, {EYES: EyesProcess(parameters)}
 
 
 if __name__ == "__main__":

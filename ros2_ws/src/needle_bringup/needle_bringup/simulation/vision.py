@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from needle_bringup.simulation.virtual_run import make_tracker, settings_of
 from needle_core import messages as m
@@ -86,28 +86,24 @@ class Eyes:
 
 
 class EyesProcess:
-    """The process of `Eyes`: the outside of the port `eyes`.
+    """The process of `Eyes`: the real port `eyes`.
 
     Parameters
     ----------
     parameters : Parameters
         Node to its parameters.
-    ring : callable
-        Called by any thread when something is done.
     """
 
-    def __init__(self, parameters: Parameters, ring: Callable[[], None]) -> None:
-        self._ring = ring
-        self._done: deque[Done] = deque()
+    def __init__(self, parameters: Parameters) -> None:
         self._pool = ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), Eyes.open, (parameters,)
         )
 
-    def take(self) -> Sequence[Done]:
-        """Return what is done."""
-        return [self._done.popleft() for _ in range(len(self._done))]
+    def open(self, arrive: Callable[[tuple[Done]], None]) -> None:
+        """Begin to hand over what is done."""
+        self._arrive = arrive
 
-    def send(self, batch: Sequence[Any]) -> None:
+    def send(self, batch: Sequence[tuple[Item, Moment]]) -> None:
         """Take work to do.
 
         Raises
@@ -117,17 +113,14 @@ class EyesProcess:
         """
         try:
             for item, at in batch:
-                self._pool.submit(Eyes.work, item, at).add_done_callback(self._take)
+                done = self._pool.submit(Eyes.work, item, at)
+                done.add_done_callback(lambda done: self._arrive((done,)))
         except BrokenProcessPool as error:
             raise UserError("the process that renders and tracks has ended") from error
 
     def close(self) -> None:
-        """End it, whatever it does."""
+        """End it, when what it does is done."""
         self._pool.shutdown(wait=True, cancel_futures=True)
-
-    def _take(self, done: Done) -> None:
-        self._done.append(done)
-        self._ring()
 
 
 class DistantTracker(Component):

@@ -8,12 +8,13 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from needle_console.console import Hand, Lag, PageEvent, Shown, View
+from needle_console.console import Hand, Lag, Looked, PageEvent, Shown, View
+from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_state import RELEASED, HoldState
 from needle_console.view.advice import Button
 from needle_console.view.camera_feed import CameraFeed
 from needle_console.view.snapshot import Array, Snapshot
-from needle_core.component import Log
+from needle_core.component import Batch, Log
 from needle_core.files.installed import find_shared
 from needle_core.messages import HOLD_LIFETIME, Point, Pose
 from needle_core.rotations import quaternion_from_rotation
@@ -28,10 +29,8 @@ class Desk:
 
     Parameters
     ----------
-    calibration_file : str
-        Calibration of the cameras; empty: needle_tracker's own.
-    ring : callable
-        Called by any thread when something has come in.
+    settings : ConsoleParameters
+        The component's.
     clock : callable, optional
         Returns the steady time [s], of the wall and not of a simulation; the system's by default.
 
@@ -42,25 +41,37 @@ class Desk:
     """
 
     def __init__(
-        self,
-        calibration_file: str,
-        ring: Callable[[], None],
-        clock: Callable[[], float] | None = None,
+        self, settings: ConsoleParameters, clock: Callable[[], float] | None = None
     ) -> None:
-        self._ring = ring
         self._clock = clock or time.monotonic
+        self._arrive: Callable[[Batch], None] = lambda _: None
         self._lock = threading.Lock()
         self._wishes: list[PageEvent] = []
         self._hold: HoldState | None = None
         self._hold_at = 0.0
         self._was_released = False
         self._snapshot = Snapshot()
-        self._feed = CameraFeed(_cameras(calibration_file), self.snapshot)
+        self._feed = CameraFeed(_cameras(settings.calibration_file), self.snapshot)
         self.refused: Callable[[], Mapping[str, int]] = dict
 
     # ---- for the component's runner -------------------------------------------------------------
 
-    def take(self) -> Sequence[PageEvent]:
+    def open(self, arrive: Callable[[Batch], None]) -> None:
+        """Begin to hand over what comes in."""
+        self._arrive = arrive
+
+    def send(self, batch: Sequence[Shown]) -> None:
+        """Take what pages show."""
+        for shown in batch:
+            if isinstance(shown, View):
+                self._feed.put(shown.side, shown.image, self._clock())
+            else:
+                self._snapshot = shown
+
+    def close(self) -> None:
+        """Do nothing: who has threads here ends them."""
+
+    def _take(self) -> tuple[PageEvent, ...]:
         """Return what has come in since the last time.
 
         Of holds the newest counts, unless one was a release: the next one is not far. They age on
@@ -75,20 +86,7 @@ class Desk:
         if hold is not None:
             counts = not was_released and not is_old
             events.append(Hand(hold if counts else RELEASED, self.refused()))
-        return events
-
-    def send(self, batch: Sequence[Shown]) -> None:
-        """Take what pages show."""
-        for shown in batch:
-            if isinstance(shown, View):
-                self._feed.put(shown.side, shown.image, self._clock())
-            else:
-                self._snapshot = shown
-
-    @property
-    def wants_images(self) -> bool:
-        """Whether a page asks for views."""
-        return self._feed.wanted(self._clock())
+        return tuple(events)
 
     def note_lag(self, seconds: float) -> None:
         """Take how far a simulation is behind the clock [s]."""
@@ -101,11 +99,11 @@ class Desk:
         with self._lock:
             self._hold, self._hold_at = state, self._clock()
             self._was_released |= not state.pressed
-        self._ring()
+        self._arrive(self._take)
 
-    def notice(self, text: str) -> None:
-        """Take a line that is worth a warning."""
-        self._put(Log("warning", text))
+    def notice(self, text: str, severity: str = "warning") -> None:
+        """Take a line for the log."""
+        self._put(Log(severity, text))
 
     # ---- for the page's thread ------------------------------------------------------------------
 
@@ -115,6 +113,7 @@ class Desk:
 
     def picture(self, side: str) -> bytes | None:
         """Return a side's (`left`, `right`) newest view as JPEG; None where there is none."""
+        self._put(Looked())
         return self._feed.picture(side, self._clock())
 
     def press(self, button: Button) -> None:
@@ -135,7 +134,7 @@ class Desk:
         with self._lock:
             if len(self._wishes) < _MOST_WISHES:
                 self._wishes.append(event)
-        self._ring()
+        self._arrive(self._take)
 
 
 def _vector(values: Array) -> tuple[float, float, float]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from needle_console.page.console_page import ConsolePage, HoldLink
 from needle_console.page.desk import Desk
 from needle_console.page.gate import Gate
 from needle_console.view.camera_feed import SIDES
+from needle_core.component import Batch
 from needle_core.errors import UserError
 
 STATIC = Path(__file__).resolve().parents[1] / "static"
@@ -93,15 +95,13 @@ class WebServer:
         self._server.run(sockets=[self._socket])
 
 
-class ConsoleServers:
-    """Servers of page and hold at a desk.
+class ServedDesk(Desk):
+    """The desk with its servers of page and hold.
 
     Parameters
     ----------
-    desk : Desk
-        What pages show and do.
     settings : ConsoleParameters
-        Where, and to whom.
+        Where they listen, and to whom.
 
     Raises
     ------
@@ -109,39 +109,38 @@ class ConsoleServers:
         A setting that cannot be, or a port that is taken.
     """
 
-    def __init__(self, desk: Desk, settings: ConsoleParameters) -> None:
+    def __init__(self, settings: ConsoleParameters) -> None:
+        super().__init__(settings)
+        self._at = f"http://{settings.address}:{settings.port}/"
         access = settings.access()
-        self._hold = HoldServer(access, settings.hold_port, desk.hold, desk.notice)
-        desk.refused = self._hold.counts
+        self._hold_server = HoldServer(access, settings.hold_port, self.hold, self.notice)
+        self.refused = self._hold_server.counts
         link = HoldLink(settings.hold_port, settings.token())
         try:
-            self._web = WebServer(
-                desk, access, address=settings.address, port=settings.port, hold=link
+            self._page_server = WebServer(
+                self, access, address=settings.address, port=settings.port, hold=link
             )
         except UserError:
-            self._hold.close()
+            self._hold_server.close()
             raise
 
-    def start(self) -> None:
+    def open(self, arrive: Callable[[Batch], None]) -> None:
         """Begin to serve."""
-        self._hold.start()
-        self._web.start()
+        super().open(arrive)
+        self._hold_server.start()
+        self._page_server.start()
+        self.notice(f"page on {self._at}", "info")
 
     def close(self) -> None:
         """Release the hold, then end both."""
-        self._hold.close()
-        self._web.close()
+        self._hold_server.close()
+        self._page_server.close()
 
 
 def _listen(address: str, port: int) -> socket.socket:
     family: Any = socket.AF_INET6 if ":" in address else socket.AF_INET
-    listening = socket.socket(family, socket.SOCK_STREAM)
-    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        listening.bind((address, port))
         # Whoever comes before the server has begun waits, and is not refused.
-        listening.listen()
+        return socket.create_server((address, port), family=family)
     except OSError as error:
-        listening.close()
         raise UserError(f"cannot listen on {address}:{port}: {error.strerror}") from error
-    return listening

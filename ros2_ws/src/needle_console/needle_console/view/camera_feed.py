@@ -13,8 +13,6 @@ from needle_tracker.optics.refraction import RefractedCamera
 SIDES = ("left", "right")
 # No view is drawn anew more often [s].
 PERIOD = 0.1
-# Who has a page open asks again within this time [s].
-ASKS_WITHIN = 2.0
 # An image counts so long [s].
 _COUNTS_FOR = 2.0
 
@@ -40,11 +38,6 @@ class CameraFeed:
         self._lock = threading.Lock()
         self._images: dict[str, tuple[Image, float]] = {}
         self._pictures: dict[str, tuple[bytes, float]] = {}
-        self._asked_at = -math.inf
-
-    def wanted(self, now: float) -> bool:
-        """Tell whether somebody looks."""
-        return now - self._asked_at <= ASKS_WITHIN
 
     def put(self, side: str, image: Image, now: float) -> None:
         """Take an image, grey, shape (height, width)."""
@@ -54,7 +47,6 @@ class CameraFeed:
     def picture(self, side: str, now: float) -> bytes | None:
         """Return the JPEG of a side's newest image; None where none has come lately."""
         with self._lock:
-            self._asked_at = now
             image, came = self._images.get(side, (None, -math.inf))
             if image is None or now - came > _COUNTS_FOR:
                 return None

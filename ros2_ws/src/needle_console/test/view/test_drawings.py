@@ -85,10 +85,7 @@ def test_views_are_drawn_for_who_asks_and_at_most_ten_times_a_second() -> None:
         return drawn[-1]
 
     feed = CameraFeed({}, snapshot)
-    assert not feed.wanted(0.0)
     assert feed.picture("left", 10.0) is None
-    assert feed.wanted(11.9)
-    assert not feed.wanted(12.1)
     feed.put("left", np.zeros((48, 64), np.uint8), 20.0)
     for now in np.arange(20.0, 21.0, 0.01):
         assert feed.picture("left", float(now))

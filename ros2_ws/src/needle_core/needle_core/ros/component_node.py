@@ -6,12 +6,13 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.client import Client
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
@@ -24,11 +25,13 @@ from needle_core.component import (
     Diagnose,
     Exit,
     Input,
+    Listen,
     Log,
     Moment,
     Output,
     Peers,
     Publish,
+    RealPort,
     Reply,
     Send,
     Service,
@@ -50,19 +53,6 @@ ANSWER_TIMEOUT = 5.0
 LOG_PERIOD = 2.0
 """Time between two lines of log of one kind [s]."""
 _PEERS_PERIOD = 0.2
-
-
-class RealPort(Protocol):
-    """The real implementation of a component's port; it may have a reader thread."""
-
-    def open(self, arrive: Callable[[Any], None]) -> None:
-        """Begin; `arrive` takes a batch, or a `PortChange`, from any thread."""
-
-    def send(self, batch: tuple[Any, ...]) -> None:
-        """Send a batch; never waits."""
-
-    def close(self) -> None:
-        """End, after what was sent is out."""
 
 
 class ComponentNode(WholeNode):
@@ -128,8 +118,10 @@ class ComponentNode(WholeNode):
         self._claims: list[Claim] = []
         self._bell = self.create_guard_condition(self._take_arrived)
         self.outputs = {row.topic: self._advertise(row) for row in self.component.outputs}
+        self._lazy: dict[str, Subscription[Any]] = {}
         for row in self.component.inputs:
-            self._hear(row)
+            if not row.lazy:
+                self._hear(row)
         for service in self.component.services:
             self._offer(service)
         for timer in self.component.timers:
@@ -173,7 +165,7 @@ class ComponentNode(WholeNode):
         kind = self._types.make(ros_type(row.message))
         return self.create_publisher(kind, self._name_of(row.topic), to_qos(row.delivery))
 
-    def _hear(self, row: Input) -> None:
+    def _hear(self, row: Input) -> Subscription[Any]:
         def on_incompatible(_: Any) -> None:
             cure = "transient_local" if row.delivery.latched else "reliable"
             option = "durability" if row.delivery.latched else "reliability"
@@ -181,7 +173,7 @@ class ComponentNode(WholeNode):
             self._diagnostics.refuse(row.topic, "incompatible QoS", why)
 
         # Raw: what cannot be decoded must not raise out of the executor.
-        self.create_subscription(
+        return self.create_subscription(
             self._types.make(ros_type(row.message)),
             self._name_of(row.topic),
             lambda data, info: self._on_bytes(row, data, info),
@@ -190,6 +182,13 @@ class ComponentNode(WholeNode):
             callback_group=self._group,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
         )
+
+    def _listen(self, topic: str, on: bool) -> None:
+        if on and topic not in self._lazy:
+            row = next(row for row in self.component.inputs if row.topic == topic)
+            self._lazy[topic] = self._hear(row)
+        elif not on and topic in self._lazy:
+            self.destroy_subscription(self._lazy.pop(topic))
 
     def _on_bytes(self, row: Input, data: bytes, info: Mapping[str, int]) -> None:
         if len(data) > row.longest:
@@ -239,6 +238,7 @@ class ComponentNode(WholeNode):
     def _take_arrived(self) -> None:
         while self._arrived:
             name, batch = self._arrived.popleft()
+            batch = batch() if callable(batch) else batch
             for row in self.component.ports:
                 if row.name == name:
                     handler = row.handler if isinstance(batch, tuple) else row.on_change
@@ -279,6 +279,8 @@ class ComponentNode(WholeNode):
                 reply = self._requests.pop(number, None)
                 if reply is not None:
                     reply.set_result(action)
+            case Listen(topic, on):
+                self._listen(topic, on)
             case Diagnose(part, diagnostic):
                 self._diagnostics.set(part, diagnostic)
             case Log():

@@ -11,10 +11,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from needle_core.commands.cli import EXIT_DONE
-from needle_core.component import Component
+from needle_core.component import Component, RealPort
 from needle_core.process.end_request import EndRequest
 from needle_core.ros.base_node import LOOK_PERIOD, run_node
-from needle_core.ros.component_node import ComponentNode, RealPort
+from needle_core.ros.component_node import ComponentNode
 
 
 def run_component(

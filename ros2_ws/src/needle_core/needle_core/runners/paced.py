@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any, Protocol
 
-from needle_core.component import Component
+from needle_core.component import Batch, Component, PortChange, RealPort
 from needle_core.runners.process import Process
 from needle_core.runners.virtual import VirtualRunner
 
@@ -16,18 +17,8 @@ SLACK = 0.05
 """So far behind the clock the runner catches up; what is more is lost [s]."""
 
 
-class Outside(Protocol):
-    """Real implementation of a port; its own threads ring the runner's bell."""
-
-    def take(self) -> Sequence[Any]:
-        """Return what has come in since the last time."""
-
-    def send(self, batch: Sequence[Any]) -> None:
-        """Take what a component sends; waits for nothing."""
-
-
 class Bell(Protocol):
-    """Part of a `threading.Event` that is used; tests have one on a clock of their own."""
+    """Part of a `threading.Event` that is used here; tests have one on a clock of their own."""
 
     def set(self) -> None:
         """Ring, from any thread."""
@@ -57,8 +48,8 @@ class PacedRunner(VirtualRunner):
         Keys latencies and compute times.
     pace : float
         Virtual over real time.
-    outside : mapping of str to Outside
-        Port to what is behind it, beside components.
+    ports : mapping of str to RealPort
+        What is outside, by the name of the component's port.
     bell : Bell, optional
         Rung when something has come in.
     clock : callable, optional
@@ -78,23 +69,31 @@ class PacedRunner(VirtualRunner):
         seed: int = 0,
         *,
         pace: float = 1.0,
-        outside: Mapping[str, Outside] | None = None,
+        ports: Mapping[str, RealPort] | None = None,
         bell: Bell | None = None,
         clock: Callable[[], float] = time.monotonic,
         **more: Any,
     ) -> None:
         super().__init__(components, seed, **more)
         self.lag = 0.0
-        self._pace, self._outside = pace, outside or {}
+        self._pace, self._clock = pace, clock
         self._bell = bell or threading.Event()
-        self._clock = clock
         self._anchor: tuple[float, float] | None = None
+        self._arrived: deque[tuple[str, Batch | PortChange]] = deque()
+        self._ports = dict(ports or {})
+        for name, port in self._ports.items():
+            port.open(partial(self._come_in, name))
+
+    def close(self) -> None:
+        """Close the ports."""
+        for port in self._ports.values():
+            port.close()
 
     def run(self, seconds: float) -> bool:
         """Run until another component exits, or for `seconds`; return whether one did."""
         # The end is an event, too: it is waited for.
         self.timeline.call_after(seconds, lambda: None)
-        return super().run(seconds)
+        return self.timeline.run(seconds, self._reach)
 
     def _reach(self, due: float) -> bool:
         behind = self._shown() - due
@@ -105,13 +104,23 @@ class PacedRunner(VirtualRunner):
             return True
         self._bell.clear()
         self.timeline.now = max(self.now, min(self._shown(), due))
-        for port, outside in self._outside.items():
-            batch = tuple(outside.take())
-            for process in self._processes.values() if batch else ():
-                for row in process.component.ports:
-                    if row.name == port:
-                        process.offer(port, partial(row.handler, batch))
+        while self._arrived:
+            self._take(*self._arrived.popleft())
         return False
+
+    def _come_in(self, port: str, batch: Batch | PortChange) -> None:
+        """Take what has come in at a port, from any thread."""
+        self._arrived.append((port, batch))
+        self._bell.set()
+
+    def _take(self, port: str, batch: Batch | PortChange) -> None:
+        items = batch() if callable(batch) else batch
+        for process in self._processes.values():
+            for row in process.component.ports:
+                if row.name == port and isinstance(items, PortChange):
+                    process.offer(port, partial(row.on_change, items))
+                elif row.name == port and not isinstance(items, PortChange) and items:
+                    self._arrive(process, row, items)
 
     def _shown(self) -> float:
         """Return the virtual time that the wall clock shows [s]."""
@@ -121,7 +130,7 @@ class PacedRunner(VirtualRunner):
         return self._anchor[0] + (wall - self._anchor[1]) * self._pace
 
     def _send_through(self, sender: Process, port: str, batch: tuple[Any, ...]) -> None:
-        if port in self._outside:
-            self._outside[port].send(batch)
+        if port in self._ports:
+            self._ports[port].send(batch)
         else:
             super()._send_through(sender, port, batch)

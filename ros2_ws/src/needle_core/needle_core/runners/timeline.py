@@ -70,21 +70,21 @@ class Timeline:
         """Let `run` return after the present event."""
         self._is_interrupted = True
 
-    def run(self, seconds: float, reach: Callable[[float], bool]) -> bool:
+    def run(self, seconds: float, reach: Callable[[float], bool] | None = None) -> bool:
         """Run what is due, for some time [s] or until an interrupt; return whether there was one.
 
         Parameters
         ----------
         seconds : float
             How long at most [s].
-        reach : callable
+        reach : callable, optional
             Takes the time of the next event [s], may wait for it, and returns False where another
             may have come before it.
         """
         end = self.now + seconds
         heap, self._is_interrupted = self._heap, False
         while heap and heap[0][0] <= end:
-            if not reach(heap[0][0]):
+            if reach is not None and not reach(heap[0][0]):
                 continue
             self.now, _, event = heapq.heappop(heap)
             event()

@@ -110,11 +110,7 @@ class VirtualRunner:
 
     def run(self, seconds: float) -> bool:
         """Run until another component exits, or for `seconds`; return whether one did."""
-        return self.timeline.run(seconds, self._reach)
-
-    def _reach(self, due: float) -> bool:
-        """Return whether the time of the next event has come: at once, in virtual time."""
-        return True
+        return self.timeline.run(seconds)
 
     # ---- what befalls components ----------------------------------------------------------------
 
@@ -271,7 +267,11 @@ class VirtualRunner:
                     self._transport.send(link, batch, PORT_LATENCY, arrive)
 
     def _arrive(self, receiver: Process, row: Port, batch: tuple[Any, ...]) -> None:
-        receiver.offer(row.name, partial(row.handler, batch))
+        waiting = receiver.batches.setdefault(row.name, [])
+        waiting += batch
+        if len(waiting) == len(batch):
+            # What comes until it is handled goes with it.
+            receiver.offer(row.name, lambda at: row.handler(receiver.batches.pop(row.name), at))
 
     # ---- who knows whom -------------------------------------------------------------------------
 

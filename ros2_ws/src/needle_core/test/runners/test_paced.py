@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import pytest
 
-from needle_core.component import Actions, Component, Moment, Port, Send, Timer
+from needle_core.component import Actions, Batch, Component, Moment, Port, PortChange, Send, Timer
 from needle_core.runners.paced import SLACK, PacedRunner
 from wall_clock import WallClock
 
@@ -25,12 +25,17 @@ class Worker(Component):
         self.takes: list[float] = []
         self.ticks: list[tuple[float, float]] = []
         self.heard: list[tuple[Any, float]] = []
-        self.ports = (Port("outside", self._hear),)
+        self.changes: list[PortChange] = []
+        self.ports = (Port("outside", self._hear, self._on_change),)
         self.timers = (Timer(PERIOD, self._tick),)
 
     def _hear(self, batch: Sequence[Any], at: Moment) -> Actions:
         self.heard += [(item, at.steady) for item in batch]
         yield Send("outside", tuple(f"{item} heard" for item in batch))
+
+    def _on_change(self, change: PortChange, at: Moment) -> Actions:
+        self.changes.append(change)
+        return ()
 
     def _tick(self, at: Moment) -> Actions:
         self.ticks.append((at.steady, self.wall.now))
@@ -42,31 +47,31 @@ class Worker(Component):
 class Line:
     """What is outside."""
 
-    def __init__(self, wall: WallClock) -> None:
-        self.wall = wall
-        self.coming: list[Any] = []
+    def __init__(self) -> None:
         self.sent: list[Any] = []
+        self.is_open = False
+
+    def open(self, arrive: Callable[[Batch | PortChange], None]) -> None:
+        self.arrive, self.is_open = arrive, True
 
     def say(self, item: Any) -> None:
-        self.coming.append(item)
-        self.wall.set()
+        self.arrive((item,))
 
-    def take(self) -> Sequence[Any]:
-        coming, self.coming = self.coming, []
-        return coming
-
-    def send(self, batch: Sequence[Any]) -> None:
+    def send(self, batch: tuple[Any, ...]) -> None:
         self.sent += batch
+
+    def close(self) -> None:
+        self.is_open = False
 
 
 class Scene:
     def __init__(self, pace: float = 1.0) -> None:
         self.wall = WallClock()
-        self.worker, self.line = Worker(self.wall), Line(self.wall)
+        self.worker, self.line = Worker(self.wall), Line()
         self.runner = PacedRunner(
             [self.worker],
             pace=pace,
-            outside={"outside": self.line},
+            ports={"outside": self.line},
             bell=self.wall,
             clock=self.wall,
         )
@@ -77,8 +82,9 @@ def test_virtual_time_goes_at_the_pace_of_the_wall_clock(pace: float) -> None:
     scene = Scene(pace)
     begin = scene.wall.now
     for _ in range(5):
-        scene.runner.run(1.0)
-    assert scene.wall.now - begin == pytest.approx(5.0 / pace)
+        scene.runner.run(0.773)
+        assert scene.wall.now - begin == pytest.approx(scene.runner.now / pace)
+    assert scene.runner.now == pytest.approx(5 * 0.773)
     assert scene.runner.lag == 0.0
     for steady, wall in scene.worker.ticks:
         assert wall - begin == pytest.approx(steady / pace)
@@ -126,3 +132,24 @@ def test_what_comes_in_during_a_delay_is_handled_right_after_it() -> None:
     ((what, when),) = scene.worker.heard
     assert what == "stop"
     assert when < 2.0 * PERIOD
+
+
+def test_what_may_age_is_asked_for_when_it_is_handled() -> None:
+    scene = Scene()
+    scene.worker.takes = [3.0]
+    begin = scene.wall.now
+    scene.wall.at(begin + 1.0, lambda: scene.line.arrive(lambda: (scene.wall.now,)))
+    scene.wall.at(begin + 1.0, lambda: scene.line.arrive(tuple))
+    scene.runner.run(2.0)
+    ((asked_at, _),) = scene.worker.heard
+    assert asked_at == pytest.approx(begin + 3.0, abs=SLACK)
+
+
+def test_a_port_that_is_lost_is_told_and_all_are_closed() -> None:
+    scene = Scene()
+    scene.line.arrive(PortChange("unplugged"))
+    scene.runner.run(0.1)
+    assert scene.worker.changes == [PortChange("unplugged")]
+    assert scene.line.is_open
+    scene.runner.close()
+    assert not scene.line.is_open

@@ -22,7 +22,7 @@ class Happening:
         self.course.meet(Moment.START)
 
     def until(self, at: float) -> None:
-        self.timeline.run(at - self.timeline.now, lambda due: True)
+        self.timeline.run(at - self.timeline.now)
 
     @property
     def state(self) -> tuple[bool, bool]:

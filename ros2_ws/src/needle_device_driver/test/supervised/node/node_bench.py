@@ -212,9 +212,7 @@ class Rig:
         self.insist("home")
         self.until(lambda: self.partner.status["homed"] == "true", "homed")
         self.insist("enable", True)
-        self.until(
-            lambda: all(drive.state == "enabled" for drive in self.peer.drives), "power"
-        )
+        self.until(lambda: all(drive.state == "enabled" for drive in self.peer.drives), "power")
         joints = len(self.partner.joints)
         self.until(lambda: len(self.partner.joints) > joints + 5, "some cycles")
         self.hold(False)

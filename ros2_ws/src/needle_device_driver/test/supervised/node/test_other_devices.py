@@ -10,18 +10,22 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_core.errors import UserError
 from needle_core.ros.conversions import LATCHED, RELIABLE
 
-from .node_bench import Make
+from .node_bench import Make, Rig
+
+
+def publishers(rig: Rig) -> int:
+    return len(rig.driver.peers.publishers["device/joint_trajectory"])
 
 
 def test_a_second_publisher_of_commands_moves_nothing(make_rig: Make) -> None:
     rig = make_rig()
     rig.ready()
     second = rig.partner.create_publisher(JointTrajectory, "device/joint_trajectory", RELIABLE)
-    rig.until(lambda: rig.driver.count_publishers("device/joint_trajectory") == 2, "second")
+    rig.until(lambda: publishers(rig) == 2, "second")
     outcome = rig.send(rig.message()).frame_id
     assert "2 nodes publish commands" in outcome
     rig.partner.destroy_publisher(second)
-    rig.until(lambda: rig.driver.count_publishers("device/joint_trajectory") == 1, "one again")
+    rig.until(lambda: publishers(rig) == 1, "one again")
     assert rig.send(rig.message()).frame_id == "succeeded"
 
 
