@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from needle_core.can_frame import CAN
-from needle_core.ros.component_node import RealPort
+from needle_core.component import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.bus.pty_can import PtyCan
 from needle_sim.drive_emulator import ADAPTER, COMMAND_LINES, DriveEmulator

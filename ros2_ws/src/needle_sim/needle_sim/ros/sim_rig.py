@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Mapping
 
-from needle_core.ros.component_node import RealPort
+from needle_core.component import RealPort
 from needle_core.ros.main import run_component
 from needle_sim.sim_rig import SimRig
 from needle_sim.sim_rig_parameters import SimRigParameters
