@@ -308,6 +308,14 @@ class DeviceDriver(Component):
             self.waiting = f"waiting for the drives: {reply.message}"
             yield Log("info", self.waiting)
 
+    def fail(self, text: str, at: Moment) -> Actions:
+        """Stop both axes for a fault that whoever runs the component has found."""
+        return self._guarded(self._fail)(text, at)
+
+    def _fail(self, text: str, at: Moment) -> Actions:
+        self.supervisor.fail(text)
+        yield from self._device.report(at)
+
     def disable(self, at: Moment) -> Actions:
         """Stop and switch off, as `device/enable` false does."""
         return self._guarded(self._disable)(at)

@@ -215,7 +215,7 @@ class DeviceDriverNode(WholeLifecycleNode):
         assert self._clocks is not None
         too_many = one_too_many(self, self._clocks)
         if too_many:
-            self._component.supervisor.fail(too_many)
+            self._do(self._component.fail, too_many)
             return
         ros_ns = to_nanoseconds(message.clock)
         if ros_ns < 0:  # rclpy's own ear refuses it by name
@@ -251,9 +251,10 @@ class DeviceDriverNode(WholeLifecycleNode):
     def on_configure(self, _: LifecycleState) -> TransitionCallbackReturn:
         """Set both drives up; moves nothing."""
         component = self._component
+        # Once, whoever does it: afterwards the lifecycle is in somebody's hands.
+        searched, component.searches, self._was_configured = component.searches, False, True
+        self._wait_while(lambda: component.is_busy and not component.is_set_up)
         if not component.is_set_up:
-            component.searches = False
-            self._wait_while(lambda: component.is_busy)
             replies: list[str] = []
 
             def then(reply: Reply, at: Moment) -> Actions:
@@ -263,10 +264,9 @@ class DeviceDriverNode(WholeLifecycleNode):
             self._do(component.set_up, then)
             self._wait_while(lambda: not replies)
             if replies[0]:
+                component.searches, self._was_configured = searched, False
                 self.get_logger().error(f"not configured: {replies[0]}")
                 return TransitionCallbackReturn.FAILURE
-        # Once, whoever did it: afterwards the lifecycle is in somebody's hands.
-        self._was_configured = True
         return TransitionCallbackReturn.SUCCESS
 
     def on_activate(self, _: LifecycleState) -> TransitionCallbackReturn:
@@ -304,7 +304,7 @@ class DeviceDriverNode(WholeLifecycleNode):
 
     def fail(self, why: str) -> None:
         """Stop both axes: a callback ended half-way, and nobody knows what it left."""
-        self._component.supervisor.fail(f"internal error: {why}")
+        self._do(self._component.fail, f"internal error: {why}")
 
     def close(self) -> None:
         """Stop both axes, switch them off, let go of the bus."""
