@@ -282,7 +282,7 @@ class DeviceDriver(Component):
             return Reply(False, why_not)
         if self.supervisor.state is not State.UNCONFIGURED:
             # A fault from before; an emergency stop that is pressed stays.
-            reply = yield from self.supervisor.resetting(now)
+            reply = yield from self.supervisor.reset(now)
             if not reply.success:
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
@@ -294,7 +294,7 @@ class DeviceDriver(Component):
             )
         else:
             self._device.simulated = emulated and self._in_simulation
-            reply = yield from self.supervisor.configuring(now)
+            reply = yield from self.supervisor.configure(now)
         # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message
         return reply
@@ -335,7 +335,7 @@ class DeviceDriver(Component):
         yield from self._device.call_off("the driver ends", at)
         if self._cycle is not None:
             self._cycle[0].cancel()
-        self._cycle = Running(self.supervisor.deconfiguring()), at
+        self._cycle = Running(self.supervisor.deconfigure()), at
         yield from self._go_on(at)
 
     def _leave(self, at: Moment) -> Actions:

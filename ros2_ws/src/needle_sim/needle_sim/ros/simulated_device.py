@@ -13,6 +13,7 @@ from needle_core.errors import UserError
 from needle_core.ros.base_node import DiagnosticsPublisher
 from needle_core.ros.discovery import signature
 from needle_device_driver.device import COMMANDS, HOLD, DeviceRows
+from needle_device_driver.procedure import run_at_once
 from needle_device_driver.ros.device_interface import DeviceInterface
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.states import Activity
@@ -76,7 +77,7 @@ class SimulatedDevice:
             lock_step=in_lock_step,
             path_delay=path_delay,
         )
-        self._supervisor.configure(now)
+        run_at_once(self._supervisor.configure(now))
         self._rows = DeviceRows(self._supervisor, signature(node), simulated=True)
         self._interface = interface = DeviceInterface(
             node, self._rows, diagnostics, refuse=refuse, on_step_end=on_step_end
@@ -169,7 +170,7 @@ class SimulatedDevice:
 
     def close(self) -> None:
         """Stop the simulated axes and say so."""
-        self._supervisor.close()
+        run_at_once(self._supervisor.deconfigure())
         self._report()
         self._interface.close()
 
