@@ -157,8 +157,12 @@ class Console(Component):
     # ---- the page -------------------------------------------------------------------------------
 
     def _on_page(self, events: Sequence[PageEvent], at: Moment) -> Actions:
+        hands = [event for event in events if isinstance(event, Hand)]
         for event in events:
             match event:
+                case Hand(HoldState(pressed=True)) if event is not hands[-1]:
+                    # A press that had to wait is none of now; a release always counts.
+                    continue
                 case Hand():
                     yield from self._on_hand(event, at)
                 case Button():

@@ -56,6 +56,8 @@ class Process:
         Those that it knows.
     routes : dict of str to list
         Topic to those of them that receive it, each with its row and the link; made when needed.
+    batches : dict of str to list
+        Port to what waits there.
     latched : dict of str to object
         Topic to its last message, for those that come late.
     health : dict of str to Diagnostic
@@ -76,6 +78,7 @@ class Process:
         self.slowness = 0.0
         self.known: list[Process] = []
         self.routes: dict[str, list[tuple[Process, Input, Link]]] = {}
+        self.batches: dict[str, list[Any]] = {}
         self.latched: dict[str, Any] = {}
         self.health: dict[str, Diagnostic] = {}
         self._compute, self._timeline, self._carry_out = compute, timeline, carry_out
@@ -132,7 +135,7 @@ class Process:
 
     @property
     def _due(self) -> float:
-        """When the next event may be handled [s]."""
+        """Time at which the next event may be handled [s]."""
         return max(self._free_at, self._frozen_until)
 
     def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:

@@ -271,7 +271,11 @@ class VirtualRunner:
                     self._transport.send(link, batch, PORT_LATENCY, arrive)
 
     def _arrive(self, receiver: Process, row: Port, batch: tuple[Any, ...]) -> None:
-        receiver.offer(row.name, partial(row.handler, batch))
+        waiting = receiver.batches.setdefault(row.name, [])
+        waiting += batch
+        if len(waiting) == len(batch):
+            # What comes until it is handled goes with it.
+            receiver.offer(row.name, lambda at: row.handler(receiver.batches.pop(row.name), at))
 
     # ---- who knows whom -------------------------------------------------------------------------
 

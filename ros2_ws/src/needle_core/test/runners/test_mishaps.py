@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -164,3 +165,22 @@ def test_a_port_is_lost_and_opened_also_for_who_starts_meanwhile() -> None:
     runner.run(0.1)
     assert anew.arrived
     assert changes == ["unplugged", "unplugged", ""]
+
+
+def test_what_waits_at_a_port_is_one_batch() -> None:
+    batches: list[int] = []
+    one, other = Wired("one", sends=True), Wired("other")
+
+    def take(batch: Sequence[int], at: Moment) -> Actions:
+        batches.append(len(batch))
+        return other._take(batch, at)
+
+    other.ports = (Port("wire", take),)
+    runner = VirtualRunner([one, other])
+    runner.run(0.1)
+    assert max(batches) <= 6
+    runner.freeze("other", 0.1)
+    runner.run(0.2)
+    assert max(batches) > 100
+    numbers = [number for _, number in other.arrived]
+    assert numbers == list(range(1, len(numbers) + 1))
