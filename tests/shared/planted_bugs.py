@@ -163,7 +163,7 @@ def _reset_refused(patch: pytest.MonkeyPatch) -> None:
         yield from ()
         return Reply(False, "no")
 
-    patch.setattr(MotionSupervisor, "resetting", refuse)
+    patch.setattr(MotionSupervisor, "reset", refuse)
 
 
 def _law_turns_away(patch: pytest.MonkeyPatch) -> None:

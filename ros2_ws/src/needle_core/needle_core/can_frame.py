@@ -32,7 +32,7 @@ class CanFrame:
 
 @dataclasses.dataclass(frozen=True)
 class CanErrors:
-    """What a port has counted since the last batch and could not hand on.
+    """Count of what a port could not hand on since the last batch.
 
     Attributes
     ----------

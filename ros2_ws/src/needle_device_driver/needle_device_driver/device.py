@@ -126,9 +126,9 @@ class DeviceRows:
         )
         call = supervisor
         self.services: Sequence[Service] = (
-            self._trigger("home", lambda at: call.homing(at.steady)),
+            self._trigger("home", lambda at: call.home(at.steady)),
             self._trigger("retract", lambda at: call.retract(at.steady)),
-            self._trigger("reset", lambda at: call.resetting(at.steady)),
+            self._trigger("reset", lambda at: call.reset(at.steady)),
             self._trigger("stop", lambda at: call.stop(), always=True),
             self._switch("enable", lambda on, at: call.enable(on, at.steady)),
             self._switch("confirm_needle_out", lambda on, at: call.confirm_needle_out(on)),

@@ -201,7 +201,8 @@ class DeviceDriver(Component):
             yield from self.set_up(self._after_search, at)
 
     def _observe(self, at: Moment) -> Actions:
-        if self._drives.may_judge(at.steady):
+        # Where this is not a cycle's own look, a hold-up of this process looks like silent drives.
+        if not self._on_clock or self._drives.may_judge(at.steady):
             self.supervisor.observe(at.steady)
         yield from self._device.report(at)
 
@@ -255,13 +256,13 @@ class DeviceDriver(Component):
             return Reply(False, why_not)
         if self.supervisor.state is not State.UNCONFIGURED:
             # A fault from before; an emergency stop that is pressed stays.
-            reply = yield from self.supervisor.resetting(now)
+            reply = yield from self.supervisor.reset(now)
             if not reply.success:
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
         emulated = yield from are_emulated(self.link, nodes)
         self._device.simulated = emulated
-        reply = yield from self.supervisor.configuring(now)
+        reply = yield from self.supervisor.configure(now)
         # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message
         return reply
@@ -281,7 +282,7 @@ class DeviceDriver(Component):
         yield from self._device.call_off("the driver ends", at)
         if self._cycle is not None:
             self._cycle[0].cancel()
-        self._cycle = Running(self.supervisor.deconfiguring()), at
+        self._cycle = Running(self.supervisor.deconfigure()), at
         yield from self._go_on(at)
 
     def _leave(self, at: Moment) -> Actions:

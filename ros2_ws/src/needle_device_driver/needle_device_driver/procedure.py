@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, Generic, TypeVar
 
 T = TypeVar("T")
 _ROUNDING = 1e-9
@@ -32,13 +32,6 @@ class Wait:
 
 Procedure = Generator[Wait, float, T]
 """Sent the steady time at which it goes on [s]."""
-
-
-class Runner(Protocol):
-    """Runs a procedure to its end and returns what it returns."""
-
-    def __call__(self, procedure: Procedure[T]) -> T:
-        """Run one."""
 
 
 def run(

@@ -127,8 +127,9 @@ class WaitListExecutor(SingleThreadedExecutor):
         left_ns = timeout_ns
         yielded = False
         while not (yielded or self._is_shutdown or condition()):
-            # One that waits, such as for the answer to a service, goes on with what comes next.
-            yield from self._begun_tasks()
+            for begun in self._begun_tasks():
+                yielded = True
+                yield begun
             ready = self._wait(left_ns)
             if timeout_ns > 0:
                 left_ns = max(until_ns - time.monotonic_ns(), 0)

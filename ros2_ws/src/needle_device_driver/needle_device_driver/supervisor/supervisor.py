@@ -8,7 +8,7 @@ from needle_core.foreign_text import plain
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
-from needle_device_driver.procedure import Procedure, Runner, run_at_once
+from needle_device_driver.procedure import Procedure
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command
 from needle_device_driver.supervisor.command_desk import CommandDesk
@@ -43,8 +43,6 @@ class MotionSupervisor:
         How many cycles after its order a set-point shows in the axes' snapshots.
     switching : callable, optional
         Returns whether an axis is on its way to where it was ordered, apart from set-points.
-    run : Runner
-        Runs the axes' procedures for the verbs that wait; ideal axes have nothing to wait for.
     """
 
     def __init__(
@@ -57,10 +55,8 @@ class MotionSupervisor:
         path_delay: float = 0.0,
         feedback_delay: int = 0,
         switching: Callable[[], bool] = lambda: False,
-        run: Runner = run_at_once,
     ) -> None:
         self._switching = switching
-        self._run = run
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
         self._lock_step = lock_step
@@ -145,11 +141,7 @@ class MotionSupervisor:
 
     # ---- what comes from outside --------------------------------------------------------------
 
-    def configure(self, now: float) -> Reply:
-        """Do `configuring` at one go."""
-        return self._run(self.configuring(now))
-
-    def configuring(self, now: float) -> Procedure[Reply]:
+    def configure(self, now: float) -> Procedure[Reply]:
         """Set the axes up; moves nothing."""
         if self._core.state is not State.UNCONFIGURED:
             return self._not_in(State.UNCONFIGURED)
@@ -158,17 +150,7 @@ class MotionSupervisor:
         self.observe(now)
         return Reply(True, "configured")
 
-    def close(self) -> None:
-        """Stop whatever moves, switch the axes off and let go of them."""
-        if self._core.activity is not Activity.NONE:
-            self._core.end_motion("aborted: the device is shut down", stop=True)
-        self._run(self._axes.close())
-
-    def deconfigure(self) -> Reply:
-        """Do `deconfiguring` at one go."""
-        return self._run(self.deconfiguring())
-
-    def deconfiguring(self) -> Procedure[Reply]:
+    def deconfigure(self) -> Procedure[Reply]:
         """Stop, switch the axes off and let go of them; a fault or emergency stop stays."""
         if self._core.state in (State.HOLDING, State.MOVING):
             self._disable()
@@ -266,11 +248,7 @@ class MotionSupervisor:
         self._needle_out = confirmed
         return Reply(True, "needle out" if confirmed else "needle not out")
 
-    def home(self, now: float) -> Reply:
-        """Do `homing` at one go."""
-        return self._run(self.homing(now))
-
-    def homing(self, now: float) -> Procedure[Reply]:
+    def home(self, now: float) -> Procedure[Reply]:
         """Begin to look for both home switches; only with the needle out."""
         if self._core.state is not State.DISABLED:
             return self._not_in(State.DISABLED)
@@ -314,11 +292,7 @@ class MotionSupervisor:
         self._core.abort("stopped on request")
         return Reply(True, f"{activity} stopped")
 
-    def reset(self, now: float) -> Reply:
-        """Do `resetting` at one go."""
-        return self._run(self.resetting(now))
-
-    def resetting(self, now: float) -> Procedure[Reply]:  # noqa: PLR0911 - each return is a reason
+    def reset(self, now: float) -> Procedure[Reply]:  # noqa: PLR0911 - each return is a reason
         """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
         if self._core.state is State.MOVING:
             return Reply(False, f"a {self._core.activity.value} is under way")

@@ -40,7 +40,7 @@ def recovers(bench: DriveBench) -> None:
     """Check that reset moves nothing and that a new command moves again, and only that."""
     at = bench.positions
     bench.hold(False)
-    reply = bench.supervisor.reset(bench.clock())
+    reply = bench.run(bench.supervisor.reset(bench.clock()))
     assert reply.success, reply.message
     bench.cycle(10)
     assert in_state(bench, State.DISABLED)

@@ -89,7 +89,6 @@ class DriveBench:
             self.settings.limits,
             feedback_delay=1,
             switching=lambda: self.drives.needs_cycles,
-            run=self.run,
         )
         self.ros_ns = 1_000_000_000
         self.stamps = itertools.count(1)
@@ -159,13 +158,13 @@ class DriveBench:
         return drive.objects[index, subindex]
 
     def configured(self) -> None:
-        assert self.supervisor.configure(self.clock()).success
+        assert self.run(self.supervisor.configure(self.clock())).success
         self.cycle(2)
 
     def homed(self) -> None:
         self.configured()
         self.supervisor.confirm_needle_out(True)
-        assert self.supervisor.home(self.clock()).success
+        assert self.run(self.supervisor.home(self.clock())).success
         self.cycle(30)
         assert self.status.homed
         assert self.state is State.DISABLED
@@ -205,5 +204,5 @@ class DriveBench:
 
     def close(self) -> None:
         with contextlib.suppress(AxisError):
-            self.supervisor.close()
+            self.run(self.supervisor.deconfigure())
         self.link.close()

@@ -6,7 +6,7 @@ import itertools
 import math
 
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
-from needle_device_driver.procedure import Procedure
+from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command, CommandPoint
 from needle_device_driver.supervisor.hold import HoldMessage
@@ -107,6 +107,7 @@ class Bench:
     """Drives a supervisor cycle by cycle and remembers what it tells."""
 
     period = PERIOD
+    run = staticmethod(run_at_once)
 
     def __init__(
         self, *, lock_step: bool = False, path_delay: float = 0.0, **limits: float
@@ -183,9 +184,9 @@ class Bench:
             self.supervisor.observe(self.now)
 
     def home(self) -> None:
-        self.supervisor.configure(self.now)
+        self.run(self.supervisor.configure(self.now))
         self.supervisor.confirm_needle_out(True)
-        assert self.supervisor.home(self.now).success
+        assert self.run(self.supervisor.home(self.now)).success
 
     def ready(self, *, holding: bool = True) -> None:
         self.home()

@@ -51,7 +51,7 @@ def test_enable_and_home_wait_until_the_axes_are_off(drive_bench: DriveBench) ->
     bench.supervisor.confirm_needle_out(True)
     for reply in (
         bench.supervisor.enable(True, bench.clock()),
-        bench.supervisor.home(bench.clock()),
+        bench.run(bench.supervisor.home(bench.clock())),
     ):
         assert not reply.success
         assert reply.message.startswith("waiting for")
@@ -83,7 +83,7 @@ def test_a_homing_from_before_does_not_count(drive_bench: DriveBench) -> None:
     bench.insertion.stale_homing = True
     bench.insertion.more_status = 0x1400
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.cycle(30)
     assert not bool(bench.status.homed)
     bench.insertion.stale_homing = False
@@ -101,7 +101,7 @@ def test_a_homing_where_it_stands_ends_on_a_drive_that_never_takes_its_end_back(
     bench.rotation.stale_homing = True
     bench.rotation.home_after = 0
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
     bench.cycle(30)
     assert bench.status.homed
 
@@ -111,7 +111,7 @@ def test_a_homing_that_fails_is_a_fault(drive_bench: DriveBench) -> None:
     bench.configured()
     bench.insertion.home_after = 1000
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
     bench.cycle(6)
     bench.insertion.more_status = 0x2000
     bench.cycle(1)
@@ -125,7 +125,7 @@ def test_a_homing_can_be_stopped_and_leaves_the_axis_un_homed(drive_bench: Drive
     bench.configured()
     bench.insertion.home_after = 1000
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
     bench.cycle(6)
     bench.supervisor.stop()
     assert bench.insertion.state == "quick stop"
@@ -160,7 +160,7 @@ def test_a_drive_that_lacks_what_is_needed_is_refused(
 ) -> None:
     drive_bench.rotation.objects |= change
     drive_bench.rotation.modes = {6}
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert not reply.success
     assert text in reply.message
     assert "rotation axis" in reply.message
@@ -173,7 +173,7 @@ def test_an_axis_whose_neighbour_is_refused_does_not_wait_for_the_computer(
 ) -> None:
     bench = drive_bench
     bench.rotation.missing_objects = {0x1016}
-    assert not bench.supervisor.configure(bench.clock()).success
+    assert not bench.run(bench.supervisor.configure(bench.clock())).success
     assert bench.written(1, 0x1016, 1) == bytes(4), "its watchdog is released"
     bench.supervisor.observe(bench.clock())
     assert "node 2 refuses" in bench.status.fault
@@ -181,7 +181,7 @@ def test_an_axis_whose_neighbour_is_refused_does_not_wait_for_the_computer(
 
 def test_objects_that_a_drive_may_lack_are_left_out(drive_bench: DriveBench) -> None:
     drive_bench.insertion.missing_objects = {0x1006, 0x1029, 0x6007, 0x60C2}
-    assert drive_bench.supervisor.configure(drive_bench.clock()).success
+    assert drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock())).success
     assert [text.partition(":")[0] for text in drive_bench.drives.missing_optional_objects] == [
         "insertion drive has no 0x6007",
         "insertion drive has no 0x60C2",
@@ -203,7 +203,7 @@ def test_a_drive_without_digital_inputs_has_no_switch_to_show(drive_bench: Drive
 
 def test_an_object_that_a_rule_needs_may_not_be_missing(drive_bench: DriveBench) -> None:
     drive_bench.insertion.missing_objects = {0x1016}
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert "refuses to write 0 to 0x1016:1 consumer heartbeat time" in reply.message
 
 

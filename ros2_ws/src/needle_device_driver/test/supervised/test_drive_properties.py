@@ -26,7 +26,7 @@ def step(bench: DriveBench) -> None:
 
 def home(bench: DriveBench) -> None:
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
 
 
 def reboot(bench: DriveBench) -> None:
@@ -54,7 +54,7 @@ EVENTS: dict[str, Callable[[DriveBench], object]] = {
     "estop off": lambda bench: bench.supervisor.receive_estop(False),
     "step": step,
     "retract": retract,
-    "reset": lambda bench: bench.supervisor.reset(bench.clock()),
+    "reset": lambda bench: bench.run(bench.supervisor.reset(bench.clock())),
     "home": home,
     "reboot": reboot,
     "fail": fail,

@@ -34,7 +34,7 @@ def holds(drive: ScriptedDrive, index: int, sub: int = 0) -> int:
 
 
 def refusal(bench: DriveBench) -> str:
-    reply = bench.supervisor.configure(bench.clock())
+    reply = bench.run(bench.supervisor.configure(bench.clock()))
     assert not reply.success
     assert not any(data[:1] == b"\x0f" for cob, data in bench.bus.sent if cob in (0x201, 0x202))
     return str(reply.message)
@@ -122,7 +122,7 @@ def test_a_ramp_that_is_read_back_is_compared_in_the_unit_of_the_drive(
     drive = drive_bench.insertion
     tells(drive, {0x60A9: RPM, 0x60AA: RPM_S}, TURN)
     drive.stores = lambda index, value: has.to_bytes(4, "little") if index == 0x6085 else value
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert reply.success is taken
     assert taken or "took 30000 for 0x6085:0 quick stop deceleration" in reply.message
 
@@ -274,7 +274,7 @@ def test_a_homing_that_is_slower_than_the_unit_of_the_drive_is_refused(
     tells(bench.insertion, {0x60A9: RPM, 0x60AA: RPM_S}, TURN)
     bench.configured()
     bench.supervisor.confirm_needle_out(True)
-    reply = bench.supervisor.home(bench.clock())
+    reply = bench.run(bench.supervisor.home(bench.clock()))
     assert not reply.success
     assert "homing at 1e-05/s is less than one of the drive's units of speed" in reply.message
     assert in_state(bench, State.FAULT)
@@ -304,7 +304,7 @@ def test_a_drive_that_started_anew_is_asked_anew(drive_bench: DriveBench) -> Non
     bench.bus.flush()
     bench.cycle(2)
     assert in_state(bench, State.FAULT)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert holds(drive, 0x6085) == 60_000
 
 
@@ -346,7 +346,7 @@ def test_a_mode_display_may_take_its_time(drive_bench: DriveBench) -> None:
         sdo(data)
 
     drive.sdo = slowly  # type: ignore[method-assign]
-    assert drive_bench.supervisor.configure(drive_bench.clock()).success
+    assert drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock())).success
     assert len(asked) >= 41
 
 

@@ -40,7 +40,7 @@ def test_a_setting_that_a_rule_needs_is_not_left_to_a_drive(
     drive_bench: DriveBench, index: int
 ) -> None:
     drive_bench.insertion.refuses = refuse(RANGE, index)
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert not reply.success
     assert f"0x{index:04X}" in reply.message
     assert "insertion axis: node 1 refuses to write" in reply.message
@@ -52,7 +52,7 @@ def test_a_heartbeat_that_is_fixed_may_be_slower(
 ) -> None:
     drive_bench.insertion.objects[0x1017, 0] = fixed.to_bytes(2, "little")
     drive_bench.insertion.refuses = refuse(READ_ONLY, 0x1017)
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert reply.success is taken
     assert taken or "node 1 refuses to write 30 to 0x1017:0" in reply.message
 
@@ -72,7 +72,7 @@ def test_a_drive_that_lists_no_modes_is_told_each(
     if lacks is None:
         steps(drive_bench)
         return
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert f"node 1 refuses to write {lacks} to 0x6060:0 mode of operation" in reply.message
     assert "(docs/hardware.md says what for)" in reply.message
 
@@ -90,7 +90,7 @@ def test_software_limits_that_cannot_be_written_refuse_the_drive_before_it_moves
     # What an un-homed drive shall have, by chance.
     drive.objects |= {(0x607D, 1): b"\0\0\0\x80", (0x607D, 2): b"\xff\xff\xff\x7f"}
     drive.refuses = refuse(READ_ONLY, 0x607D)
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert "refuses to write -2147483648 to 0x607D:1" in reply.message
 
 
@@ -136,7 +136,7 @@ def test_what_a_drive_makes_of_a_setting_is_read_back_where_a_rule_needs_it(
         if at == index and value == wanted.to_bytes(len(value), "little")
         else value
     )
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert reply.success is taken
     assert taken or f"took {wanted} for 0x{index:04X}" in reply.message
     assert taken or reply.message.endswith(f"and has {has}")
@@ -172,12 +172,12 @@ def test_software_limits_that_a_homed_drive_does_not_take_keep_it_from_being_swi
     bench = drive_bench
     bench.configured()
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.insertion.refuses = refuse(RANGE, 0x607D)
     bench.cycle(30)
     assert in_state(bench, State.FAULT)
     assert "refuses to write -20000 to 0x607D:1" in bench.status.fault
-    bench.supervisor.reset(bench.clock())
+    bench.run(bench.supervisor.reset(bench.clock()))
     assert not bench.supervisor.enable(True, bench.clock()).success
     with pytest.raises(AxisError, match="insertion axis has no software limits yet"):
         bench.axes[0].power(True)
@@ -192,7 +192,7 @@ def test_between_homing_and_its_software_limits_nothing_is_switched_on(
     bench = drive_bench
     bench.configured()
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     for _ in range(30):
         bench.cycle(1)
         # Whoever is in a hurry is asked to call again, and breaks nothing.
@@ -220,7 +220,7 @@ def test_software_limits_are_taken_from_slow_drives_with_few_heartbeats(
 
         drive.sdo, drive.say = slowly, say  # type: ignore[method-assign]
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.cycle(30)
     assert in_state(bench, State.DISABLED), bench.status.fault
     assert bench.status.homed
@@ -252,7 +252,7 @@ def test_a_node_without_heartbeat_is_told_from_one_that_does_not_start(
         take(cob_id, data)
 
     bench.rotation.take = impatient  # type: ignore[method-assign]
-    reply = bench.supervisor.configure(bench.clock())
+    reply = bench.run(bench.supervisor.configure(bench.clock()))
     assert "rotation axis: node 2 sends no heartbeat (0x1017)" in reply.message
     assert "insertion axis" not in reply.message
 
@@ -274,7 +274,7 @@ def test_a_powered_drive_is_off_before_it_is_set_up(drive_bench: DriveBench) -> 
     drive.refuses = lambda index, sub, value: (
         OTHER_STATE if index != 0x6040 and index >= 0x6000 and drive.state == "enabled" else 0
     )
-    assert drive_bench.supervisor.configure(drive_bench.clock()).success
+    assert drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock())).success
     assert asked[:6] == ["enabled"] * 5 + ["disabled"]
 
 
@@ -305,7 +305,7 @@ def test_a_fault_that_stays_in_a_drive_without_error_code_is_told_all_the_same(
         sdo(data)
 
     drive.sdo = late  # type: ignore[method-assign]
-    reply = bench.supervisor.reset(bench.clock())
+    reply = bench.run(bench.supervisor.reset(bench.clock()))
     assert reply.message == "insertion axis: the drive does not leave its fault"
 
 
@@ -316,7 +316,7 @@ def test_a_drive_that_does_not_say_that_it_is_off_keeps_its_watchdog(
     bench.moving()
     sync = bench.insertion.sync
     bench.insertion.sync = lambda: None  # type: ignore[method-assign]
-    reply = bench.supervisor.deconfigure()
+    reply = bench.run(bench.supervisor.deconfigure())
     bench.insertion.sync = sync  # type: ignore[method-assign]
     assert not reply.success
     assert "insertion axis: does not say that it is off" in bench.notices[-1].text
@@ -331,7 +331,7 @@ def test_a_homing_method_that_a_drive_lacks_is_known_before_anything_moves(
     drive_bench: DriveBench,
 ) -> None:
     drive_bench.insertion.refuses = refuse(RANGE, 0x6098)
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert "refuses to write 17 to 0x6098:0 homing method" in reply.message
 
 
@@ -340,12 +340,12 @@ def test_a_drive_that_is_refused_leaves_the_other_one_without_watchdog(
 ) -> None:
     bench = drive_bench
     bench.insertion.refuses = refuse(RANGE, 0x6098)
-    assert not bench.supervisor.configure(bench.clock()).success
+    assert not bench.run(bench.supervisor.configure(bench.clock())).success
     assert bench.rotation.nmt == 0x05
     assert bench.written(2, 0x1016, 1) == bytes(4)
     # And may be configured once the first is mended.
     bench.insertion.refuses = refuse(RANGE)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     steps(bench)
 
 
@@ -366,7 +366,7 @@ def test_a_homing_ends_by_its_second_bit_where_the_first_stays_for_good(
     drive.position, drive.home_after, drive.stale_homing = 3000, 20, True
     drive.more_status = 0x1400
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.cycle(4)
     for _ in range(15):
         # Under way: attained once, not at the target.

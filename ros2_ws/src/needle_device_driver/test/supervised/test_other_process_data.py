@@ -66,7 +66,7 @@ def test_a_drive_that_answers_no_sync_is_refused(drive_bench: DriveBench) -> Non
     drive_bench.insertion.refuses = lambda index, sub, value: (
         RANGE if 0x1800 <= index < 0x1900 and sub == 2 and value == b"\x01" else 0
     )
-    reply = drive_bench.supervisor.configure(drive_bench.clock())
+    reply = drive_bench.run(drive_bench.supervisor.configure(drive_bench.clock()))
     assert "node 1 refuses to write 1 to 0x1800:2 transmission type" in reply.message
 
 

@@ -65,10 +65,10 @@ _others = st.sampled_from(
         _named("enable", lambda bench: bench.supervisor.enable(True, bench.now)),
         _named("disable", lambda bench: bench.supervisor.enable(False, bench.now)),
         _named("confirm", lambda bench: bench.supervisor.confirm_needle_out(True)),
-        _named("home", lambda bench: bench.supervisor.home(bench.now)),
+        _named("home", lambda bench: bench.run(bench.supervisor.home(bench.now))),
         _named("retract", lambda bench: bench.supervisor.retract(bench.now)),
         _named("stop", lambda bench: bench.supervisor.stop()),
-        _named("reset", lambda bench: bench.supervisor.reset(bench.now)),
+        _named("reset", lambda bench: bench.run(bench.supervisor.reset(bench.now))),
         _named("estop", lambda bench: bench.supervisor.receive_estop(True)),
         _named("estop off", lambda bench: bench.supervisor.receive_estop(False)),
         _named("fault", _fault),
@@ -147,7 +147,7 @@ def test_never_without_hold_never_beyond_limits_from_the_start(
     make_bench: type[Bench], events: list[Event], pause: bool
 ) -> None:
     bench = make_bench(lock_step=pause, **_LIMITS)
-    bench.supervisor.configure(bench.now)
+    bench.run(bench.supervisor.configure(bench.now))
     _run(bench, events)
 
 

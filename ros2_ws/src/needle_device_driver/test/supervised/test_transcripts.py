@@ -18,7 +18,7 @@ HEARTBEAT = 0x77F
 
 
 def set_up(bench: DriveBench) -> int:
-    bench.supervisor.configure(bench.clock())
+    bench.run(bench.supervisor.configure(bench.clock()))
     return 0
 
 
@@ -26,7 +26,7 @@ def home(bench: DriveBench) -> int:
     bench.configured()
     start = len(bench.bus.sent)
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
     bench.cycle(16)
     return start
 
@@ -60,7 +60,7 @@ def fault_and_reset(bench: DriveBench) -> int:
     bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     bench.cycle(3)
     return start
 

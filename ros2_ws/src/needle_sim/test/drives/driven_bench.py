@@ -85,7 +85,6 @@ class DrivenBench:
             settings.limits,
             feedback_delay=1,
             switching=lambda: self.cycles.needs_cycles,
-            run=self.run,
         )
         self.ros_ns = 1_000_000_000
         self.due = self.now
@@ -143,12 +142,12 @@ class DrivenBench:
 
     def home(self, most: int = 20_000) -> None:
         """Configure and home; return when that has ended, however."""
-        reply = self.supervisor.configure(self.now)
+        reply = self.run(self.supervisor.configure(self.now))
         assert reply.success, reply.message
         self.due = self.now
         self.cycle(2)
         self.supervisor.confirm_needle_out(True)
-        reply = self.supervisor.home(self.now)
+        reply = self.run(self.supervisor.home(self.now))
         assert reply.success, reply.message
         for _ in range(most):
             self.cycle(1)
@@ -189,6 +188,6 @@ class DrivenBench:
 
     def close(self) -> None:
         with contextlib.suppress(AxisError):
-            self.supervisor.close()
+            self.run(self.supervisor.deconfigure())
         assert self.link is not None
         self.link.close()

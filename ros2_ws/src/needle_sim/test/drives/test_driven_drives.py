@@ -61,7 +61,7 @@ def test_drives_that_take_speeds_in_rpm_and_do_not_say_so_are_stopped_within_8_m
     at = bench.insertion_mm
     bench.cycle(60)
     assert bench.insertion_mm == at
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
 
 
 def test_an_axis_of_10_mm_whose_switch_never_comes_runs_12_mm(make: Make) -> None:

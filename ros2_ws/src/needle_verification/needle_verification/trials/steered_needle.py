@@ -26,6 +26,7 @@ from needle_controller.protocol.steering_types import (
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
 from needle_core.status_messages import DeviceStatus
+from needle_device_driver.procedure import run_at_once
 from needle_device_driver.supervisor.command import (
     Command,
     CommandPoint,
@@ -173,9 +174,9 @@ class SteeredNeedle:
         now = self.time_ns * 1e-9
         self.device.note_time(0, now)
         self.device.note_time(self.time_ns, now)
-        self.device.configure(now)
+        run_at_once(self.device.configure(now))
         self.device.confirm_needle_out(True)
-        assert self.device.home(now).success
+        assert run_at_once(self.device.home(now)).success
         self.device.observe(now)
         assert self.device.enable(True, now).success
         self.device.receive_hold(HoldMessage("person", 0, False, 0.0), now)

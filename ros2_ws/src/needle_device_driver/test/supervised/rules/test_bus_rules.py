@@ -48,7 +48,7 @@ def test_link_loss_is_named_and_reset_opens_the_link_anew(drive_bench: DriveBenc
     bench.insertion.state = bench.rotation.state = "fault"
     bench.hold(False)
     bench.no_adapter = True
-    reply = bench.supervisor.reset(bench.clock())
+    reply = bench.run(bench.supervisor.reset(bench.clock()))
     assert not reply.success
     assert "cannot open" in reply.message
     assert in_state(bench, State.FAULT)
@@ -72,7 +72,7 @@ def test_link_loss_while_nothing_is_sent_is_noticed_too(drive_bench: DriveBench)
 def test_link_loss_before_the_start_refuses_the_configuration(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.no_adapter = True
-    assert "cannot open" in bench.supervisor.configure(bench.clock()).message
+    assert "cannot open" in bench.run(bench.supervisor.configure(bench.clock())).message
     with pytest.raises(LinkError, match="not open"):
         bench.link.send(0x80)
 
@@ -87,7 +87,7 @@ def test_reply_age_a_cut_bus_reports_nothing_and_is_found(drive_bench: DriveBenc
     bench.cycle(1, holding=True)
     failed(bench, Rule.REPLY_AGE, "no reply from an axis")
     assert bench.supervisor.joints(bench.clock()) is None
-    assert not bench.supervisor.reset(bench.clock()).success
+    assert not bench.run(bench.supervisor.reset(bench.clock())).success
     bench.bus.cut = False
     bench.insertion.state = bench.rotation.state = "fault"
     recovers(bench)
@@ -245,7 +245,7 @@ def test_drive_reboot_is_a_fault_and_unhomes(drive_bench: DriveBench) -> None:
     failed(bench, Rule.DRIVE_REBOOT, "home position is lost")
     assert not bench.status.homed
     bench.hold(False)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert bench.insertion.nmt == 0x05
     assert bench.written(INSERTION, 0x1016, 1) == (127 << 16 | 100).to_bytes(4, "little")
     # No software limits before it is homed again.
@@ -276,7 +276,7 @@ def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same(
     bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
     assert not bench.status.homed
 
@@ -302,7 +302,7 @@ def test_drive_reboot_during_the_set_up_of_a_reset_is_not_forgotten(
     bench.bus.flush()
     bench.cycle(1)
     assert in_state(bench, State.FAULT)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert not bench.status.homed
 
 
@@ -326,10 +326,10 @@ def test_drive_reboot_within_its_set_up_voids_it(
     bench.cycle(1)
     assert in_state(bench, State.FAULT)
     # What it was told before it started anew is gone: only a whole set-up counts.
-    refused = bench.supervisor.reset(bench.clock())
+    refused = bench.run(bench.supervisor.reset(bench.clock()))
     assert not refused.success
     assert "started anew while it was set up" in refused.message
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     bench.cycle(5)
     assert in_state(bench, State.DISABLED)
 
@@ -346,7 +346,7 @@ def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
         bench.bus.flush()
         bench.cycle(1)
         bench.hold(False)
-        assert bench.supervisor.reset(bench.clock()).success
+        assert bench.run(bench.supervisor.reset(bench.clock())).success
         bench.cycle(5)
         assert bench.supervisor.enable(True, bench.clock()).success
         bench.cycle(12)

@@ -145,7 +145,7 @@ def test_command_newer_a_reset_keeps_no_stamp_out_that_would_have_counted(bench:
     bench.ready()
     bench.command()
     bench.cycle(25, holding=True)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(False)
     bench.hold()
     bench.command(stamp_ns=bench.ros_ns - 40_000_000)
@@ -212,7 +212,7 @@ def test_tip_age_tells_how_far_a_clock_is_ahead(bench: Bench) -> None:
 
 
 def test_homed_first(bench: Bench) -> None:
-    bench.supervisor.configure(bench.now)
+    bench.run(bench.supervisor.configure(bench.now))
     bench.supervisor.enable(True, bench.now)
     bench.hold()
     bench.command()

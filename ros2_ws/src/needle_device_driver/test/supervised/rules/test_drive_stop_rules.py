@@ -78,7 +78,7 @@ def test_quick_stop_option_that_a_drive_does_not_take_refuses_the_drive(
         bench.insertion.objects[0x605A, 0] = b"\x02\x00"
 
     bench.insertion.sdo = ignoring  # type: ignore[method-assign]
-    reply = bench.supervisor.configure(bench.clock())
+    reply = bench.run(bench.supervisor.configure(bench.clock()))
     assert not reply.success
     assert "took 6 for 0x605A:0 quick stop option and has 2" in reply.message
 
@@ -99,7 +99,7 @@ def test_drive_watchdog_that_a_drive_does_not_keep_refuses_the_drive(
 ) -> None:
     bench = drive_bench
     bench.insertion.stores = lambda index, value: bytes(4) if index == 0x1016 else value
-    reply = bench.supervisor.configure(bench.clock())
+    reply = bench.run(bench.supervisor.configure(bench.clock()))
     assert not reply.success
     assert "0x1016:1 consumer heartbeat time and has 0" in reply.message
 
@@ -130,12 +130,12 @@ def test_drive_watchdog_that_tripped_before_the_start_is_told_at_the_start(
     bench = drive_bench
     bench.insertion.fail(0x8130)
     bench.insertion.out.clear()
-    bench.supervisor.configure(bench.clock())
+    bench.run(bench.supervisor.configure(bench.clock()))
     assert in_state(bench, State.FAULT)
     assert bench.notices[-1].rule is Rule.DRIVE_WATCHDOG
     assert "insertion axis: the drive reports 0x8130" in bench.status.fault
     assert bench.insertion.state == "fault"
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     bench.cycle(3)
     assert in_state(bench, State.DISABLED)
 
@@ -178,13 +178,13 @@ def test_drive_emergency_that_stays_keeps_the_device_in_fault(drive_bench: Drive
         took(data)
 
     bench.insertion.sdo = late  # type: ignore[method-assign]
-    reply = bench.supervisor.reset(bench.clock())
+    reply = bench.run(bench.supervisor.reset(bench.clock()))
     assert not reply.success
     assert "0x7121 motor blocked" in reply.message
     assert in_state(bench, State.FAULT)
     # The edge counts: the order before was one to reset, too.
     bench.insertion.deaf_to_reset = False
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
 
 
 def test_drive_emergency_a_drive_in_fault_takes_no_order_to_move(drive_bench: DriveBench) -> None:
@@ -234,7 +234,7 @@ def test_inner_limit_switch_stops_both_axes_at_once_and_leaves_the_way_out(
     assert turned <= 0.0081
     bench.insertion.blocked = False
     bench.hold(False)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert bench.supervisor.enable(True, bench.clock()).success
     bench.cycle(12)
     bench.hold(False)

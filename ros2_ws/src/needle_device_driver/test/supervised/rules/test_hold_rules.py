@@ -72,10 +72,10 @@ def test_hold_age_one_that_fell_silent_pressed_keeps_no_reset_out(bench: Bench) 
     bench.ready()
     bench.supervisor.fail("test")
     bench.hold()
-    assert not bench.supervisor.reset(bench.now).success
+    assert not bench.run(bench.supervisor.reset(bench.now)).success
     bench.now += 0.3
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
 
 
 def test_hold_age_a_message_counts_for_a_quarter_of_a_second(bench: Bench) -> None:
@@ -143,7 +143,7 @@ def test_hold_new_press_one_from_before_does_not_count(bench: Bench, press_befor
         bench.hold()
         assert bench.status.hold_owner == "a"
         if press_before == "reset":
-            bench.supervisor.reset(bench.now)
+            bench.run(bench.supervisor.reset(bench.now))
         else:
             bench.supervisor.stop()
     bench.cycle(5, holding=True)
@@ -267,7 +267,7 @@ def test_no_motion_by_itself_on_configure_enable_reset(bench: Bench) -> None:
     assert in_state(bench, State.FAULT)
     bench.insertion.orders.clear()
     bench.hold(False)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     assert bench.supervisor.enable(True, bench.now).success
     bench.cycle(5)
     bench.cycle(20, holding=True)

@@ -145,8 +145,8 @@ def test_unhomed_outward_only_ends_at_the_switch(bench: Bench) -> None:
 
 
 def test_homing_needle_out_must_be_confirmed_and_a_step_ends_that(bench: Bench) -> None:
-    bench.supervisor.configure(bench.now)
-    assert "confirm" in bench.supervisor.home(bench.now).message
+    bench.run(bench.supervisor.configure(bench.now))
+    assert "confirm" in bench.run(bench.supervisor.home(bench.now)).message
     inserted(bench, steps=0)
     assert bool(bench.status.needle_out_confirmed)
     bench.cycle(1, holding=True)
@@ -154,7 +154,7 @@ def test_homing_needle_out_must_be_confirmed_and_a_step_ends_that(bench: Bench) 
     bench.cycle(25, holding=True)
     assert not bench.status.needle_out_confirmed
     bench.supervisor.enable(False, bench.now)
-    assert not bench.supervisor.home(bench.now).success
+    assert not bench.run(bench.supervisor.home(bench.now)).success
 
 
 def test_homing_needle_out_only_when_disabled_and_can_be_stopped(bench: Bench) -> None:
@@ -169,13 +169,13 @@ def test_homing_needle_out_only_when_disabled_and_can_be_stopped(bench: Bench) -
     assert bench.positions == at
     assert in_state(bench, State.DISABLED)
     assert not bench.insertion.powered
-    assert bench.supervisor.home(bench.now).success
+    assert bench.run(bench.supervisor.home(bench.now)).success
     bench.cycle(500)
     assert bench.positions == (0.0, 0.0)
     assert bench.status.homed
     assert in_state(bench, State.DISABLED)
     bench.supervisor.enable(True, bench.now)
-    assert not bench.supervisor.home(bench.now).success
+    assert not bench.run(bench.supervisor.home(bench.now)).success
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_hold_stamp_increases_reset_lets_in_one_that_was_ahead(
     assert not has_hold(bench, "a")
     bench.now += silence
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     hand.send(True, 5)
     assert not has_hold(bench, "a"), "pressed since before the reset"
     hand.send(False, 3)
@@ -86,7 +86,7 @@ def test_hold_stamp_increases_reset_lets_in_one_that_was_ahead(
 
 def test_hold_stamp_increases_reset_puts_the_way_out_in_reach(bench: Bench, hand: Hand) -> None:
     bench.insertion.position = 0.001
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     hand.send(False)
     hand.send(True)
     bench.supervisor.observe(bench.now)
@@ -103,7 +103,7 @@ def test_hold_stamp_increases_nothing_from_before_a_reset_counts_again(
 ) -> None:
     bench.now += silence
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     before = list(hand.sent)
     for message in before:
         hand.repeat([message])
@@ -131,7 +131,7 @@ def test_hold_stamp_increases_a_press_that_was_on_its_way_at_a_reset(
     hand.send(False)
     bench.now += silence
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(stamp_ns=late)
     assert not has_hold(bench, "a")
 
@@ -152,7 +152,7 @@ def test_hold_new_press_one_that_was_silent_over_a_reset(bench: Bench) -> None:
     bench.ready()
     bench.now += 1.0
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold()
     assert not has_hold(bench, "a"), "pressed since before the reset"
     bench.hold(False)
@@ -168,7 +168,7 @@ def test_hold_stamp_increases_what_counts_is_the_highest_stamp_before_a_reset(
     bench.hold(False, sender="b", stamp_ns=10)
     bench.now += 1.0
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(stamp_ns=500)
     assert not has_hold(bench, "a")
 
@@ -176,7 +176,7 @@ def test_hold_stamp_increases_what_counts_is_the_highest_stamp_before_a_reset(
 def test_hold_stamp_increases_a_late_release_after_a_reset_keeps_no_press_out(
     bench: Bench, hand: Hand
 ) -> None:
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     for behind_ns in (0, 40 * MS):
         hand.ahead_ns = -behind_ns
         hand.send(False)
@@ -188,7 +188,7 @@ def test_hold_stamp_increases_a_late_release_after_a_reset_keeps_no_press_out(
 def test_hold_stamp_increases_a_release_from_after_a_reset_lets_any_press_count(
     bench: Bench, hand: Hand
 ) -> None:
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     hand.send(False)
     hand.ahead_ns = 2 * FAR_AHEAD
     hand.send(False)
@@ -206,7 +206,7 @@ def test_hold_one_owner_reset_forgets_who_is_silent(bench: Bench) -> None:
     assert "device/reset" in bench.status.reason
     bench.now += 1.0
     bench.supervisor.observe(bench.now)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(False, sender="late")
     bench.hold(sender="late")
     assert has_hold(bench, "late")
@@ -216,7 +216,7 @@ def test_hold_one_owner_reset_forgets_nobody_who_is_heard(bench: Bench) -> None:
     bench.ready(holding=False)
     for number in range(MAX_SENDERS):
         bench.hold(False, sender=str(number))
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(False, sender="late")
     bench.hold(sender="late")
     assert not has_hold(bench, "late")
@@ -226,7 +226,7 @@ def test_a_reset_is_refused_while_something_moves_and_forgets_nothing(bench: Ben
     bench.ready()
     bench.command()
     bench.cycle(3, holding=True)
-    assert "under way" in bench.supervisor.reset(bench.now).message
+    assert "under way" in bench.run(bench.supervisor.reset(bench.now)).message
     assert has_hold(bench, "a")
     bench.cycle(22, holding=True)
     assert bench.results[-1].outcome == "succeeded"
@@ -240,7 +240,7 @@ def test_hold_stamp_increases_a_press_after_a_reset_was_as_long_on_its_way(
     hand = Hand(bench)
     hand.ahead_ns = FAR_AHEAD
     hand.send(False)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     hand.ahead_ns = 0
     hand.send(False)
     hand.ahead_ns = sooner_ns
@@ -289,7 +289,7 @@ def test_command_newer_reset_lets_commands_in_after_time_went_back(
     bench.command()
     assert bench.last_rule is Rule.COMMAND_NEWER
     assert "device/reset" in bench.results[-1].outcome
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.cycle(1, holding=True)
     bench.hold(False)
     bench.hold()
@@ -305,7 +305,7 @@ def test_command_newer_no_stamp_is_used_twice_though_time_went_back(bench: Bench
     bench.cycle(2, holding=True)
     bench.supervisor.stop()
     back_to(bench, used - 200 * MS)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(False)
     bench.cycle(15, holding=True)
     assert bench.ros_ns > used
@@ -323,7 +323,7 @@ def test_command_newer_a_reset_lets_no_earlier_command_in(bench: Bench) -> None:
     stamp = bench.command()
     bench.cycle(2, holding=True)
     bench.supervisor.stop()
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     bench.hold(False)
     bench.hold()
     for older_by in (0, 1, 100 * MS):

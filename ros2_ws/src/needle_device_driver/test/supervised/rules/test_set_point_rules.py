@@ -115,7 +115,7 @@ def test_software_limits_in_the_drives_come_with_homing(drive_bench: DriveBench)
         assert bench.written(node, 0x607D, 1) == bytes.fromhex("00000080")
         assert bench.written(node, 0x607D, 2) == bytes.fromhex("ffffff7f")
     bench.supervisor.confirm_needle_out(True)
-    bench.supervisor.home(bench.clock())
+    bench.run(bench.supervisor.home(bench.clock()))
     bench.cycle(30)
     lower, upper = (
         int.from_bytes(bench.written(INSERTION, 0x607D, sub), "little", signed=True)
@@ -129,7 +129,7 @@ def test_software_limits_in_the_drives_end_while_they_are_homed_again(
 ) -> None:
     bench = drive_bench
     bench.homed()
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     for node in (INSERTION, ROTATION):
         assert bench.written(node, 0x607D, 1) == bytes.fromhex("00000080")
 
@@ -142,7 +142,7 @@ def test_software_limits_that_a_drive_does_not_keep_refuse_the_drive(
     bench.insertion.stores = lambda index, value: (
         bytes(4) if index == 0x607D and value == bytes.fromhex(limit) else value
     )
-    assert "and has 0" in bench.supervisor.configure(bench.clock()).message
+    assert "and has 0" in bench.run(bench.supervisor.configure(bench.clock())).message
 
 
 def test_software_limits_in_the_driver_refuse_a_set_point(drive_bench: DriveBench) -> None:

@@ -40,7 +40,7 @@ def searches(drive: ScriptedDrive, ways: Iterable[int]) -> None:
 def homing(bench: DriveBench) -> None:
     bench.configured()
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
 
 
 def until_fault(bench: DriveBench, most: int = 1000) -> None:
@@ -73,7 +73,7 @@ def test_axis_speed_a_homing_that_is_too_fast_is_stopped_in_two_cycles(
     bench.cycle(10)
     assert bench.positions == at
     assert bench.insertion.state == bench.rotation.state == "disabled"
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
 
 
 def test_axis_speed_stops_both_in_the_cycle_that_shows_it(drive_bench: DriveBench) -> None:
@@ -113,7 +113,7 @@ def test_axis_speed_a_drive_that_counts_anew_at_its_home_is_not_fast(
     bench.cycle(5)
     searches(bench.insertion, ways)
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.cycle(60)
     assert in_state(bench, State.MOVING), bench.status.fault
 

@@ -23,13 +23,13 @@ def test_estop_latches_until_released_hold_off_and_reset(bench: Bench) -> None:
     assert bench.last_rule is Rule.ESTOP_LATCHES
     assert bench.notices[-1].fault
     bench.cycle(1, holding=True)
-    assert "still pressed" in bench.supervisor.reset(bench.now).message
+    assert "still pressed" in bench.run(bench.supervisor.reset(bench.now)).message
     bench.supervisor.receive_estop(False)
     assert in_state(bench, State.ESTOPPED)
     assert not bench.supervisor.enable(True, bench.now).success
-    assert "hold" in bench.supervisor.reset(bench.now).message
+    assert "hold" in bench.run(bench.supervisor.reset(bench.now)).message
     bench.hold(False)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     assert in_state(bench, State.DISABLED)
     bench.cycle(20, holding=True)
     assert bench.positions == at
@@ -48,7 +48,7 @@ def test_estop_latches_from_every_state(bench: Bench, state: str) -> None:
     bench.supervisor.receive_estop(True)
     assert in_state(bench, State.ESTOPPED)
     bench.supervisor.receive_estop(False)
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     wanted = State.UNCONFIGURED if state == "UNCONFIGURED" else State.DISABLED
     assert in_state(bench, wanted)
 
@@ -70,26 +70,26 @@ def test_one_device_stops_and_refuses_everything_until_it_is_alone_and_reset(
     supervisor = bench.supervisor
     for reply in (
         supervisor.enable(True, bench.now),
-        supervisor.home(bench.now),
+        bench.run(supervisor.home(bench.now)),
         supervisor.retract(bench.now),
         supervisor.confirm_needle_out(True),
-        supervisor.reset(bench.now),
+        bench.run(supervisor.reset(bench.now)),
     ):
         assert not reply.success
-    assert "/sim_rig" in supervisor.reset(bench.now).message
+    assert "/sim_rig" in bench.run(supervisor.reset(bench.now)).message
     supervisor.see_others("")
     assert in_state(bench, State.FAULT)
-    assert supervisor.reset(bench.now).success
+    assert bench.run(supervisor.reset(bench.now)).success
     assert bench.positions == at
 
 
 def test_one_device_takes_back_the_word_that_the_needle_is_out(bench: Bench) -> None:
-    bench.supervisor.configure(bench.now)
+    bench.run(bench.supervisor.configure(bench.now))
     bench.supervisor.confirm_needle_out(True)
     bench.supervisor.see_others("another device is there: /sim_rig")
     bench.supervisor.see_others("")
-    assert bench.supervisor.reset(bench.now).success
-    assert "confirm first" in bench.supervisor.home(bench.now).message
+    assert bench.run(bench.supervisor.reset(bench.now)).success
+    assert "confirm first" in bench.run(bench.supervisor.home(bench.now)).message
 
 
 @pytest.mark.parametrize("which", ["insertion", "rotation"])
@@ -134,9 +134,9 @@ def test_reply_age_a_silent_axis_is_a_fault_and_hides_the_joints(bench: Bench) -
     assert bench.supervisor.joints(bench.now) is None
     assert bench.status.insertion is None
     bench.hold(False)
-    assert not bench.supervisor.reset(bench.now).success
+    assert not bench.run(bench.supervisor.reset(bench.now)).success
     bench.rotation.silent_since = None
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
 
 
 def test_disable_stop_and_close_end_a_motion(bench: Bench) -> None:
@@ -152,15 +152,15 @@ def test_disable_stop_and_close_end_a_motion(bench: Bench) -> None:
     bench.hold()
     bench.command(stamp_ns=bench.ros_ns)
     stops = bench.insertion.stops, bench.rotation.stops
-    bench.supervisor.close()
-    assert bench.results[-1].outcome == "aborted: the device is shut down"
+    bench.run(bench.supervisor.deconfigure())
+    assert bench.results[-1].outcome == "aborted: disabled on request"
     assert (bench.insertion.stops, bench.rotation.stops) == (stops[0] + 1, stops[1] + 1)
 
 
 def test_configuration_that_fails_is_a_fault_with_the_reason(bench: Bench) -> None:
     bench.insertion.unplugged = True
-    assert not bench.supervisor.configure(bench.now).success
+    assert not bench.run(bench.supervisor.configure(bench.now)).success
     assert in_state(bench, State.FAULT)
     assert "no link" in bench.status.fault
-    assert bench.supervisor.reset(bench.now).success
+    assert bench.run(bench.supervisor.reset(bench.now)).success
     assert in_state(bench, State.UNCONFIGURED)

@@ -110,7 +110,7 @@ def test_quick_stop_that_a_homing_drive_ignores_after_an_emergency_stop(
     ignores(drive, quick_stop=True, off=True)
     runs_on(drive, "enabled", way=-400)
     bench.supervisor.confirm_needle_out(True)
-    assert bench.supervisor.home(bench.clock()).success
+    assert bench.run(bench.supervisor.home(bench.clock())).success
     bench.cycle(15)
     at = drive.position
     assert at < 0
@@ -202,7 +202,7 @@ def test_quick_stop_after_a_reset_nothing_of_it_is_left(drive_bench: DriveBench)
     bench.insertion.state = "disabled"
     bench.supervisor.receive_estop(False)
     bench.hold(False)
-    assert bench.supervisor.reset(bench.clock()).success
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert bench.status.fault == ""
     bench.cycle(2)
     assert bench.status.fault == ""
