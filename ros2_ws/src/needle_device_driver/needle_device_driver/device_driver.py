@@ -201,9 +201,7 @@ class DeviceDriver(Component):
             yield from self.set_up(self._after_search, at)
 
     def _observe(self, at: Moment) -> Actions:
-        # Where this is not a cycle's own look, a hold-up of this process looks like silent drives.
-        if not self._on_clock or self._drives.may_judge(at.steady):
-            self.supervisor.observe(at.steady)
+        self.supervisor.observe(at.steady)
         yield from self._device.report(at)
 
     def _begin_cycle(self, at: Moment) -> Actions:

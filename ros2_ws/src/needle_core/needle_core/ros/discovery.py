@@ -134,23 +134,6 @@ def known_publishers_of(node: Node, topic: str) -> set[str]:
     return set(publishers_of(node, topic)) - {_NAMELESS, node.get_fully_qualified_name()}
 
 
-def one_too_many(node: Node, subscription: Subscription[Any]) -> str:
-    """Return who else publishes what only one may: a message does not say whose it is.
-
-    Parameters
-    ----------
-    node : Node
-        The node that asks.
-    subscription : Subscription
-        Its own.
-    """
-    if subscription.get_publisher_count() <= 1:
-        return ""
-    topic = subscription.topic_name
-    names = sorted(publishers_of(node, topic))
-    return f"{len(names)} nodes publish {topic}, wanted 1: {', '.join(names)}"
-
-
 def _listeners(node: Node, topic: str) -> set[str]:
     infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     return {info.node_name for info in infos}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 from typing import Any
 
-from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 
 
@@ -29,12 +28,3 @@ class _WholeOrGone(type):
 
 class WholeNode(Node, metaclass=_WholeOrGone):
     """A node that is destroyed if its construction fails."""
-
-
-class WholeLifecycleNode(LifecycleNode, metaclass=_WholeOrGone):
-    """A lifecycle node that is destroyed if its construction fails."""
-
-    def destroy_node(self) -> None:
-        """Destroy the node, and what rclpy leaves of it: its states, which keep it alive."""
-        super().destroy_node()
-        self._state_machine.destroy_when_not_in_use()

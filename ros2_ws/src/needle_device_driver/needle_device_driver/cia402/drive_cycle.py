@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 from needle_core.diagnostics import Diagnostic, Level
@@ -16,7 +15,6 @@ from needle_device_driver.procedure import Procedure, Wait
 _PAUSE = 2
 _PAUSE_WAIT = 0.015
 # Longer than this between two looks [s], and the process was held up; its drives speak up within.
-_HELD_UP, _HEARD_WITHIN = 0.05, 0.04
 
 
 class DriveCycle:
@@ -41,8 +39,6 @@ class DriveCycle:
         self.unanswered = 0
         self._outstanding = 0
         self._paused = 0
-        self._looked_at = math.inf
-        self._held_up_at = -math.inf
         self._told_unanswered = 0
 
     @property
@@ -106,20 +102,6 @@ class DriveCycle:
                 self._link.beat()
             except LinkError:
                 return
-
-    def may_judge(self, now: float) -> bool:
-        """Return whether drives can be judged: after a hold-up of this process it hears them first.
-
-        Parameters
-        ----------
-        now : float
-            Time of this call, one of each cycle [s].
-        """
-        before, self._looked_at = self._looked_at, now
-        if now - before > _HELD_UP:
-            self._held_up_at = now
-        waits = now - self._held_up_at < _HEARD_WITHIN
-        return not waits or all(axis.monitor.fresh_time >= self._held_up_at for axis in self._axes)
 
     def collect(self) -> None:
         """Take the answers that came too late for the cycle before."""

@@ -200,15 +200,6 @@ def test_a_drive_that_refuses_its_set_up_ends_the_driver_at_once(axis: str) -> N
     assert all(drive.error_code == 0 for drive in bench.drives.bus.drives.values())
 
 
-def test_without_autostart_nothing_begins() -> None:
-    bench = ComponentBench(autostart=False, connect_timeout=1.0)
-    bench.run(3.0)
-    assert bench.sent(0.0, *SDO, 0x000, 0x77F) == []
-    assert bench.state == "UNCONFIGURED"
-    assert bench.call("home").text == "waiting for the driver to be activated"
-    assert DRIVER not in bench.runner.exits
-
-
 def test_with_another_device_nothing_begins() -> None:
     bench = ComponentBench()
     # Not before they know each other.

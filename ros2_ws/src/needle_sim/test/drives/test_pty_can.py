@@ -43,6 +43,7 @@ class Served:
 
     def __init__(self, link: Path) -> None:
         self.bus = make_bus()
+        self.bus.poll(time.monotonic())
         self.adapter = PtyCan(link)
         self._arrived: deque[tuple[CanFrame, ...]] = deque()
         self._end = threading.Event()

@@ -25,7 +25,7 @@ from needle_core.ros.conversions import (
     to_stamp,
     values_of,
 )
-from needle_core.ros.hold_topic import HoldTopic
+from needle_verification.ros.hold_topic import HoldTopic
 from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 JOINTS = ("insertion_joint", "rotation_joint")

@@ -13,8 +13,8 @@ import rclpy
 
 from needle_console.hold.hold_state import OWNER, HoldState
 from needle_core.messages import HOLD_LIFETIME
-from needle_core.ros.hold_topic import HoldTopic
 from needle_core.ros.whole_node import WholeNode
+from needle_verification.ros.hold_topic import HoldTopic
 from needle_verification.trials.button_page import serving_button
 
 
