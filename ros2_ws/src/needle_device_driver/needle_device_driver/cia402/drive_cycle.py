@@ -14,7 +14,6 @@ from needle_device_driver.procedure import Procedure, Wait
 # How long a pause for answers that are late lasts, in cycles without any, and each of them [s].
 _PAUSE = 2
 _PAUSE_WAIT = 0.015
-# Longer than this between two looks [s], and the process was held up; its drives speak up within.
 
 
 class DriveCycle:
