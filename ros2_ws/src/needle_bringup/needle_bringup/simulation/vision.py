@@ -14,19 +14,21 @@ from typing import ClassVar
 
 from needle_bringup.simulation.virtual_run import make_tracker, settings_of
 from needle_core import messages as m
+from needle_core.commands.cli import EXIT_MISSED
 from needle_core.component import (
     LATCHED,
     Action,
     Actions,
     Component,
+    Exit,
     Input,
     Moment,
     Output,
     Port,
+    PortChange,
     Send,
     Timer,
 )
-from needle_core.errors import UserError
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -99,24 +101,18 @@ class EyesProcess:
             1, multiprocessing.get_context("spawn"), Eyes.open, (parameters,)
         )
 
-    def open(self, arrive: Callable[[tuple[Done]], None]) -> None:
+    def open(self, arrive: Callable[[tuple[Done] | PortChange], None]) -> None:
         """Begin to hand over what is done."""
         self._arrive = arrive
 
     def send(self, batch: Sequence[tuple[Item, Moment]]) -> None:
-        """Take work to do.
-
-        Raises
-        ------
-        UserError
-            The process has ended.
-        """
+        """Take work to do."""
         try:
             for item, at in batch:
                 done = self._pool.submit(Eyes.work, item, at)
                 done.add_done_callback(lambda done: self._arrive((done,)))
-        except BrokenProcessPool as error:
-            raise UserError("the process that renders and tracks has ended") from error
+        except BrokenProcessPool:
+            self._arrive(PortChange("the process that renders and tracks has ended"))
 
     def close(self) -> None:
         """End it, when what it does is done."""
@@ -142,7 +138,7 @@ class DistantTracker(Component):
             Output(TIP_POSE, m.PoseWithCovariance),
             Output(CALIBRATION, m.Text, LATCHED),
         )
-        self.ports = (Port(CAMERAS, self._on_exposures), Port(EYES, self._on_done))
+        self.ports = (Port(CAMERAS, self._on_exposures), Port(EYES, self._on_done, self._on_change))
         self.timers = (Timer(_CHECK_PERIOD, partial(self._hand_on, None)),)
 
     def _hand_on(self, item: Item, at: Moment) -> Actions:
@@ -158,3 +154,6 @@ class DistantTracker(Component):
         for done in batch:
             self._under_way.popleft()
             yield from done.result()
+
+    def _on_change(self, change: PortChange, at: Moment) -> Actions:
+        yield Exit(EXIT_MISSED, change.lost)

@@ -17,10 +17,12 @@ from needle_core.component import (
     Action,
     Actions,
     Component,
+    Exit,
     Input,
     Moment,
     Output,
     Port,
+    PortChange,
     Publish,
     Send,
     Timer,
@@ -140,3 +142,10 @@ def test_what_fails_there_is_named_here_and_ends_nothing() -> None:
     before = len(rig.tips)
     runner.run(3.0)
     assert len(rig.tips) > before
+
+
+def test_without_the_process_that_works_there_is_no_rig() -> None:
+    port = next(port for port in DistantTracker().ports if port.name == EYES)
+    assert list(port.on_change(PortChange("it has ended"), Moment(1.0, 1))) == [
+        Exit(1, "it has ended")
+    ]

@@ -10,7 +10,7 @@ from nicegui import events, ui
 from needle_console.hold.hold_state import OWNER
 from needle_console.page.desk import Desk
 from needle_console.view.advice import Button, advise, usable_buttons
-from needle_console.view.snapshot import Snapshot
+from needle_console.view.snapshot import Snapshot, trouble_of
 from needle_console.view.targets import plane_pose, target_point
 from needle_core.errors import UserError
 
@@ -61,7 +61,7 @@ class Controls:
         possible = usable_buttons(snapshot)
         device = snapshot.device
         must_let_go = device is not None and device.press_again == OWNER
-        why = device.trouble if device is not None and must_let_go else ""
+        why = trouble_of(device) if device is not None and must_let_go else ""
         self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
         for button, element in self._buttons.items():
             usable = button in possible and not self._other_steers

@@ -54,7 +54,7 @@ class NeedleScene:
 
     def _show_target(self, snapshot: Snapshot) -> None:
         """Show the point where there is one, else the plane: that is then no target."""
-        point = snapshot.controller.target_point if snapshot.controller is not None else None
+        point = snapshot.controller.target_point_m if snapshot.controller is not None else None
         centre, rotation = plane_centre(snapshot, _LENGTH), plane_rotation(snapshot)
         wanted = [centre, rotation] if point is None else [to_view(np.array(point))]
         if not self._is_new("target", *wanted):

@@ -6,8 +6,8 @@ import dataclasses
 import enum
 import math
 
-from needle_console.view.rig_state import ControllerState, DeviceState
-from needle_console.view.snapshot import Snapshot
+from needle_console.view.snapshot import Snapshot, trouble_of
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # As near to the home position the needle counts as out [m].
 _OUT = 1e-4
@@ -106,11 +106,11 @@ def usable_buttons(snapshot: Snapshot) -> frozenset[Button]:
     return frozenset(found)
 
 
-def _unconfigured(_: Snapshot, device: DeviceState) -> Advice:
-    return Advice("The drives are not set up", device.trouble or "Configure device_driver.")
+def _unconfigured(_: Snapshot, device: DeviceStatus) -> Advice:
+    return Advice("The drives are not set up", trouble_of(device) or "Configure device_driver.")
 
 
-def _estopped(_: Snapshot, device: DeviceState) -> Advice:
+def _estopped(_: Snapshot, device: DeviceStatus) -> Advice:
     return Advice(
         "Emergency stop",
         "Find out why. Release the emergency stop and every hold, then press Reset.",
@@ -118,22 +118,22 @@ def _estopped(_: Snapshot, device: DeviceState) -> Advice:
     )
 
 
-def _fault(_: Snapshot, device: DeviceState) -> Advice:
+def _fault(_: Snapshot, device: DeviceStatus) -> Advice:
     return Advice(
-        f"Fault: {device.trouble or 'no reason given'}",
+        f"Fault: {trouble_of(device) or 'no reason given'}",
         "Put right what it says, let go of every hold, then press Reset.",
         Button.RESET,
     )
 
 
-def _moving(device: DeviceState) -> Advice:
+def _moving(device: DeviceStatus) -> Advice:
     if device.activity == "homing":
         return Advice("Homing", "The axes look for their switches. Keep clear; Stop ends it.")
     what = "goes in" if device.activity == "step" else "is drawn out"
     return Advice(f"The needle {what}", "Let go to stop it.")
 
 
-def _disabled(_: Snapshot, device: DeviceState) -> Advice:
+def _disabled(_: Snapshot, device: DeviceStatus) -> Advice:
     if device.homed:
         return Advice("Ready, switched off", "Switching on moves nothing.", Button.ENABLE)
     if not device.needle_out_confirmed:
@@ -146,7 +146,7 @@ def _disabled(_: Snapshot, device: DeviceState) -> Advice:
     return Advice("Not homed", "Homing moves and turns the needle without a hold.", Button.HOME)
 
 
-def _holding(snapshot: Snapshot, device: DeviceState) -> Advice:
+def _holding(snapshot: Snapshot, device: DeviceStatus) -> Advice:
     controller = snapshot.controller
     if not device.homed:
         return Advice(
@@ -161,7 +161,7 @@ def _holding(snapshot: Snapshot, device: DeviceState) -> Advice:
     return _not_steering(controller, is_in=snapshot.insertion > _OUT)
 
 
-def _not_steering(controller: ControllerState, *, is_in: bool) -> Advice:
+def _not_steering(controller: ControllerStatus, *, is_in: bool) -> Advice:
     if controller.state == "DONE":
         return Advice("The depth is reached", "Draw the needle out at last.", Button.RETRACT)
     if controller.state == "FAULT":
@@ -178,7 +178,7 @@ def _not_steering(controller: ControllerState, *, is_in: bool) -> Advice:
     return Advice("Ready to steer", "Starting moves nothing yet.", Button.START)
 
 
-def _steering(snapshot: Snapshot, controller: ControllerState, device: DeviceState) -> Advice:
+def _steering(snapshot: Snapshot, controller: ControllerStatus, device: DeviceStatus) -> Advice:
     if controller.state == "WAITING_FOR_TIP":
         return Advice(
             f"The tip is not seen: {controller.reason or 'no reason given'}",

@@ -72,8 +72,8 @@ def chart(snapshot: Snapshot) -> str:
     rows = [(p.depth * _MM, p.r1 * _MM, 2.0 * p.sigma * _MM) for p in snapshot.course]
     limit = max([1.5 * GOAL_MM, *(1.1 * (abs(r1) + half) for _, r1, half in rows)])
     controller = snapshot.controller
-    depth = math.nan if controller is None else controller.depth
-    last = _DEFAULT_DEPTH_MM if math.isnan(depth) else depth * _MM
+    depth = None if controller is None else controller.depth_m
+    last = _DEFAULT_DEPTH_MM if depth is None else depth * _MM
     frame = _Frame(max([last, *(row[0] for row in rows)]), _round_up(limit))
     upper = [(at, r1 + half) for at, r1, half in rows]
     lower = [(at, r1 - half) for at, r1, half in rows]

@@ -56,7 +56,7 @@ def _draw_needle(picture: Image, snapshot: Snapshot, camera: RefractedCamera, sc
     tip = snapshot.tip
     if tip is not None and snapshot.tip_lost_for == 0.0:
         _mark(picture, _pixels(camera.project(tip.position[None]), scale)[0], cv2.MARKER_CROSS)
-    point = snapshot.controller.target_point if snapshot.controller is not None else None
+    point = snapshot.controller.target_point_m if snapshot.controller is not None else None
     if point is not None:
         at = _pixels(camera.project(np.array([point])), scale)[0]
         _mark(picture, at, cv2.MARKER_DIAMOND)

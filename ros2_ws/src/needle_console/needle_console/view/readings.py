@@ -38,9 +38,9 @@ def mm(value: float, digits: int = 2) -> str:
 def _depth(snapshot: Snapshot) -> str:
     at = mm(snapshot.insertion, 1)
     controller = snapshot.controller
-    if controller is None or math.isnan(controller.depth):
+    if controller is None or controller.depth_m is None:
         return at
-    return f"{at} of {mm(controller.depth, 0)}"
+    return f"{at} of {mm(controller.depth_m, 0)}"
 
 
 def _off_plane(snapshot: Snapshot) -> str:
@@ -48,9 +48,9 @@ def _off_plane(snapshot: Snapshot) -> str:
         return NONE
     last, controller = snapshot.course[-1], snapshot.controller
     text = mm(last.r1)
-    if controller is None or math.isnan(controller.r1_low) or math.isnan(controller.r1_high):
+    if controller is None or controller.r1_low_m is None or controller.r1_high_m is None:
         return text
-    return f"{text} (95 %: {mm(controller.r1_low)[:-3]} to {mm(controller.r1_high)[:-3]})"
+    return f"{text} (95 %: {mm(controller.r1_low_m)[:-3]} to {mm(controller.r1_high_m)[:-3]})"
 
 
 def _turn(rotation: float) -> str:
@@ -76,11 +76,11 @@ def _reach(snapshot: Snapshot) -> str:
     controller = snapshot.controller
     if controller is None or controller.reachable is None:
         return NONE
-    what = "plane" if controller.target_point is None else "point"
+    what = "plane" if controller.target_point_m is None else "point"
     if not controller.reachable:
         return f"the {what} is out of reach"
-    needs = controller.reachable_depth
-    return f"the {what} can be reached" + ("" if math.isnan(needs) else f", from {mm(needs, 0)} on")
+    needs = controller.reachable_depth_m
+    return f"the {what} can be reached" + ("" if needs is None else f", from {mm(needs, 0)} on")
 
 
 def _estimate(snapshot: Snapshot) -> str:

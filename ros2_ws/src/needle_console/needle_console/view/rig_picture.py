@@ -8,9 +8,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from needle_console.view.rig_state import controller_state, device_state
-from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot
+from needle_console.view.snapshot import Array, CoursePoint, SeenTip, Snapshot, trouble_of
 from needle_core.foreign_text import plain
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 # Estimates that are closer together are drawn as one [m].
 SPACING = 2.5e-4
@@ -58,20 +58,20 @@ class RigPicture:
 
     def see_device(self, values: Mapping[str, str]) -> None:
         """Take the key-values of `device/status`."""
-        state, before = device_state(values), self._told.device
-        if before is not None and before.trouble and "(hold_new_press)" in state.trouble:
+        state, before = DeviceStatus.parse(values), self._told.device
+        if before is not None and "(hold_new_press)" in state.reason:
             # Only says that the press goes on; the status before said why it no longer counts.
-            state = dataclasses.replace(state, trouble=before.trouble)
+            state = dataclasses.replace(state, reason=trouble_of(before) or state.reason)
         self._tell(device=state)
 
     def see_controller(self, values: Mapping[str, str]) -> None:
         """Take the key-values of `needle/controller_status`; a new start begins a new course."""
-        state = controller_state(values)
+        state = ControllerStatus.parse(values)
         before = self._told.controller
         if before is not None and state.starts != before.starts:
             self._course.clear()
         self._told = dataclasses.replace(
-            self._told, controller=state, T_rig_plane=self._plane(state.target_offset)
+            self._told, controller=state, T_rig_plane=self._plane(state.target_offset_m)
         )
 
     def lose_controller(self) -> None:
@@ -139,7 +139,7 @@ class RigPicture:
         self._heard_plane = T_rig_plane
         state = self._told.controller
         if state is not None:
-            plane = self._plane(state.target_offset)
+            plane = self._plane(state.target_offset_m)
             self._told = dataclasses.replace(self._told, T_rig_plane=plane)
 
     def see_health(self, name: str, *, bad: bool, message: str, now: float) -> None:
@@ -157,13 +157,13 @@ class RigPicture:
     def _tell(self, **news: object) -> None:
         self._told = dataclasses.replace(self._told, **news)  # type: ignore[arg-type]
 
-    def _plane(self, offset: float) -> Array:
+    def _plane(self, offset: float | None) -> Array:
         """Return the plane in force: what was sent if the controller took it, else the default."""
         heard = self._heard_plane
         if heard is not None and (
-            math.isnan(offset) or abs(float(heard[:3, 0] @ heard[:3, 3]) - offset) < _SAME_OFFSET
+            offset is None or abs(float(heard[:3, 0] @ heard[:3, 3]) - offset) < _SAME_OFFSET
         ):
             return heard
         plane = np.eye(4)
-        plane[0, 3] = 0.0 if math.isnan(offset) else offset
+        plane[0, 3] = 0.0 if offset is None else offset
         return plane

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from needle_console.view.rig_state import ControllerState, DeviceState
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 Array: TypeAlias = NDArray[np.float64]
 # Axes at rest are so near to where they were [m].
@@ -64,7 +64,7 @@ class Snapshot:
 
     Attributes
     ----------
-    device, controller : DeviceState, ControllerState, or None
+    device, controller : DeviceStatus, ControllerStatus, or None
         Their last words; None: not heard.
     insertion, rotation : float
         The joints [m], [rad]; NaN: not heard, or not for a second.
@@ -82,8 +82,8 @@ class Snapshot:
         What the last service call was answered.
     """
 
-    device: DeviceState | None = None
-    controller: ControllerState | None = None
+    device: DeviceStatus | None = None
+    controller: ControllerStatus | None = None
     insertion: float = math.nan
     rotation: float = math.nan
     tip: SeenTip | None = None
@@ -99,3 +99,8 @@ class Snapshot:
         end = self.insertion + _AT_REST
         within = [point for point in self.course if not point.depth > end]
         return np.array([np.zeros(3), *(point.position for point in within)])
+
+
+def trouble_of(device: DeviceStatus) -> str:
+    """Return the fault of a device, or why it last stopped, refused or waits; empty: neither."""
+    return device.fault or device.reason

@@ -7,12 +7,12 @@ import itertools
 import pytest
 
 from needle_console.view.advice import Button, advise, usable_buttons
-from needle_console.view.rig_state import ControllerState, DeviceState
 from needle_console.view.snapshot import Snapshot
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
-DISABLED = DeviceState("DISABLED")
-ENABLED = DeviceState("HOLDING", homed=True)
-STEERING = ControllerState("STEERING")
+DISABLED = DeviceStatus(state="DISABLED")
+ENABLED = DeviceStatus(state="HOLDING", homed=True)
+STEERING = ControllerStatus(state="STEERING")
 
 
 @pytest.mark.parametrize(
@@ -21,17 +21,20 @@ STEERING = ControllerState("STEERING")
         (Snapshot(), None),
         (Snapshot(DISABLED), None),
         (Snapshot(DISABLED, insertion=0.0), Button.CONFIRM),
-        (Snapshot(DeviceState("DISABLED", needle_out_confirmed=True), insertion=0.0), Button.HOME),
-        (Snapshot(DeviceState("MOVING", activity="homing")), None),
-        (Snapshot(DeviceState("DISABLED", homed=True), insertion=0.0), Button.ENABLE),
-        (Snapshot(ENABLED, ControllerState("IDLE"), insertion=0.0), Button.START),
+        (
+            Snapshot(DeviceStatus(state="DISABLED", needle_out_confirmed=True), insertion=0.0),
+            Button.HOME,
+        ),
+        (Snapshot(DeviceStatus(state="MOVING", activity="homing")), None),
+        (Snapshot(DeviceStatus(state="DISABLED", homed=True), insertion=0.0), Button.ENABLE),
+        (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.0), Button.START),
         (Snapshot(ENABLED, STEERING, insertion=0.0), Button.INSERT),
-        (Snapshot(DeviceState("MOVING", activity="step"), STEERING), None),
-        (Snapshot(ENABLED, ControllerState("DONE"), insertion=0.12), Button.RETRACT),
-        (Snapshot(ENABLED, ControllerState("IDLE"), insertion=0.05), Button.RETRACT),
-        (Snapshot(DeviceState("HOLDING"), insertion=0.03), Button.RETRACT),
-        (Snapshot(DeviceState("FAULT", trouble="following_error")), Button.RESET),
-        (Snapshot(DeviceState("ESTOPPED")), Button.RESET),
+        (Snapshot(DeviceStatus(state="MOVING", activity="step"), STEERING), None),
+        (Snapshot(ENABLED, ControllerStatus(state="DONE"), insertion=0.12), Button.RETRACT),
+        (Snapshot(ENABLED, ControllerStatus(state="IDLE"), insertion=0.05), Button.RETRACT),
+        (Snapshot(DeviceStatus(state="HOLDING"), insertion=0.03), Button.RETRACT),
+        (Snapshot(DeviceStatus(state="FAULT", fault="following_error")), Button.RESET),
+        (Snapshot(DeviceStatus(state="ESTOPPED")), Button.RESET),
     ],
 )
 def test_a_run_is_led_from_button_to_button(snapshot: Snapshot, button: Button | None) -> None:
@@ -43,12 +46,12 @@ def test_a_run_is_led_from_button_to_button(snapshot: Snapshot, button: Button |
 
 
 def test_a_fault_is_named() -> None:
-    advice = advise(Snapshot(DeviceState("FAULT", trouble="[reply_age] no reply")), "console")
+    advice = advise(Snapshot(DeviceStatus(state="FAULT", fault="[reply_age] no reply")), "console")
     assert "[reply_age] no reply" in advice.headline
 
 
 def test_a_press_that_does_not_count_is_told_to_whose_it_is() -> None:
-    device = DeviceState("HOLDING", homed=True, press_again="console")
+    device = DeviceStatus(state="HOLDING", homed=True, press_again="console")
     snapshot = Snapshot(device, STEERING, insertion=0.01)
     assert "press and hold again" in advise(snapshot, "console").text
     assert "press and hold again" not in advise(snapshot, "pedal").text
@@ -56,10 +59,13 @@ def test_a_press_that_does_not_count_is_told_to_whose_it_is() -> None:
 
 def test_every_state_has_words_and_no_button_that_cannot_be_pressed() -> None:
     states = ("UNCONFIGURED", "DISABLED", "HOLDING", "MOVING", "FAULT", "ESTOPPED", "NEW")
-    controllers = (None, *map(ControllerState, ("IDLE", *_STEERING, "DONE", "FAULT")))
+    controllers = (
+        None,
+        *(ControllerStatus(state=state) for state in ("IDLE", *_STEERING, "DONE", "FAULT")),
+    )
     booleans = (False, True)
     for state, controller, homed, out in itertools.product(states, controllers, booleans, booleans):
-        device = DeviceState(state, homed=homed, needle_out_confirmed=out)
+        device = DeviceStatus(state=state, homed=homed, needle_out_confirmed=out)
         snapshot = Snapshot(device, controller, insertion=0.03)
         advice = advise(snapshot, "console")
         assert advice.headline

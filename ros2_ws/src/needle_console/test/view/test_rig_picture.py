@@ -9,9 +9,9 @@ import pytest
 
 from needle_console.view.readings import readings
 from needle_console.view.rig_picture import RigPicture
-from needle_console.view.rig_state import controller_state, device_state
-from needle_console.view.snapshot import Snapshot
+from needle_console.view.snapshot import Snapshot, trouble_of
 from needle_console.view.targets import plane_pose
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 COVARIANCE = np.diag([1e-8, 4e-8, 9e-8])
 
@@ -75,19 +75,19 @@ def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
         picture.see_device(told)
     device = picture.states().device
     assert device is not None
-    assert (device.press_again, device.trouble) == ("console", silent)
+    assert (device.press_again, trouble_of(device)) == ("console", silent)
     # Where the console stood still itself, it heard no more than that.
     picture = RigPicture()
     for told in ({"state": "MOVING", "hold_owner": "console"}, values):
         picture.see_device(told)
     device = picture.states().device
     assert device is not None
-    assert device.trouble == goes_on
+    assert trouble_of(device) == goes_on
     stamps = "hold of 'console' does not count (hold_stamp_increases); device/reset ends this"
     picture.see_device({**values, "reason": stamps})
     device = picture.states().device
     assert device is not None
-    assert device.trouble == stamps
+    assert trouble_of(device) == stamps
 
 
 def test_a_controller_that_is_gone_steers_no_longer() -> None:
@@ -143,12 +143,14 @@ def test_troubles_end_when_they_are_mended_or_no_longer_told() -> None:
 
 
 def test_statuses_that_say_nothing_sensible_become_states_without_numbers() -> None:
-    controller = controller_state({"state": "IDLE", "depth_m": "nan", "target_point_m": "1, x, 3"})
-    assert math.isnan(controller.depth)
-    assert controller.target_point is None
+    controller = ControllerStatus.parse(
+        {"state": "IDLE", "depth_m": "nan", "target_point_m": "1, x, 3"}
+    )
+    assert controller.depth_m is None
+    assert controller.target_point_m is None
     assert controller.reachable is None
-    assert device_state({"simulated": "yes"}).simulated is False
-    assert set(readings(Snapshot(device_state({}), controller)).values()) == {"\N{EN DASH}"}
+    assert DeviceStatus.parse({"simulated": "yes"}).simulated is False
+    assert set(readings(Snapshot(DeviceStatus.parse({}), controller)).values()) == {"\N{EN DASH}"}
 
 
 def test_readings_are_in_mm_and_degrees() -> None:
