@@ -95,6 +95,7 @@ class PlaneController(Component):
         self._missing: list[str] = [f"subscriber of {COMMANDS}"]
         self._heard = HeardMessages()
         self._logged: dict[str, float] = {}
+        self._told: tuple[dict[str, str], dict[str, str]] | None = None
         self._published: ControllerStatus | None = None
         rows: tuple[tuple[str, type[Any], Callable[[Any, Moment], Iterable[Action]], Delivery], ...]
         rows = (
@@ -253,14 +254,16 @@ class PlaneController(Component):
 
     def _report(self) -> Actions:
         history = self.steering.intake.joints
-        joints = {
+        complaints = {"joint_states": history.complaint} | self.complaints
+        counts = {
             "joint_states_refused": str(self._bad_joints),
             "joint_states_doubted": str(history.doubted),
         }
-        complaint = self.complaints.get("joint_states", "") or history.complaint
-        yield Diagnose("joint_states", _health(complaint, joints))
-        for topic in TARGETS:
-            yield Diagnose(topic, _health(self.complaints.get(topic, ""), {}))
+        if (complaints, counts) != self._told:
+            self._told = complaints, counts
+            yield Diagnose("joint_states", _health(complaints["joint_states"], counts))
+            for topic in TARGETS:
+                yield Diagnose(topic, _health(complaints.get(topic, ""), {}))
         status = controller_status(self.steering, self.settings.preset, self.name)
         if status != self._published or self._heard.is_full:
             self._published = status

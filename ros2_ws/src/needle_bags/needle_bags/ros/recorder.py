@@ -21,7 +21,7 @@ from needle_bags.recording.allocator import keep_freed_memory
 from needle_bags.recording.not_understood import NotUnderstood
 from needle_bags.recording.provenance import commit, distribution, versions
 from needle_bags.recording.recorder_health import RecorderHealth
-from needle_bags.recording.recording import Received, Recording, open_recording
+from needle_bags.recording.recording import Received, open_recording
 from needle_bags.ros.graph_topics import GraphTopics
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
 from needle_bags.ros.recorder_parameters import RecorderParameters
@@ -76,15 +76,9 @@ FAULTS = ("FAULT", "ESTOPPED")
 
 
 class Recorder(WholeNode):
-    """Subscribes to whatever the graph has and hands it to a `Recording`.
+    """Subscribes to whatever the graph has and hands it to a `Recording`."""
 
-    Parameters
-    ----------
-    open_recording : callable
-        Begins the recording: `open_recording`, or one like it.
-    """
-
-    def __init__(self, open_recording: Callable[..., Recording] = open_recording) -> None:
+    def __init__(self) -> None:
         super().__init__("recorder")
         self._settings = NodeParameters(self, RecorderParameters).values
         bag = self._settings.bag or time.strftime("bag_%Y_%m_%d-%H_%M_%S")

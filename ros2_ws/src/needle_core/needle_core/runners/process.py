@@ -98,7 +98,8 @@ class Process:
         """Queue an event; of one source only the newest `depth` wait."""
         if not self.is_alive:
             return
-        if not (self._is_busy or self._queue) and self._due <= self._timeline.now:
+        now = self._timeline.now
+        if not self._is_busy and self._free_at <= now >= self._frozen_until and not self._queue:
             self._handle_now(source, work, sent_ns)
             return
         if depth is not None and self._waiting[source] >= depth:

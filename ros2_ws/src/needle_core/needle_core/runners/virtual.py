@@ -99,6 +99,7 @@ class VirtualRunner:
         self._serial = itertools.count(1)
         self._calls: dict[int, tuple[Process, str]] = {}
         self._processes: dict[str, Process] = {}
+        self._wires: dict[str, list[tuple[Process, Port]]] = {}
         self._lost_ports: dict[tuple[str, str], str] = {}
         for component in components:
             self.start(component)
@@ -137,6 +138,8 @@ class VirtualRunner:
                 found = self.timeline.draw(f"discovery/{pair[0].name}/{pair[1].name}", DISCOVERY)
                 self.timeline.call_after(found, partial(self._discover, *pair))
         self._processes[name] = process
+        for row in component.ports:
+            self._wires.setdefault(row.name, []).append((process, row))
         for owner, port in self._lost_ports:
             if owner == name:
                 self._tell_port(name, port)
@@ -199,6 +202,8 @@ class VirtualRunner:
     def _remove(self, process: Process) -> None:
         process.end()
         del self._processes[process.name]
+        for row in process.component.ports:
+            self._wires[row.name].remove((process, row))
 
     # ---- actions --------------------------------------------------------------------------------
 
@@ -258,13 +263,14 @@ class VirtualRunner:
         receiver.offer(row.topic, partial(row.handler, message), depth=depth, sent_ns=sent_ns)
 
     def _send_through(self, sender: Process, port: str, batch: tuple[Any, ...]) -> None:
-        lost = self._lost_ports.keys()
-        for receiver in self._processes.values():
-            for row in receiver.component.ports if receiver is not sender else ():
-                if row.name == port and not {(sender.name, port), (receiver.name, port)} & lost:
-                    link = Link(sender.name, port, receiver.name)
-                    arrive = partial(self._arrive, receiver, row)
-                    self._transport.send(link, batch, PORT_LATENCY, arrive)
+        lost = self._lost_ports
+        if (sender.name, port) in lost:
+            return
+        for receiver, row in self._wires.get(port, ()):
+            if receiver is not sender and (receiver.name, port) not in lost:
+                link = Link(sender.name, port, receiver.name)
+                arrive = partial(self._arrive, receiver, row)
+                self._transport.send(link, batch, PORT_LATENCY, arrive)
 
     def _arrive(self, receiver: Process, row: Port, batch: tuple[Any, ...]) -> None:
         waiting = receiver.batches.setdefault(row.name, [])

@@ -244,6 +244,8 @@ class CanopenDevice:
     def _watch(self, now: float) -> None:
         for k in range(1, _HEARTBEAT_CONSUMERS + 1):
             consumer = self.dictionary.value(0x1016, k)
+            if not consumer:
+                continue
             node, limit = consumer >> 16 & 0x7F, (consumer & 0xFFFF) * 1e-3
             # Monitoring begins with the first heartbeat.
             heard = self._heard.get(node)
