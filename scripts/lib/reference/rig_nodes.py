@@ -228,11 +228,6 @@ def _make_and_look(node: Any, _: Noted) -> None:
     node.look_around()
 
 
-def _with_pedal(module: ModuleType) -> Node:
-    node: Node = module.OperatorNode(mock.MagicMock())
-    return node
-
-
 def _report_and_close(node: Any, _: Noted) -> None:
     node.report()
     node.recording.close()
@@ -242,13 +237,6 @@ def _tick(node: Any, noted: Noted) -> None:
     """Do what every timer does."""
     for timer in list(node.timers):
         timer.callback()
-    _turn(node, noted)
-
-
-def _hold(node: Any, noted: Noted) -> None:
-    """Let a hand's timer go by, and have the operator look at its joystick."""
-    timers = node._component.timers
-    node._on_timer(timers[0].handler if timers else lambda at: ())
     _turn(node, noted)
 
 
@@ -264,8 +252,8 @@ WAYS: dict[str, tuple[Way, ...]] = {
     "live_view": (Way(then=_look),),
     "openigtlink": (Way("", ("port:=0",), then=lambda node, _: node._show()),),
     "operator": (
-        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), _with_pedal, _hold),
-        Way("source joy", ("source:=joy", "key:=0"), then=_hold),
+        Way("sources pedal and joystick", ("device:=/dev/null", "key:=48"), then=_tick),
+        Way("source joy", ("source:=joy", "key:=0"), then=_tick),
     ),
     "player": (
         Way(make=_player, then=_make_and_look),

@@ -6,7 +6,7 @@ import dataclasses
 import math
 from typing import Any
 
-from needle_core.errors import OutOfBoundsError, UserError
+from needle_core.errors import UserError
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link.link_settings import LINKS, LinkSettings
@@ -85,10 +85,6 @@ class DriverParameters:
         check_fields(self)
         if self.drive("insertion").node_id == self.drive("rotation").node_id:
             raise UserError("insertion_node_id and rotation_node_id are the same")
-        if self.reply_age_limit > LONGEST_WATCHDOG:
-            raise OutOfBoundsError(
-                "reply_age_limit", self.reply_age_limit, 0.05, LONGEST_WATCHDOG, "s"
-            )
         _ = self.link_settings, self.limits
 
     @property

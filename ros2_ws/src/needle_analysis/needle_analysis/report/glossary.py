@@ -26,7 +26,6 @@ TERMS = {
     "watchdog": "ends what waits too long for a message; it goes by real time, so a run in which "
     "one tripped may not repeat exactly",
     "step": "the stretch of insertion from one command to the next, 1 mm by default",
-    "lock step": "simulated time stands still until every node has answered",
     "rerun": "recorded tips or images through today's code; nothing moves",
 }
 """Term to its meaning, as half a sentence."""

@@ -47,7 +47,7 @@ CAPTIONS = {
     ),
     "timing": (
         "Timing of each stage",
-        "By when the messages were sent. In [lock step] the device's part is computing.",
+        "By when the messages were sent.",
     ),
     "events": (
         "States, hold and faults",

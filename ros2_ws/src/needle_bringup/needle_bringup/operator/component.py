@@ -8,7 +8,7 @@ from needle_bringup.operator.hand import Reading
 from needle_bringup.operator.hold_gate import Grip, Held, HoldGate
 from needle_bringup.operator.joy_source import JoySource
 from needle_bringup.operator.parameters import JOY, OperatorParameters
-from needle_bringup.operator.retraction import RETRACT, STOP_STEERING, Retraction
+from needle_bringup.operator.retraction import STOP_STEERING, Retraction
 from needle_core import messages as m
 from needle_core.commands.cli import EXIT_DONE
 from needle_core.component import (
@@ -27,6 +27,7 @@ from needle_core.component import (
     Peers,
     Port,
     Publish,
+    Send,
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
@@ -36,7 +37,6 @@ HOLD, INPUT_DEVICE = "device/hold", "input device"
 PERIOD = 0.02
 """Between two looks at the hand [s]."""
 DEVICE_STOP = "device/stop"
-CALLED = (DEVICE_STOP, RETRACT, STOP_STEERING)
 RELEASES = 3
 """The hold is best effort: a release worth sending is worth sending again."""
 
@@ -92,7 +92,8 @@ class Operator(Component):
     def on_settings(self, settings: OperatorParameters, at: Moment) -> Actions:
         """Take another speed."""
         self.settings = settings
-        return ()
+        if self.ports:
+            yield Send(INPUT_DEVICE, (settings.speed_scale,))
 
     def on_peers(self, peers: Peers, at: Moment) -> Actions:
         """Note whether there is a controller, and how many joysticks."""

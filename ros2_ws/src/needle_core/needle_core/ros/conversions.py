@@ -30,7 +30,6 @@ LATCHED.durability = DurabilityPolicy.TRANSIENT_LOCAL
 HOLD = _last(1, ReliabilityPolicy.BEST_EFFORT)
 # What a device hears while others flood the topic, from one look to the next: all of it counts.
 HOLDS_HEARD = _last(100, ReliabilityPolicy.BEST_EFFORT)
-ESTOPS_HEARD = _last(1000, ReliabilityPolicy.RELIABLE)
 IMAGES = _last(5, ReliabilityPolicy.RELIABLE)
 IMAGES_BEST_EFFORT = _last(2, ReliabilityPolicy.BEST_EFFORT)
 

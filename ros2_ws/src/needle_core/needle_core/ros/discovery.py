@@ -121,19 +121,6 @@ def subscribers_of(node: Node, topic: str) -> list[str]:
     ]
 
 
-def known_publishers_of(node: Node, topic: str) -> set[str]:
-    """Return the full names of the other nodes that publish a topic, as far as they are known.
-
-    Parameters
-    ----------
-    node : Node
-        The node that asks.
-    topic : str
-        Its name as the node would give it.
-    """
-    return set(publishers_of(node, topic)) - {_NAMELESS, node.get_fully_qualified_name()}
-
-
 def _listeners(node: Node, topic: str) -> set[str]:
     infos = node.get_subscriptions_info_by_topic(node.resolve_topic_name(topic))
     return {info.node_name for info in infos}
@@ -171,24 +158,6 @@ class AnsweringNodes:
                 )
             self._questions[name].ask(NO_TYPE)
         return names <= self._answered
-
-    def unaware_sources(self, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
-        """Return what keeps subscriptions from hearing everything from now on; empty: nothing.
-
-        Parameters
-        ----------
-        subscriptions : iterable of Subscription
-            The node's own; each wants a publisher, `publisher of T`, and each publisher's node has
-            to answer, `answer of N`.
-        """
-        missing, names = [], set()
-        for subscription in subscriptions:
-            known = known_publishers_of(self._node, subscription.topic_name)
-            if not known:
-                missing.append(f"publisher of {subscription.topic_name}")
-            names |= known
-        self.all_of(names)
-        return missing + [f"answer of {name}" for name in sorted(names - self._answered)]
 
     def close(self) -> None:
         """Drop the clients."""

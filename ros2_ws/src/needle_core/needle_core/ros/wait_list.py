@@ -63,20 +63,6 @@ class WaitListExecutor(SingleThreadedExecutor):
         self._is_stale = True
         super().wake()
 
-    def spin_ready(self, timeout_sec: float, looks: int) -> None:
-        """Wait until something is ready; run it, and what is ready then, until nothing is.
-
-        Parameters
-        ----------
-        timeout_sec : float
-            How long to wait [s]; not at all with 0.
-        looks : int
-            How often to look at most, each callback once a look: what comes without end ends here.
-        """
-        for look in range(looks):
-            if not self._run_ready(timeout_sec if look == 0 else 0.0):
-                return
-
     def _run_ready(self, timeout_sec: float) -> bool:
         """Run what one look finds; return whether it found anything."""
         found = False

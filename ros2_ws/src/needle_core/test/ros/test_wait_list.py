@@ -180,44 +180,6 @@ def waiting() -> Iterator[Bench]:
         bench.close()
 
 
-def test_all_that_waits_runs_when_asked_for_at_once(waiting: Bench) -> None:
-    for topic in ("one", "two"):
-        waiting.hear(topic, waiting.note(topic))
-    for sender in [waiting.sender(topic) for topic in ("one", "two")]:
-        for _ in range(RELIABLE.depth):
-            sender.publish(Header())
-    waiting.executor.spin_ready(1.0, RELIABLE.depth)
-    assert waiting.done == RELIABLE.depth * ["one", "two"]
-    waiting.executor.spin_ready(0.0, RELIABLE.depth)
-    assert len(waiting.done) == 2 * RELIABLE.depth
-
-
-def test_what_comes_without_end_is_left_after_so_many_looks(waiting: Bench) -> None:
-    def again(message: Header) -> None:
-        waiting.done.append("again")
-        sender.publish(message)
-
-    waiting.hear("flood", again)
-    sender = waiting.sender("flood")
-    sender.publish(Header())
-    waiting.executor.spin_ready(1.0, 7)
-    assert waiting.done == 7 * ["again"]
-
-
-def test_a_failure_of_one_of_many_is_raised_and_the_others_have_their_turn(waiting: Bench) -> None:
-    def fail(_: Header) -> None:
-        raise ValueError("no")
-
-    waiting.hear("bad", fail)
-    waiting.hear("good", waiting.note("good"))
-    for sender in [waiting.sender(topic) for topic in ("bad", "good")]:
-        sender.publish(Header())
-    with pytest.raises(ValueError, match="no"):
-        waiting.executor.spin_ready(1.0, 1)
-    waiting.executor.spin_ready(1.0, 1)
-    assert waiting.done == ["good"]
-
-
 def test_entities_are_gathered_once_however_many_callbacks_run(
     waiting: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 from needle_device_driver.axes.axis_pair import PairSnapshot
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import (
@@ -11,7 +9,6 @@ from needle_device_driver.supervisor.command import (
     CommandContext,
     Refusal,
     check_command,
-    check_form,
     clocks_differ,
 )
 from needle_device_driver.supervisor.command_stamps import CommandStamps
@@ -21,13 +18,6 @@ from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.motion_run import INNER_SWITCH
 from needle_device_driver.supervisor.reports import SUCCEEDED
 from needle_device_driver.supervisor.states import Activity, State
-
-
-@dataclasses.dataclass(frozen=True)
-class _Waiting:
-    command: Command
-    publishers: int
-    press: int
 
 
 class CommandDesk:
@@ -41,10 +31,6 @@ class CommandDesk:
         Whose press counts.
     limits : SafetyLimits
         The bounds of the rules.
-    lock_step : bool
-        Tips age in simulated time.
-    path_delay : float
-        In lock step a path takes effect so long after its stamp, in simulated time [s].
 
     Attributes
     ----------
@@ -59,16 +45,11 @@ class CommandDesk:
         core: DeviceCore,
         hold: Hold,
         limits: SafetyLimits,
-        *,
-        lock_step: bool,
-        path_delay: float,
     ) -> None:
         self._core = core
         self._hold = hold
         self._limits = limits
-        self._stamps = CommandStamps(2.0 * limits.tip_age_limit, lock_step=lock_step)
-        self._delay_ns = round(path_delay * 1e9) if lock_step else 0
-        self._waiting: _Waiting | None = None
+        self._stamps = CommandStamps(2.0 * limits.tip_age_limit)
         self._on_path = False
         self.refused = 0
         self.newest_ns = 0
@@ -81,36 +62,10 @@ class CommandDesk:
         """Let in commands stamped after a time that went back."""
         self._stamps.readmit()
 
-    def needs_time(self, now: float) -> bool:
-        """Return whether a path waits for its time while somebody holds."""
-        return self._waiting is not None and self._hold.is_fresh(now)
-
     def submit(self, command: Command, now: float, publishers: int) -> bool:
         """Take a command, nothing checked; return whether it moves the needle from now on."""
         self.newest_ns = command.stamp_ns
-        if command.is_path and not self._is_due(command):
-            wrong = check_form(command)
-            if wrong is not None:
-                self._refuse(command, wrong)
-                return False
-            self._waiting = _Waiting(command, publishers, self._hold.presses)
-            return False
         return self._start(command, now, publishers)
-
-    def take_waiting(self, now: float) -> bool:
-        """Start the path whose time has come; return whether it moves the needle from now on."""
-        waiting = self._waiting
-        if waiting is None or not self._is_due(waiting.command):
-            return False
-        if self._hold.owner is not None and waiting.press == self._hold.presses:
-            if not self._hold.is_fresh(now):
-                # A lapse only pauses.
-                return False
-            self._waiting = None
-            return self._start(waiting.command, now, waiting.publishers)
-        self._waiting = None
-        self._refuse(waiting.command, Refusal(Rule.HOLD_TO_RUN, "the hold it was for has ended"))
-        return False
 
     def watch_path(self, now: float) -> None:
         """End a path whose tip has become too old: nobody says any more where the needle is."""
@@ -125,11 +80,6 @@ class CommandDesk:
             text = f"the tip behind the path is {clocks_differ(age) if age < 0.0 else old}"
             self._core.notice(text, Rule.TIP_AGE)
             self._core.abort(text)
-
-    def _is_due(self, command: Command) -> bool:
-        # One from the future is for the rules to refuse.
-        waits = command.stamp_ns <= self._stamps.newest_ns < command.stamp_ns + self._delay_ns
-        return not waits
 
     def _start(self, command: Command, now: float, publishers: int) -> bool:
         at = self._ready_for(command, now)

@@ -17,30 +17,19 @@ class CommandStamps:
     ----------
     horizon : float
         Up to which age stamps can be told apart [s].
-    lock_step : bool
-        Stamps age in ROS time, which a simulation lets go on only where all have answered, rather
-        than in steady time.
     """
 
-    def __init__(self, horizon: float, *, lock_step: bool) -> None:
+    def __init__(self, horizon: float) -> None:
         self._ages = StampAges(horizon)
-        self._lock_step = lock_step
         self._last_ns: int | None = None
         self._used_ns: deque[int] = deque(maxlen=_REMEMBERED_STEPS)
 
-    @property
-    def newest_ns(self) -> int:
-        """The newest ROS time noted [ns]; 0: none yet."""
-        return self._ages.newest_ns or 0
-
     def note(self, ros_ns: int, now: float) -> None:
         """Note that ROS time is `ros_ns` [ns] at steady time `now` [s]."""
-        self._ages.note(ros_ns, ros_ns * 1e-9 if self._lock_step else now)
+        self._ages.note(ros_ns, now)
 
     def age(self, stamp_ns: int, now: float) -> float:
         """Return the age of a stamp as `StampAges.age` does [s]."""
-        if self._lock_step and (newest := self._ages.newest_ns) is not None:
-            now = newest * 1e-9
         return self._ages.age(stamp_ns, now)
 
     def use(self, stamp_ns: int) -> None:

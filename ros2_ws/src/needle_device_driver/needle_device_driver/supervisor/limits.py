@@ -85,7 +85,7 @@ class SafetyLimits:
         2.0, "s", "A command is refused if the tip behind it is older, steady clock.", 0.05, 60.0
     )
     reply_age_limit: float = fixed_parameter(
-        0.1, "s", "A drive silent for longer has failed; over 0.5 s in lock step only.", 0.05, 10.0
+        0.1, "s", "A drive silent for longer has failed.", 0.05, 0.5
     )
     retraction_speed: float = fixed_parameter(
         0.002, "m/s", "Speed at which the needle is drawn out.", _SMALLEST, HARD_SPEED_CAP
@@ -146,15 +146,3 @@ def limit_parameter(name: str) -> Any:
     """Declare the field `name` of `SafetyLimits` as a field of a parameter dataclass."""
     (field,) = (field for field in dataclasses.fields(SafetyLimits) if field.name == name)
     return dataclasses.field(default=field.default, metadata=field.metadata)
-
-
-def path_delay_parameter() -> Any:
-    """Declare the field `path_delay` of a parameter dataclass: of a device in a simulation."""
-    return fixed_parameter(
-        0.04,
-        "s",
-        "Lock step: a path of continuous insertion takes effect so long after its tip's exposure, "
-        "in simulated time.",
-        0.0,
-        1.0,
-    )

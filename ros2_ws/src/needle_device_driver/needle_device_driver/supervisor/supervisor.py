@@ -33,12 +33,6 @@ class MotionSupervisor:
         The two axes.
     limits : SafetyLimits
         The bounds of the rules.
-    lock_step : bool
-        Simulated time stands still while somebody is silent: a hold that lapses pauses instead of
-        aborting (a release always aborts), and tips age in that time.
-    path_delay : float
-        In lock step a path takes effect so long after its stamp, in simulated time [s], so that
-        it does not depend on when it came; 0: as soon as it comes.
     feedback_delay : int
         How many cycles after its order a set-point shows in the axes' snapshots.
     switching : callable, optional
@@ -51,15 +45,12 @@ class MotionSupervisor:
         rotation: Axis,
         limits: SafetyLimits,
         *,
-        lock_step: bool = False,
-        path_delay: float = 0.0,
         feedback_delay: int = 0,
         switching: Callable[[], bool] = lambda: False,
     ) -> None:
         self._switching = switching
         self._axes = AxisPair(insertion, rotation)
         self._limits = limits
-        self._lock_step = lock_step
         self._hold = Hold(limits.hold_timeout)
         self._hold_refusals = HoldRefusals()
         self._estop_pressed = False
@@ -71,9 +62,7 @@ class MotionSupervisor:
             feedback_delay=feedback_delay,
             on_stop=self._hold.require_new_press,
         )
-        self._commands = CommandDesk(
-            self._core, self._hold, limits, lock_step=lock_step, path_delay=path_delay
-        )
+        self._commands = CommandDesk(self._core, self._hold, limits)
 
     # ---- what is told -------------------------------------------------------------------------
 
@@ -133,7 +122,7 @@ class MotionSupervisor:
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
-            needs_time=self.may_move(now) or self._switching() or self._commands.needs_time(now),
+            needs_time=self.may_move(now) or self._switching(),
             command_ns=self.command_ns,
             rotation_owed=self._core.rotation_owed,
             simulated=simulated,
@@ -200,7 +189,7 @@ class MotionSupervisor:
     def submit(self, command: Command, now: float, publishers: int = 1) -> None:
         """Take a command: it starts, or is refused whole; a result tells which.
 
-        A path takes the place of the one under way. In lock step it waits for its time.
+        A path takes the place of the one under way.
 
         Parameters
         ----------
@@ -321,8 +310,6 @@ class MotionSupervisor:
             self._core.drive_homing(period)
             return
         self._watch_hold(now)
-        if self._commands.take_waiting(now):
-            self._needle_out = False
         self._commands.watch_path(now)
         if self.may_move(now):
             self._core.drive(period, self._hold.speed_scale, now)
@@ -343,10 +330,6 @@ class MotionSupervisor:
         moving = core.moves_with_hold
         text = f"no hold message for {age:.3f} s, limit {self._hold.timeout:g} s"
         core.notice(text, Rule.HOLD_AGE)
-        if self._lock_step:
-            # Simulated time waits too: the same motion goes on later.
-            core.explain(text + ": paused")
-            return
         self._hold.require_new_press()
         core.explain(text + ": release and press again")
         if moving:

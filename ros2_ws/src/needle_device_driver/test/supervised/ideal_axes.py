@@ -109,9 +109,7 @@ class Bench:
     period = PERIOD
     run = staticmethod(run_at_once)
 
-    def __init__(
-        self, *, lock_step: bool = False, path_delay: float = 0.0, **limits: float
-    ) -> None:
+    def __init__(self, **limits: float) -> None:
         self.insertion = FakeAxis("insertion")
         self.rotation = FakeAxis("rotation")
         self.limits = SafetyLimits(**limits)
@@ -119,8 +117,6 @@ class Bench:
             self.insertion,
             self.rotation,
             self.limits,
-            lock_step=lock_step,
-            path_delay=path_delay,
         )
         self.now = 100.0
         self.ros_ns = 1_000_000_000

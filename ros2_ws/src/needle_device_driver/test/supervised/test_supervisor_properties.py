@@ -142,21 +142,21 @@ def _run(bench: Bench, events: list[Event]) -> None:
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
-@given(events=_events, pause=st.booleans())
+@given(events=_events)
 def test_never_without_hold_never_beyond_limits_from_the_start(
-    make_bench: type[Bench], events: list[Event], pause: bool
+    make_bench: type[Bench], events: list[Event]
 ) -> None:
-    bench = make_bench(lock_step=pause, **_LIMITS)
+    bench = make_bench(**_LIMITS)
     bench.run(bench.supervisor.configure(bench.now))
     _run(bench, events)
 
 
 @settings(max_examples=150, deadline=None, derandomize=True)
-@given(events=_events, pause=st.booleans())
+@given(events=_events)
 def test_never_without_hold_never_beyond_limits_once_ready(
-    make_bench: type[Bench], events: list[Event], pause: bool
+    make_bench: type[Bench], events: list[Event]
 ) -> None:
-    bench = make_bench(lock_step=pause, **_LIMITS)
+    bench = make_bench(**_LIMITS)
     bench.ready(holding=False)
     _run(bench, [lambda b: b.hold(), lambda b: b.command(), *events])
 

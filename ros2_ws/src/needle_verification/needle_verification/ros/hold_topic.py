@@ -29,11 +29,6 @@ class HoldTopic:
         self._promise = [] if lifetime is None else [lifetime]
         self._last_stamp = 0
 
-    @property
-    def is_heard(self) -> bool:
-        """Whether anybody listens."""
-        return bool(self._publisher.get_subscription_count())
-
     def publish(self, *, pressed: bool, speed: float) -> None:
         """Say whether the hold is pressed, and at which share of the nominal speed."""
         # Stamps must increase whatever the system clock does.

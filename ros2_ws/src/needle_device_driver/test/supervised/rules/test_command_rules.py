@@ -165,26 +165,6 @@ def test_tip_age_on_the_steady_clock_while_ros_time_stands_still(bench: Bench) -
     assert bench.status.watchdog_trips == 1
 
 
-def test_tip_age_in_lock_step_while_simulated_time_waits(make_bench: type[Bench]) -> None:
-    bench = make_bench(lock_step=True)
-    bench.ready()
-    stamp = bench.ros_ns
-    bench.now += 100.0
-    bench.hold()
-    bench.command(stamp_ns=stamp)
-    assert in_state(bench, State.MOVING)
-
-
-def test_tip_age_in_lock_step_counts_simulated_seconds(make_bench: type[Bench]) -> None:
-    bench = make_bench(lock_step=True)
-    bench.ready()
-    stamp = bench.ros_ns
-    bench.ros_ns += round((bench.limits.tip_age_limit + 0.1) * 1e9)
-    bench.supervisor.note_time(bench.ros_ns, bench.now)
-    bench.command(stamp_ns=stamp)
-    assert "old" in refused(bench, Rule.TIP_AGE)
-
-
 def test_tip_age_counts_steady_seconds_while_ros_time_runs_fast(bench: Bench) -> None:
     bench.ready()
     stamp = bench.ros_ns

@@ -110,28 +110,6 @@ def test_hold_new_press_is_asked_of_nobody_who_is_silent_or_presses_beside_the_o
     assert bench.status.press_again == ""
 
 
-def test_hold_age_pauses_a_lock_step_simulation_and_goes_on(make_bench: type[Bench]) -> None:
-    bench = make_bench(lock_step=True)
-    bench.ready()
-    bench.command()
-    bench.cycle(5, holding=True)
-    bench.now += 1.0
-    at = bench.positions
-    bench.cycle(5)
-    assert bench.positions == at
-    assert not bench.supervisor.may_move(bench.now)
-    assert in_state(bench, State.MOVING)
-    assert "paused" in bench.status.reason
-    # What happens is what would have happened: the run repeats.
-    assert bench.status.watchdog_trips == 0
-    bench.cycle(20, holding=True)
-    assert bench.results[-1].outcome == "succeeded"
-    bench.command()
-    bench.now += 1.0
-    bench.hold(False)
-    assert bench.results[-1].outcome == "aborted: hold released"
-
-
 @pytest.mark.parametrize("press_before", ["enable", "reset", "stop"])
 def test_hold_new_press_one_from_before_does_not_count(bench: Bench, press_before: str) -> None:
     bench.home()

@@ -256,50 +256,6 @@ def test_hold_to_run_a_release_ends_a_path_at_once(bench: Bench) -> None:
     assert bench.last_rule is Rule.HOLD_TO_RUN
 
 
-def delayed() -> Bench:
-    bench = Bench(lock_step=True, path_delay=0.04)
-    bench.ready()
-    return bench
-
-
-@pytest.mark.parametrize("late", [0, 1, 2])
-def test_no_motion_by_itself_in_lock_step_a_path_takes_effect_a_stated_time_after_its_tip(
-    late: int,
-) -> None:
-    bench = delayed()
-    stamp = bench.ros_ns
-    bench.cycle(late, holding=True)
-    path(bench, (0.0, 0.0), (1.0, 0.1), (2.0, 0.1), stamp_ns=stamp)
-    moved = []
-    for _ in range(4 - late):
-        assert bench.status.needs_time
-        bench.cycle(holding=True)
-        moved.append(bench.positions[0] > 0.0)
-    assert moved == [False, True, True, True][late:] if late < 2 else [True, True]
-
-
-def test_command_form_and_age_of_a_path_that_would_wait_are_refused_at_once() -> None:
-    bench = delayed()
-    path(bench, (0.0, 0.0), (1.0, 0.0), (0.9, 0.0))
-    assert bench.last_rule is Rule.COMMAND_FORM
-    stamp = path(bench, (0.0, 0.0), (1.0, 0.0), (2.0, 0.0), stamp_ns=bench.ros_ns + 5_000_000_000)
-    assert (bench.results[-1].stamp_ns, bench.last_rule) == (stamp, Rule.TIP_AGE)
-    bench.cycle(5, holding=True)
-    assert bench.positions == (0.0, 0.0)
-
-
-def test_hold_new_press_a_path_that_waits_is_not_for_another_press() -> None:
-    bench = delayed()
-    stamp = path(bench, (0.0, 0.0), (1.0, 0.1), (2.0, 0.1))
-    bench.hold(False)
-    bench.hold()
-    bench.cycle(5, holding=True)
-    assert bench.positions == (0.0, 0.0)
-    assert [(r.stamp_ns, r.outcome) for r in bench.results] == [
-        (stamp, "aborted: the hold it was for has ended")
-    ]
-
-
 def test_hold_age_a_hold_lives_as_long_as_it_says_and_never_longer(bench: Bench) -> None:
     for lifetime, lives in ((0.1, 0.1), (5.0, bench.limits.hold_timeout)):
         bench = Bench()
