@@ -33,7 +33,6 @@ from needle_core.ros.conversions import (
     RELIABLE,
     to_nanoseconds,
 )
-from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
@@ -103,12 +102,7 @@ class LiveViewNode(WholeNode):
         self.create_subscription(
             String, "stereo_tracker/calibration", self._on_calibration, LATCHED
         )
-        self._life = LifeSigns(
-            self,
-            self._diagnostics,
-            "shows the needle while somebody looks",
-            hearing.missing,
-        )
+        self.get_logger().info("shows the needle while somebody looks")
         self.create_timer(1.0 / values.rate, self._show, clock=STEADY_CLOCK)
 
     def _on_calibration(self, message: String) -> None:

@@ -18,7 +18,6 @@ from needle_core.convert import from_ros
 from needle_core.errors import UserError
 from needle_core.ros.base_node import DiagnosticsPublisher
 from needle_core.ros.conversions import JOINT_STATES, LATCHED, RELIABLE, to_nanoseconds, values_of
-from needle_core.ros.discovery import unpublished
 from needle_tracker.answers.tracker_messages import insertion_of, rotation_of
 
 # Nothing of a rig is farther off, or less certain [m], [m^2]; what says so is not believed.
@@ -44,13 +43,10 @@ class NeedleHearing:
 
     def __init__(self, node: Node, diagnostics: DiagnosticsPublisher) -> None:
         self.needle = LiveNeedle()
-        self._node = node
         self._diagnostics = diagnostics
         hear = node.create_subscription
-        self._awaited = [
-            hear(PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip, RELIABLE),
-            hear(JointState, "joint_states", self._on_joints, JOINT_STATES),
-        ]
+        hear(PoseWithCovarianceStamped, "needle/tip_pose", self._on_tip, RELIABLE)
+        hear(JointState, "joint_states", self._on_joints, JOINT_STATES)
         hear(PoseWithCovarianceStamped, "needle/estimate", self._on_estimate, RELIABLE)
         hear(DiagnosticStatus, "needle/controller_status", self._on_controller, LATCHED)
         # A latched plane comes to whoever comes late, a plain one to the plain subscription alone.
@@ -62,10 +58,6 @@ class NeedleHearing:
             LATCHED,
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
-
-    def missing(self) -> list[str]:
-        """Return the topics that nobody publishes and without which there is no needle."""
-        return unpublished(self._node, self._awaited)
 
     def _on_joints(self, message: JointState) -> None:
         insertion = insertion_of(from_ros(messages.JointState, message))

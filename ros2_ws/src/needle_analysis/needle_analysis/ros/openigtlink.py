@@ -16,7 +16,6 @@ from needle_analysis.ros.needle_hearing import NeedleHearing
 from needle_core.commands.cli import EXIT_BAD_INPUT
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
@@ -74,12 +73,8 @@ class OpenIGTLinkNode(WholeNode):
         self.server = LinkServer(values.address, values.port)
         hearing = NeedleHearing(self, self._diagnostics)
         self._needle = hearing.needle
-        self._life = LifeSigns(
-            self,
-            self._diagnostics,
-            f"shows the needle at {values.address}, port {self.server.port}",
-            hearing.missing,
-        )
+        place = f"{values.address}, port {self.server.port}"
+        self.get_logger().info(f"shows the needle at {place}")
         self.create_timer(1.0 / values.rate, self._show, clock=STEADY_CLOCK)
 
     def destroy_node(self) -> None:

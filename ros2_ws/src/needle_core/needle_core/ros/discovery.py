@@ -13,7 +13,6 @@ from typing import Any
 from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from type_description_interfaces.srv import GetTypeDescription
 
 from needle_core.ros.question import Question
@@ -46,34 +45,6 @@ def unrecorded(node: Node, publishers: Iterable[Publisher[Any]]) -> list[str]:
         for publisher in publishers
         if RECORDER not in _listeners(node, publisher.topic_name)
     ]
-
-
-def unheard(node: Node, topics: Iterable[str]) -> list[str]:
-    """Return the topics that nobody listens to but `node` itself or a recorder.
-
-    Parameters
-    ----------
-    node : Node
-        The node that asks.
-    topics : iterable of str
-        Names as the node would give them; each missing one comes as `subscriber of T`.
-    """
-    nobody = {RECORDER, _UNKNOWN, node.get_name()}
-    return [f"subscriber of {topic}" for topic in topics if not _listeners(node, topic) - nobody]
-
-
-def unpublished(node: Node, subscriptions: Iterable[Subscription[Any]]) -> list[str]:
-    """Return what nobody publishes of what is listened to, as `publisher of T`.
-
-    Parameters
-    ----------
-    node : Node
-        The node that listens.
-    subscriptions : iterable of Subscription
-        Its own.
-    """
-    topics = [subscription.topic_name for subscription in subscriptions]
-    return [f"publisher of {topic}" for topic in topics if not node.count_publishers(topic)]
 
 
 def full_name(namespace: str, name: str) -> str:

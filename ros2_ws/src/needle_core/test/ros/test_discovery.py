@@ -11,7 +11,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from std_msgs.msg import Header
 
-from needle_core.ros.discovery import AnsweringNodes, unheard, unrecorded
+from needle_core.ros.discovery import AnsweringNodes, unrecorded
 
 PATIENCE = 20.0
 
@@ -56,20 +56,14 @@ def graph() -> Iterator[Graph]:
     context.try_shutdown()
 
 
-def test_a_recorder_is_nobody_who_acts(graph: Graph) -> None:
+def test_what_no_recorder_hears_is_named(graph: Graph) -> None:
     rig = graph.node("rig")
     words = rig.create_publisher(Header, "words", 10)
     recorder = graph.node("recorder")
-    assert unheard(rig, [words.topic_name]) == ["subscriber of /words"]
     assert unrecorded(rig, [words]) == ["recorder of /words"]
 
     recorder.create_subscription(Header, "words", lambda _: None, 10)
     graph.until(lambda: unrecorded(rig, [words]) == [])
-    assert words.get_subscription_count() == 1
-    assert unheard(rig, [words.topic_name]) == ["subscriber of /words"]
-
-    graph.node("controller").create_subscription(Header, "words", lambda _: None, 10)
-    graph.until(lambda: unheard(rig, [words.topic_name]) == [])
 
 
 def test_a_node_counts_once_it_has_answered(graph: Graph) -> None:

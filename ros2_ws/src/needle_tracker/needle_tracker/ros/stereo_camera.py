@@ -27,8 +27,6 @@ from needle_core.ros.base_node import (
     run_node,
 )
 from needle_core.ros.conversions import IMAGES, to_stamp
-from needle_core.ros.discovery import unheard
-from needle_core.ros.life_signs import LifeSigns
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
@@ -132,14 +130,7 @@ class StereoCameraNode(WholeNode):
         self._begun = time.monotonic()
         self.create_timer(1.0 / self._parameters.rate, self._tick, clock=STEADY_CLOCK)
         self.create_timer(0.5, self._report, clock=STEADY_CLOCK)
-        images = [f"stereo/{side}/image_raw" for side in ("left", "right")]
-        self._life = LifeSigns(
-            self,
-            self._diagnostics,
-            f"publishes images at {self._parameters.rate:g} Hz",
-            lambda: [] if self._awaited() else unheard(self, images),
-            alone_on=images,
-        )
+        self.get_logger().info(f"publishes images at {self._parameters.rate:g} Hz")
         self._report()
 
     def close(self) -> None:
