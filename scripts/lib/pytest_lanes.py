@@ -35,7 +35,6 @@ LONG_FILES = (
     "tests/site/test_docs_site.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_run.py",
     "ros2_ws/src/needle_verification/test/checks/test_check_driver.py",
-    "ros2_ws/src/needle_bringup/test/graph/test_console.py",
     "ros2_ws/src/needle_bringup/test/graph/test_graph_interrupt.py",
     "ros2_ws/src/needle_verification/test/soak/test_rig_run.py",
     "ros2_ws/src/needle_verification/test/studies/test_obstacle_study.py",

@@ -54,8 +54,8 @@ class DeviceDriver(Component):
         The node's parameters, a `DeviceDriverParameters`.
     name : str
         How it signs what it says.
-    look_around : float
-        How long another device has to show itself before the drives are looked for [s].
+    search_from : float
+        Steady time of the first look for the drives: another device shows itself before [s].
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class DeviceDriver(Component):
         settings: DriverParameters,
         name: str = name,
         *,
-        look_around: float = 0.0,
+        search_from: float = 0.0,
     ) -> None:
         self.settings = settings
         self.link = FrameLink(settings.link_settings)
@@ -103,7 +103,7 @@ class DeviceDriver(Component):
         self._refusal = ""
         self._times = CycleTimes(PERIOD)
         self._is_ending = False
-        self._retry_at, self._give_up_at = look_around, math.inf
+        self._retry_at, self._give_up_at = search_from, math.inf
         self._cycle: tuple[Running[Any], Moment] | None = None
         self.inputs = tuple(
             dataclasses.replace(row, handler=self._guarded(row.handler))

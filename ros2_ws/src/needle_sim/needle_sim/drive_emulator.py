@@ -41,6 +41,8 @@ class DriveEmulator(Component):
         The node's parameters.
     name : str
         Full name of the node.
+    now : float
+        Steady time at which the power comes [s].
 
     Attributes
     ----------
@@ -50,10 +52,12 @@ class DriveEmulator(Component):
 
     name = "drive_emulator"
 
-    def __init__(self, settings: DriveEmulatorParameters, name: str = name) -> None:
+    def __init__(
+        self, settings: DriveEmulatorParameters, name: str = name, now: float = 0.0
+    ) -> None:
         self.name, self.settings = name, settings
         clock = MotionClock.STEADY
-        self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, 0.0)
+        self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, now)
         self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
         self._is_heard = False
         self.outputs = (Output(POSITIONS, m.JointState),)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import multiprocessing
 import signal
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from typing import Any, ClassVar
 
 from needle_core.component import Actions, Moment, Port, Publish
+from needle_core.process.end_request import ENDING_SIGNALS
 from needle_sim.camera_sensor import CAMERAS, DistantCameras, Exposure, StereoCameras
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -59,6 +62,11 @@ class RenderingProcess:
         self._pool = ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), RenderingProcess._begin, (settings,)
         )
+        # The process has from its first moment on what its parent blocks: signals to the whole
+        # group, by which its parent ends in order, and then ends it.
+        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
+        self._pool.submit(int)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Begin to hand over images."""
@@ -66,12 +74,14 @@ class RenderingProcess:
 
     def send(self, batch: tuple[Exposure, ...]) -> None:
         """Render exposures, one after the other."""
-        for exposure in batch:
-            self._pool.submit(RenderingProcess._render, exposure).add_done_callback(self._take)
+        with contextlib.suppress(BrokenProcessPool):
+            for exposure in batch:
+                self._pool.submit(RenderingProcess._render, exposure).add_done_callback(self._take)
 
     def close(self) -> None:
         """Complete what the cameras write, and end."""
-        self._pool.submit(RenderingProcess._end)
+        with contextlib.suppress(BrokenProcessPool):
+            self._pool.submit(RenderingProcess._end)
         self._pool.shutdown(wait=True)
 
     def _take(self, done: Future[list[Publish]]) -> None:
@@ -80,8 +90,7 @@ class RenderingProcess:
 
     @staticmethod
     def _begin(settings: SimRigParameters) -> None:
-        """Make the cameras of this process, which ends with its parent and not by a signal."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        """Make the cameras of this process, which ends with its parent."""
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         RenderingProcess._cameras = StereoCameras(settings)
 

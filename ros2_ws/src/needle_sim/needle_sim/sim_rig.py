@@ -43,6 +43,8 @@ class SimRig(Component):
         Full name of the node.
     see : callable
         Makes what sees the needle, of bench and settings.
+    now : float
+        Steady time [s].
     """
 
     name = "sim_rig"
@@ -52,6 +54,7 @@ class SimRig(Component):
         settings: SimRigParameters,
         name: str = name,
         see: Callable[[SimulatedBench, SimRigParameters], Sensor] = make_sensor,
+        now: float = 0.0,
     ) -> None:
         self.name, self.settings = name, settings
         self._bench = SimulatedBench(
@@ -70,7 +73,7 @@ class SimRig(Component):
         self._ended = ""
         self._is_tip_wanted = False
         self._exposures = 0
-        self._exposed_at = 0.0
+        self._exposed_at = self._begun = now
         status = Input("needle/controller_status", ControllerStatus, self._on_controller, LATCHED)
         self.inputs = (*self._device.inputs, status)
         self.outputs = (
@@ -120,7 +123,10 @@ class SimRig(Component):
         self._exposed_at = at.steady
         yield Publish("sim/tip_pose", self._truth(at.stamp_ns))
         yield from self._sensor.expose(number, at.stamp_ns)
-        values = {"exposures": str(self._exposures), "simulated_s": f"{at.steady:.2f}"}
+        values = {
+            "exposures": str(self._exposures),
+            "simulated_s": f"{at.steady - self._begun:.2f}",
+        }
         yield Diagnose("simulation", Diagnostic(Level.OK, "running", values))
 
     def _truth(self, stamp_ns: int) -> m.Pose:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable
 from typing import Any, TextIO
 
@@ -61,7 +62,7 @@ def main() -> int:
     return run_component(
         "simulated_operator",
         SimulatedOperatorParameters,
-        SimulatedOperator,
+        lambda settings, name: SimulatedOperator(settings, name, time.monotonic()),
         help_text=HELP,
         ports=lambda _: {PROGRESS: _ProgressPort()},
         interrupted=EXIT_INTERRUPTED,

@@ -50,16 +50,20 @@ class SimulatedOperator(Component):
         The node's parameters.
     name : str
         Full name of the node, by which the device knows whose hold it is.
+    now : float
+        Steady time [s].
     """
 
     name = "simulated_operator"
 
-    def __init__(self, settings: SimulatedOperatorParameters, name: str = name) -> None:
+    def __init__(
+        self, settings: SimulatedOperatorParameters, name: str = name, now: float = 0.0
+    ) -> None:
         self.name, self.settings = name, settings
         self._unrecorded: Sequence[str] = ("recorder",) if settings.wait_for_recorder else ()
         self._nodes: frozenset[str] = frozenset()
         self._sequence = OperatorSequence(
-            0.0,
+            now,
             self.name,
             wait_timeout=settings.wait_timeout,
             stall_timeout=settings.stall_timeout,

@@ -57,8 +57,9 @@ def test_it_steers_records_and_reports(run: Run, level: str) -> None:
     # One before the first step, one after each; one for every second that nobody waits for a tip.
     assert 11 <= counts["/needle/tip"] <= counts["/sim/tip_pose"]
     assert mode or counts["/sim/tip_pose"] <= 12
-    # What was recorded is what the code does, taken through it again.
-    assert rerun.main([str(bag)]) == 0
+    # What was recorded is what the code does, taken through it again. In real time a node may hear
+    # less than the recorder until it knows everybody.
+    assert mode or rerun.main([str(bag)]) == 0
 
 
 def test_variables_of_another_set_up_are_named_first_and_keep_no_node_away(

@@ -97,7 +97,7 @@ class ComponentNode(WholeNode):
         **node_arguments: Any,
     ) -> None:
         super().__init__(name, **node_arguments)
-        self._own, self._begun = name, time.monotonic()
+        self._own = name
         # A service that answers later keeps no other callback from running.
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
@@ -148,8 +148,7 @@ class ComponentNode(WholeNode):
             port.close()
 
     def _moment(self, sent_ns: int = 0) -> Moment:
-        steady = time.monotonic() - self._begun
-        return Moment(steady, self.get_clock().now().nanoseconds, sent_ns)
+        return Moment(time.monotonic(), self.get_clock().now().nanoseconds, sent_ns)
 
     def _name_of(self, topic: str) -> str:
         """Return a row's name as rclpy resolves it: below the node's own where it says so."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import time
 
 from needle_core.can_frame import CAN
 from needle_core.process.reach import DISCOVERY, is_open
@@ -38,7 +39,8 @@ _LOOK_AROUND = 0.3
 
 def make_driver(settings: DriverParameters, name: str) -> DeviceDriver:
     """Return the driver, which gives another device time to show itself."""
-    return DeviceDriver(settings, name, look_around=DISCOVERY if is_open() else _LOOK_AROUND)
+    look_around = DISCOVERY if is_open() else _LOOK_AROUND
+    return DeviceDriver(settings, name, search_from=time.monotonic() + look_around)
 
 
 def main() -> int:

@@ -6,6 +6,7 @@ import os
 import select
 import sys
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -102,7 +103,7 @@ def main() -> int:
     return run_component(
         "drive_emulator",
         DriveEmulatorParameters,
-        DriveEmulator,
+        lambda settings, name: DriveEmulator(settings, name, time.monotonic()),
         help_text=HELP,
         ports=_ports,
         shared_memory=False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Mapping
 
 from needle_core.component import RealPort
@@ -28,11 +29,11 @@ Services    levels tip and camera: device/{home,retract,stop,reset},
 
 def _make(settings: SimRigParameters, name: str) -> SimRig:
     if settings.level == "tip":
-        return SimRig(settings, name)
+        return SimRig(settings, name, now=time.monotonic())
     # The renderer takes longer to load than all else: not where nothing is drawn.
     from needle_sim.rendering import RenderedCameras  # noqa: PLC0415
 
-    return SimRig(settings, name, RenderedCameras)
+    return SimRig(settings, name, RenderedCameras, time.monotonic())
 
 
 def _ports(settings: SimRigParameters) -> Mapping[str, RealPort]:

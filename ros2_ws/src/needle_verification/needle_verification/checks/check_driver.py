@@ -66,7 +66,6 @@ BOUNDS = {
 NUISANCES = {
     "points": "trajectories of 1,000,000 points",
     "name": "holds with a name of 1 MB",
-    "parameters": "set_parameters with 20,000 names",
     "flood": "10,000 messages/s on each topic that the driver hears",
 }
 # The drives' watchdog, and the copy of a message of 56 MB [s].
@@ -175,23 +174,6 @@ def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
         )
 
 
-def two_rigs(_: Workbench, starts: int = MOMENTS) -> Iterator[Finding]:
-    """Move nothing real when a simulation is started beside it, in any order."""
-    outcomes = _trials("two_rigs", starts)
-    moved = [
-        one["order"] for one in outcomes if one["moved_mm"] or one["turned_rad"] or one["enabled"]
-    ]
-    unnamed = [one for one in outcomes if not one["named"]]
-    yield Finding(
-        "two_rigs",
-        f"a real driver beside a simulation in one domain, {len(outcomes)} starts in any order",
-        "the real one is never enabled and never moves; who gives way names the other",
-        f"enabled or moved in {len(moved)}{''.join(f' ({order})' for order in moved)}, "
-        f"nobody named in {len(unnamed)}",
-        len(outcomes) == starts and not moved and not unnamed,
-    )
-
-
 def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
     """Hold up neither cycle nor emergency stop by anything that others send."""
     for outcome in _trials("nuisances", seconds, *NUISANCES):
@@ -230,7 +212,6 @@ CHECKS: tuple[Check, ...] = (
     many_steps,
     faults,
     killed_nodes,
-    two_rigs,
     nuisances,
     fuzz,
 )

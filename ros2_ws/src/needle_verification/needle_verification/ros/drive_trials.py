@@ -1,7 +1,7 @@
 """Trials of the device driver against the emulated drives, each printed as one JSON object.
 
 `python -m needle_verification.ros.drive_trials steps 10000`, `... faults 50 cut_bus unplug`,
-`... kills 50 simulated_operator`, `... two_rigs 50`, `... nuisances 5 points flood` (5 s of each),
+`... kills 50 simulated_operator`, `... nuisances 5 points flood` (5 s of each),
 `... fuzz 900` (seconds).
 """
 
@@ -18,12 +18,11 @@ from needle_verification.ros.graph_kills import KILLED, kill_trials
 from needle_verification.ros.listening_node import ros
 from needle_verification.ros.nuisance import NUISANCE_KINDS
 from needle_verification.ros.nuisance_trials import nuisance_trials
-from needle_verification.ros.two_rigs import two_rigs_trials
 from needle_verification.trials.drive_steps import random_steps
 from needle_verification.trials.trial_runner import Outcomes, run_trials, trials_of
 
 KINDS = {
-    **{name: (name,) for name in ("steps", "two_rigs", "fuzz")},
+    **{name: (name,) for name in ("steps", "fuzz")},
     **{"faults": FAULTS, "kills": KILLED, "nuisances": NUISANCE_KINDS},
 }
 
@@ -48,8 +47,6 @@ def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Outcomes:
             yield from nuisance_trials(folder, domain, trials, float(given.count))
         elif given.trial == "fuzz":
             yield from fuzz_trials(folder, domain, float(given.count), given.seed)
-        elif given.trial == "two_rigs":
-            yield from two_rigs_trials(folder, domain, trials)
         else:
             yield from kill_trials(folder, domain, trials)
 

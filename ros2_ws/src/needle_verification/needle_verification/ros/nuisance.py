@@ -13,9 +13,7 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
-from rcl_interfaces.srv import SetParameters
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Joy
 from std_msgs.msg import Bool
@@ -26,9 +24,8 @@ from needle_core.ros.conversions import HOLD, RELIABLE
 
 POINTS = 1_000_000
 NAME = 1_000_000
-NAMES = 20_000
 PER_SECOND = 10_000
-NUISANCE_KINDS = ("points", "name", "parameters", "flood")
+NUISANCE_KINDS = ("points", "name", "flood")
 _LIMIT = 20.0
 # Long ones go out one after the other: what is sent at once would be several at once.
 _PAUSE = 0.5
@@ -60,13 +57,6 @@ def _prepared(node: Node, kind: str) -> tuple[Callable[[], None], float]:
         hold = Joy(axes=[1.0], buttons=[1])
         hold.header.frame_id = "n" * NAME
         return _sender(node, Joy, "device/hold", HOLD, hold), _PAUSE
-    if kind == "parameters":
-        client = node.create_client(SetParameters, "device_driver/set_parameters")
-        if not client.wait_for_service(_LIMIT):
-            raise UserError("device_driver/set_parameters is not there")
-        one = Parameter("max_speed", value=0.004).to_parameter_msg()
-        request = SetParameters.Request(parameters=[one] * NAMES)
-        return lambda: client.call_async(request), _PAUSE
     if kind == "flood":
         hold = Joy(axes=[1.0], buttons=[1])
         hold.header.frame_id = "nuisance"

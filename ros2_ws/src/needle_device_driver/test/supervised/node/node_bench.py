@@ -203,7 +203,14 @@ class Rig:
 
     def insist(self, name: str, data: bool | None = None) -> None:
         """Call a service until it agrees: it refuses while the axes switch off."""
-        self.until(lambda: bool(self.call(name, data).success), name)
+        while not self.call(name, data).success:
+            # Calls without a break would keep the port's thread from running.
+            self.cycles(5)
+
+    def cycles(self, count: int) -> None:
+        """Let so many cycles go by."""
+        heard = len(self.partner.joints)
+        self.until(lambda: len(self.partner.joints) > heard + count, "cycles")
 
     def ready(self) -> None:
         self.matched()
@@ -213,8 +220,7 @@ class Rig:
         self.until(lambda: self.partner.status["homed"] == "true", "homed")
         self.insist("enable", True)
         self.until(lambda: all(drive.state == "enabled" for drive in self.peer.drives), "power")
-        joints = len(self.partner.joints)
-        self.until(lambda: len(self.partner.joints) > joints + 5, "some cycles")
+        self.cycles(5)
         self.hold(False)
         self.hold(True)
         self.until(lambda: self.partner.status["hold_owner"] == "partner", "hold")

@@ -70,6 +70,16 @@ def test_the_emergency_stop_stops_both_drives_and_its_reset_moves_nothing(make_r
     assert rig.positions == at
 
 
+def test_drives_that_fall_silent_are_a_fault(make_rig: Make) -> None:
+    """The port's thread and the node read one clock: else a reply would never be old."""
+    rig = make_rig()
+    rig.ready()
+    for drive in rig.peer.drives:
+        drive.silent = True
+    rig.until(lambda: rig.partner.status["state"] == "FAULT", "the fault")
+    assert "reply" in rig.partner.status["fault"]
+
+
 def test_its_end_in_the_middle_of_a_step_leaves_the_drives_off(make_rig: Make) -> None:
     rig = make_rig()
     rig.ready()

@@ -49,7 +49,7 @@ def test_another_device_stops_everything_until_it_is_gone_and_reset(make_rig: Ma
     assert "other_rig" in rig.call("reset").message
     assert rig.send(rig.message()).frame_id.startswith("aborted: ")
     other.destroy_node()
-    rig.until(lambda: rig.call("reset").success, "alone again")
+    rig.insist("reset")
     assert rig.positions == at
 
 
