@@ -60,6 +60,7 @@ def fault_and_reset(bench: DriveBench) -> int:
     bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
+    bench.cycle(5)
     assert bench.run(bench.supervisor.reset(bench.clock())).success
     bench.cycle(3)
     return start

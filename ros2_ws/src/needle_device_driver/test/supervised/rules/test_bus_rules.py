@@ -276,6 +276,7 @@ def test_drive_reboot_one_that_starts_by_itself_is_set_up_anew_all_the_same(
     bench.bus.flush()
     bench.cycle(1, holding=True)
     bench.hold(False)
+    bench.cycle(5)
     assert bench.run(bench.supervisor.reset(bench.clock())).success
     assert bench.written(INSERTION, 0x1016, 1) != bytes(4)
     assert not bench.status.homed
@@ -344,8 +345,8 @@ def test_drive_reboot_on_the_way_out_leaves_what_is_left_of_the_way(
     for cycles in (10, 100):
         bench.insertion.reboot()
         bench.bus.flush()
-        bench.cycle(1)
         bench.hold(False)
+        bench.cycle(8)
         assert bench.run(bench.supervisor.reset(bench.clock())).success
         bench.cycle(5)
         assert bench.supervisor.enable(True, bench.clock()).success

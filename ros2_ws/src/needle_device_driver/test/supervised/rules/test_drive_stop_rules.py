@@ -163,14 +163,32 @@ def test_drive_emergency_a_fault_without_message_counts_too(drive_bench: DriveBe
     recovers(bench)
 
 
+def test_drive_emergency_no_reset_while_the_other_axis_is_still_stopping(
+    drive_bench: DriveBench,
+) -> None:
+    bench = drive_bench
+    bench.moving()
+    bench.insertion.fail(0x7305)
+    bench.bus.flush()
+    bench.cycle(1, holding=True)
+    bench.hold(False)
+    assert bench.rotation.state == "quick stop"
+    reply = bench.run(bench.supervisor.reset(bench.clock()))
+    assert reply.message == "rotation axis: is still stopping: reset again when it stands"
+    assert in_state(bench, State.FAULT)
+    bench.cycle(5)
+    assert bench.rotation.state == "disabled"
+    assert bench.run(bench.supervisor.reset(bench.clock())).success
+
+
 def test_drive_emergency_that_stays_keeps_the_device_in_fault(drive_bench: DriveBench) -> None:
     bench = drive_bench
     bench.moving()
     bench.insertion.fail(0x7121)
     bench.insertion.deaf_to_reset = True
     bench.bus.flush()
-    bench.cycle(1, holding=True)
     bench.hold(False)
+    bench.cycle(5)
     took = bench.insertion.sdo
 
     def late(data: bytes) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections import deque
 from collections.abc import Sequence
 
@@ -92,7 +91,6 @@ class Watch:
         self._page_holds = False
         self._page_ended = -1.0
         self._must_press_after = 0.0
-        self._stopped_at = -math.inf
         self._status = DeviceStatus()
         self._status_at = 0.0
         self._homing_until = -1.0
@@ -160,8 +158,6 @@ class Watch:
         ):
             # Enabled, or reset: a press from before may not count.
             self._must_press_after = at
-        if state != before and state in ("FAULT", "ESTOPPED"):
-            self._stopped_at = at
         if self._is_homing:
             # Whatever ends it, the drives' own watchdog bounds what is under way.
             self._homing_until = at + WATCHDOG_BOUND
@@ -276,9 +272,7 @@ class Watch:
                 f"motion {by_others:.3f} s after the last press of an owner reached the device",
             )
         since = max(self._pressed_since, self._other_since)
-        # An axis that was blocked may come free before its drive has stopped, reset or not.
-        stops = at <= self._stopped_at + WATCHDOG_BOUND
-        if begins and not stops and since < self._must_press_after:
+        if begins and since < self._must_press_after:
             self.violate(
                 "no_motion_by_itself",
                 at,
