@@ -12,7 +12,7 @@ from needle_verification.checking import SimulateRun, Workbench, payloads, unrea
 
 SHORT = ("--depth-mm", "10")
 SIMULATE = (sys.executable, "-m", "needle_bringup.simulation.simulate")
-TOPICS = ("/needle/tip", "/device/joint_trajectory", "/sim/tip_pose")
+TOPICS = ("/needle/tip", "/device/joint_trajectory", "/device/result", "/sim/tip_pose")
 
 Run = Callable[..., SimulateRun]
 
@@ -52,8 +52,14 @@ def test_it_steers_records_and_reports(run: Run, level: str) -> None:
     assert -4.0 < summary["r1_final_mm"] < -2.0
     assert (bag / "report.html").stat().st_size > 1000
     assert list(bag.glob("*.png"))
-    counts = {topic: len(data) for topic, data in payloads(bag, TOPICS).items()}
-    assert counts["/device/joint_trajectory"] == 10
+    recorded = payloads(bag, TOPICS)
+    counts = {topic: len(data) for topic, data in recorded.items()}
+    results = recorded["/device/result"]
+    assert len(results) == counts["/device/joint_trajectory"]
+    assert sum(b"succeeded" in result for result in results) == 10
+    # In real time a hold may come later than its age limit: that step is aborted and asked anew.
+    late = [result for result in results if b"aborted: no hold message for" in result]
+    assert len(results) == 10 + (len(late) if mode else 0)
     # One before the first step, one after each; one for every second that nobody waits for a tip.
     assert 11 <= counts["/needle/tip"] <= counts["/sim/tip_pose"]
     assert mode or counts["/sim/tip_pose"] <= 12
