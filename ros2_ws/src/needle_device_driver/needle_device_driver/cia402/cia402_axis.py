@@ -175,14 +175,7 @@ class Cia402Axis(Axis):
             self._send_order()
 
     def reset(self) -> Procedure[None]:
-        """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing.
-
-        Raises
-        ------
-        AxisError
-            If any of it fails, or the axis is still stopping: who resets would be told that it
-            stands.
-        """
+        """Open a lost link, set a rebooted drive up again, acknowledge its fault; moves nothing."""
         self._machine.want(Goal.OFF)
         self._homing = None
         with self._as_axis_error():
@@ -195,8 +188,6 @@ class Cia402Axis(Axis):
             self.monitor.emergency = None
             yield from reset_fault(self._link, self._settings)
             yield from self._refresh()
-            if self.actuated and self._machine.state in POWERED:
-                raise DriveError("is still stopping: reset again when it stands")
 
     def poll(self, now: float) -> AxisSnapshot:
         """Return the newest reply."""

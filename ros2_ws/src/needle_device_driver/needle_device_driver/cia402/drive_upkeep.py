@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from needle_device_driver.cia402.cia402 import FAULTS, DriveCommand, Mode, drive_state
+from needle_device_driver.cia402.cia402 import FAULTS, POWERED, DriveCommand, Mode, drive_state
 from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.link import objects as od
@@ -81,7 +81,7 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
     Raises
     ------
     DriveError
-        If the drive does not answer, or stays in its fault.
+        If the drive does not answer, stays in its fault or still has power: it is stopping.
     LinkError
         If the link is lost.
     """
@@ -94,7 +94,10 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
         else:
             yield from access.write(od.CONTROLWORD, command)
 
-    if drive_state((yield from access.read(od.STATUSWORD))) not in FAULTS:
+    state = drive_state((yield from access.read(od.STATUSWORD)))
+    if settings.actuated and state in POWERED:
+        raise DriveError("is still stopping: reset again when it stands")
+    if state not in FAULTS:
         return
     # The rising edge counts.
     yield from order(DriveCommand.DISABLE_VOLTAGE)
