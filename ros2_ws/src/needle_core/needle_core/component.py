@@ -228,6 +228,10 @@ class Timer:
     handler: Callable[[Moment], Actions]
 
 
+ANSWER_TIMEOUT = 5.0
+"""A call without an answer is given up after this time [s]."""
+
+
 @dataclass(frozen=True)
 class Answer:
     """Outcome of a service call.

@@ -62,7 +62,6 @@ class Operator(Component):
     ) -> None:
         self.name = name
         self.settings = settings
-        self._joy_topic = joy
         self._peers = Peers()
         self._joy = JoySource(
             settings.controls,

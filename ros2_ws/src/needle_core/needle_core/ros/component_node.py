@@ -17,6 +17,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from needle_core.component import (
+    ANSWER_TIMEOUT,
     Action,
     Actions,
     Answer,
@@ -48,8 +49,6 @@ from needle_core.ros.discovery import full_name, publishers_of, signature, subsc
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 
-ANSWER_TIMEOUT = 5.0
-"""A call without an answer is given up after this time [s]."""
 LOG_PERIOD = 2.0
 """Time between two lines of log of one kind [s]."""
 _PEERS_PERIOD = 0.2
@@ -176,11 +175,12 @@ class ComponentNode(WholeNode):
             why = f"a publisher's QoS does not fit: --qos-{option} {cure} does"
             self._diagnostics.refuse(row.topic, "incompatible QoS", why)
 
+        kind = self._types.make(ros_type(row.message))
         # Raw: what cannot be decoded must not raise out of the executor.
         return self.create_subscription(
-            self._types.make(ros_type(row.message)),
+            kind,
             self._name_of(row.topic),
-            lambda data, info: self._on_bytes(row, data, info),
+            lambda data, info: self._on_bytes(row, kind, data, info),
             to_qos(row.delivery),
             raw=True,
             callback_group=self._group,
@@ -194,13 +194,12 @@ class ComponentNode(WholeNode):
         elif not on and topic in self._lazy:
             self.destroy_subscription(self._lazy.pop(topic))
 
-    def _on_bytes(self, row: Input, data: bytes, info: Mapping[str, int]) -> None:
+    def _on_bytes(self, row: Input, kind: type[Any], data: bytes, info: Mapping[str, int]) -> None:
         if len(data) > row.longest:
             why = f"{len(data)} bytes, at most {row.longest}"
             self._diagnostics.refuse(row.topic, "too long", why)
             return
         try:
-            kind = self._types.make(ros_type(row.message))
             message = from_ros(row.message, deserialize_message(data, kind))
         except Exception as error:  # noqa: BLE001 - whatever the middleware raises
             why = f"{len(data)} bytes: {type(error).__name__}: {error}"

@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from needle_core.component import (
+    ANSWER_TIMEOUT,
     Action,
     Answer,
     Call,
@@ -51,8 +52,6 @@ DISCOVERY = (0.02, 0.2)
 """Time until one component knows another [s]."""
 LEASE = 8.0
 """So long others still count a component that was killed [s]."""
-ANSWER_TIMEOUT = 5.0
-"""A call without an answer is given up after this time [s]."""
 _DIAGNOSTICS_PERIOD = 1.0
 
 Tap = Callable[[int, str, Any, Output], None]

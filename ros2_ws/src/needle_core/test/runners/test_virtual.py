@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from needle_core.component import (
+    ANSWER_TIMEOUT,
     LATCHED,
     RELIABLE,
     Actions,
@@ -29,7 +30,7 @@ from needle_core.runners.faults import (
     silence,
 )
 from needle_core.runners.timeline import START_NS
-from needle_core.runners.virtual import ANSWER_TIMEOUT, DISCOVERY, VirtualRunner
+from needle_core.runners.virtual import DISCOVERY, VirtualRunner
 
 from .runner_scene import Once, Receiver, Sender, Server, Wired, run
 

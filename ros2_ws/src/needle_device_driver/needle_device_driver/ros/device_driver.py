@@ -31,8 +31,6 @@ Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad p
 
 # From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
 _GRACE = 0.8
-
-
 # Longer than a node takes to look at its surroundings [s].
 _LOOK_AROUND = 0.3
 
