@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
-import multiprocessing
-import signal
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from typing import Any, ClassVar
 
 from needle_core.component import Actions, Moment, Port, Publish
-from needle_core.process.end_request import ENDING_SIGNALS
+from needle_core.process.worker import start_worker
 from needle_sim.camera_sensor import CAMERAS, DistantCameras, Exposure, StereoCameras
 from needle_sim.rig.bench import SimulatedBench
 from needle_sim.sim_rig_parameters import SimRigParameters
 
 _MOST_UNDER_WAY = 2
-_PR_SET_PDEATHSIG = 1
 
 
 class RenderedCameras(DistantCameras):
@@ -59,14 +55,7 @@ class RenderingProcess:
     """Those of the process that renders."""
 
     def __init__(self, settings: SimRigParameters) -> None:
-        self._pool = ProcessPoolExecutor(
-            1, multiprocessing.get_context("spawn"), RenderingProcess._begin, (settings,)
-        )
-        # The process has from its first moment on what its parent blocks: signals to the whole
-        # group, by which its parent ends in order, and then ends it.
-        signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
-        self._pool.submit(int)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDING_SIGNALS)
+        self._pool = start_worker(RenderingProcess._begin, settings)
 
     def open(self, arrive: Callable[[Any], None]) -> None:
         """Begin to hand over images."""
@@ -90,8 +79,6 @@ class RenderingProcess:
 
     @staticmethod
     def _begin(settings: SimRigParameters) -> None:
-        """Make the cameras of this process, which ends with its parent."""
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         RenderingProcess._cameras = StereoCameras(settings)
 
     @staticmethod

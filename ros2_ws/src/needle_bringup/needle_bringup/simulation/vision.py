@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import ctypes
-import multiprocessing
-import signal
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from typing import ClassVar
@@ -29,6 +26,7 @@ from needle_core.component import (
     Send,
     Timer,
 )
+from needle_core.process.worker import start_worker
 from needle_core.settings.parameter_files import Parameters
 from needle_sim.camera_sensor import CAMERAS, Exposure, StereoCameras
 from needle_sim.sim_rig_parameters import SimRigParameters
@@ -38,7 +36,6 @@ EYES = "eyes"
 """Name of the port between the tracker's stand-in and the process that works."""
 _MOST_EXPOSURES = 2
 _CHECK_PERIOD = 0.05
-_PR_SET_PDEATHSIG = 1
 
 Item = Exposure | m.JointState | None
 """What is handed on; None: time alone."""
@@ -64,9 +61,7 @@ class Eyes:
 
     @staticmethod
     def open(parameters: Parameters) -> None:
-        """Make those of this process, which ends with its parent and not by a signal."""
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+        """Make those of this process."""
         Eyes.here = Eyes(parameters)
 
     @staticmethod
@@ -97,9 +92,7 @@ class EyesProcess:
     """
 
     def __init__(self, parameters: Parameters) -> None:
-        self._pool = ProcessPoolExecutor(
-            1, multiprocessing.get_context("spawn"), Eyes.open, (parameters,)
-        )
+        self._pool = start_worker(Eyes.open, parameters)
 
     def open(self, arrive: Callable[[tuple[Done] | PortChange], None]) -> None:
         """Begin to hand over what is done."""
