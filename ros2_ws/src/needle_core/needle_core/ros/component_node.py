@@ -39,7 +39,6 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.convert import Converter, from_ros, ros_type
-from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.message_types import rclpy_types
 from needle_core.process.claim import WAY_OUT, Claim
@@ -48,6 +47,7 @@ from needle_core.ros.conversions import to_qos
 from needle_core.ros.discovery import full_name, publishers_of, signature, subscribers_of
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
+from needle_core.runners.handlers import Handlers
 
 LOG_PERIOD = 2.0
 """Time between two lines of log of one kind [s]."""
@@ -110,7 +110,7 @@ class ComponentNode(WholeNode):
         self._types = rclpy_types()
         self._converter = Converter(self._types)
         self._diagnostics = DiagnosticsPublisher(self)
-        self._failures = 0
+        self._handlers = Handlers(self.component.outputs)
         self._logged: dict[str, float] = {}
         self.peers = Peers()
         self._requests: dict[int, Future[Reply]] = {}
@@ -253,21 +253,10 @@ class ComponentNode(WholeNode):
     # ---- actions ------------------------------------------------------------------------------
 
     def _handle(self, work: Callable[[], Actions]) -> None:
-        """Carry out the actions of a handler; one that raises is reported and ends nothing."""
+        """Carry out the actions of a handler, unless the component has ended."""
         if self.exit is not None:
             return
-        actions: list[Action] = []
-        try:
-            # One by one: what a handler did before it failed is done.
-            for action in work():
-                actions.append(action)
-        except Exception as error:  # noqa: BLE001 - whatever a message may lead to
-            self._failures += 1
-            text = f"internal error: {type(error).__name__}: {error}"
-            values = {"failures": str(self._failures)}
-            failed = Diagnose("handlers", Diagnostic(Level.ERROR, text, values))
-            actions += [Log("error", text, kind=text), failed]
-        for action in actions:
+        for action in self._handlers.run(work):
             self._do(action)
 
     def _do(self, action: Action) -> None:

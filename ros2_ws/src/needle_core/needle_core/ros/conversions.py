@@ -23,7 +23,7 @@ def _last(depth: int, reliability: ReliabilityPolicy) -> QoSProfile:
 
 
 RELIABLE = _last(10, ReliabilityPolicy.RELIABLE)
-# A lock-step simulation sends the 25 joint states of a step at once: more than a depth of 10 keeps.
+# Four seconds of them, at 50 Hz, for a receiver that stands still meanwhile.
 JOINT_STATES = _last(200, ReliabilityPolicy.RELIABLE)
 LATCHED = _last(1, ReliabilityPolicy.RELIABLE)
 LATCHED.durability = DurabilityPolicy.TRANSIENT_LOCAL

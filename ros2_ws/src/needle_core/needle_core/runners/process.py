@@ -12,14 +12,12 @@ from needle_core.component import (
     Action,
     Actions,
     Component,
-    Diagnose,
     Input,
-    Log,
     Moment,
-    Publish,
 )
-from needle_core.diagnostics import Diagnostic, Level
+from needle_core.diagnostics import Diagnostic
 from needle_core.runners.faults import Link
+from needle_core.runners.handlers import Handlers
 from needle_core.runners.timeline import Timeline
 
 Compute = Callable[[Sequence[Action], random.Random], float]
@@ -87,7 +85,7 @@ class Process:
         self._queue: deque[tuple[str, Work, int]] = deque()
         self._waiting: Counter[str] = Counter()
         self._streams: dict[str, random.Random] = {}
-        self._failures = 0
+        self._handlers = Handlers(component.outputs)
 
     @property
     def stands_still(self) -> bool:
@@ -140,7 +138,8 @@ class Process:
         return max(self._free_at, self._frozen_until)
 
     def _handle_now(self, source: str, work: Work, sent_ns: int) -> None:
-        actions = self._handle(work, self._timeline.moment(sent_ns))
+        at = self._timeline.moment(sent_ns)
+        actions = self._handlers.run(lambda: work(at))
         stream = self._streams.get(source)
         if stream is None:
             stream = self._streams[source] = self._timeline.stream(f"{self.name}/{source}")
@@ -149,22 +148,6 @@ class Process:
         if actions:
             self._is_busy = True
             self._timeline.call_at(self._free_at, partial(self._finish, actions))
-
-    def _handle(self, work: Work, at: Moment) -> list[Action]:
-        """Return the actions of a handler; one that raises is reported and ends nothing."""
-        actions: list[Action] = []
-        try:
-            for action in work(at):
-                if isinstance(action, Publish) and action.topic not in self.outputs:
-                    raise ValueError(f"{action.topic} is not among its outputs")
-                actions.append(action)
-        except Exception as error:  # noqa: BLE001
-            self._failures += 1
-            text = f"internal error: {type(error).__name__}: {error}"
-            values: dict[str, Any] = {"failures": str(self._failures)}
-            actions.append(Log("error", text))
-            actions.append(Diagnose("handlers", Diagnostic(Level.ERROR, text, values)))
-        return actions
 
     def _finish(self, actions: Sequence[Action]) -> None:
         if self.stands_still:

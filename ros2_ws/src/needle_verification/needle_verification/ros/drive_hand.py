@@ -29,9 +29,8 @@ from needle_verification.ros.hold_topic import HoldTopic
 from needle_verification.ros.listening_node import PATIENCE, ListeningNode
 
 JOINTS = ("insertion_joint", "rotation_joint")
-# What a count of each encoder is [m], [rad]: the emulator's defaults.
+# What a count of the encoder is [m]: the emulator's default.
 INSERTION_COUNT = 1.0 / 2.0e7
-ROTATION_COUNT = math.tau / 65536.0
 _HOLD_PERIOD = 0.05
 
 
