@@ -40,6 +40,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_tracker.optics.calibration import rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
 
@@ -127,8 +128,8 @@ class Console(Component):
         self._looked_at = -math.inf
         self._lag = 0.0
         self.inputs = (
-            Input(DEVICE_STATUS, m.Status, self._on_device, LATCHED),
-            Input(CONTROLLER_STATUS, m.Status, self._on_controller, LATCHED),
+            Input(DEVICE_STATUS, DeviceStatus, self._on_device, LATCHED),
+            Input(CONTROLLER_STATUS, ControllerStatus, self._on_controller, LATCHED),
             Input("joint_states", m.JointState, self._on_joints),
             Input("needle/tip_pose", m.PoseWithCovariance, self._on_tip),
             Input("needle/estimate", m.PoseWithCovariance, self._on_estimate),
@@ -236,12 +237,12 @@ class Console(Component):
 
     # ---- the rig --------------------------------------------------------------------------------
 
-    def _on_device(self, message: m.Status, at: Moment) -> Actions:
-        self._picture.see_device(message.values)
+    def _on_device(self, message: DeviceStatus, at: Moment) -> Actions:
+        self._picture.see_device(message)
         return ()
 
-    def _on_controller(self, message: m.Status, at: Moment) -> Actions:
-        self._picture.see_controller(message.values)
+    def _on_controller(self, message: ControllerStatus, at: Moment) -> Actions:
+        self._picture.see_controller(message)
         return ()
 
     def _on_joints(self, message: m.JointState, at: Moment) -> Actions:

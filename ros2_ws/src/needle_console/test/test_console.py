@@ -34,6 +34,7 @@ from needle_core.component import (
 )
 from needle_core.diagnostics import Level
 from needle_core.runners.virtual import VirtualRunner
+from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 INSERT = HoldState(True, 0.5, Mode.INSERT)
 RETRACT = HoldState(True, 0.5, Mode.RETRACT)
@@ -88,8 +89,8 @@ class Rig(Component):
             Input("/diagnostics", m.Diagnostics, self._on_health),
         )
         self.outputs = (
-            Output("device/status", m.Status, LATCHED),
-            Output("needle/controller_status", m.Status, LATCHED),
+            Output("device/status", DeviceStatus, LATCHED),
+            Output("needle/controller_status", ControllerStatus, LATCHED),
             Output("stereo/left/image_raw", m.Image),
         )
         self.services = tuple(
@@ -128,13 +129,10 @@ class Rig(Component):
         return ()
 
     def _report(self, at: Moment) -> Actions:
-        yield Publish("device/status", self._status("device", self.device))
-        yield Publish("needle/controller_status", self._status("controller", self.controller))
+        yield Publish("device/status", DeviceStatus.parse(self.device))
+        yield Publish("needle/controller_status", ControllerStatus.parse(self.controller))
         image = m.Image(at.stamp_ns, "left", 2, 3, "mono8", 4, bytes(range(8)))
         yield Publish("stereo/left/image_raw", image)
-
-    def _status(self, part: str, values: dict[str, str]) -> m.Status:
-        return m.Status("rig", part, Level.OK, "", dict(values))
 
 
 class Taken:
@@ -221,7 +219,7 @@ def test_a_retraction_waits_for_the_end_of_steering_and_is_called_once(scene: Sc
 def test_a_controller_that_is_gone_keeps_no_needle_in() -> None:
     console, page = Console(ConsoleParameters()), Page()
     runner = VirtualRunner([console, page])
-    steering = m.Status("gone", "controller", Level.OK, "", {"state": "STEERING"})
+    steering = ControllerStatus(state="STEERING")
     at = Moment(0.0, 1)
     row = next(row for row in console.inputs if row.topic == "needle/controller_status")
     assert list(row.handler(steering, at)) == []

@@ -42,11 +42,11 @@ class KeyValues:
     @classmethod
     def parse(cls: type[_Kind], values: Mapping[str, str]) -> _Kind:
         """Return what key-values say, of an unnamed node."""
-        kinds, read = get_type_hints(cls), {}
-        for row in fields(cls):
-            if row.name in values and row.name not in _IN_STATUS:
+        read: dict[str, Any] = {}
+        for key, reader in _KEYS[cls]:
+            if key in values:
                 try:
-                    read[row.name] = _READERS[kinds[row.name]](values[row.name])
+                    read[key] = reader(values[key])
                 except ValueError:
                     continue
         return cls(**read)
@@ -247,3 +247,15 @@ def _text(value: Any, form: str) -> str:
         case tuple():
             return ", ".join(repr(part) for part in value)
     return str(value)
+
+
+def _keys(kind: type[KeyValues]) -> list[tuple[str, Callable[[str], Any]]]:
+    types = get_type_hints(kind)
+    names = (row.name for row in fields(kind) if row.name not in _IN_STATUS)
+    return [(name, _READERS[types[name]]) for name in names]
+
+
+# Kind of status to its keys, each with what reads its value.
+_KEYS: dict[type[KeyValues], list[tuple[str, Callable[[str], Any]]]] = {
+    kind: _keys(kind) for kind in (DeviceStatus, ControllerStatus)
+}

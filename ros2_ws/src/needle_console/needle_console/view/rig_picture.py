@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 
 import numpy as np
 
@@ -56,17 +55,16 @@ class RigPicture:
         """Return what device and controller last said; all else may be old."""
         return self._told
 
-    def see_device(self, values: Mapping[str, str]) -> None:
-        """Take the key-values of `device/status`."""
-        state, before = DeviceStatus.parse(values), self._told.device
+    def see_device(self, state: DeviceStatus) -> None:
+        """Take what the device says."""
+        before = self._told.device
         if before is not None and "(hold_new_press)" in state.reason:
             # Only says that the press goes on; the status before said why it no longer counts.
             state = dataclasses.replace(state, reason=trouble_of(before) or state.reason)
         self._tell(device=state)
 
-    def see_controller(self, values: Mapping[str, str]) -> None:
-        """Take the key-values of `needle/controller_status`; a new start begins a new course."""
-        state = ControllerStatus.parse(values)
+    def see_controller(self, state: ControllerStatus) -> None:
+        """Take what the controller says; a new start begins a new course."""
         before = self._told.controller
         if before is not None and state.starts != before.starts:
             self._course.clear()

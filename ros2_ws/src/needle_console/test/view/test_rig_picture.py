@@ -18,7 +18,9 @@ COVARIANCE = np.diag([1e-8, 4e-8, 9e-8])
 
 def seen(*depths: float) -> RigPicture:
     picture = RigPicture()
-    picture.see_controller({"state": "STEERING", "starts": "1", "target_offset_m": "0.003"})
+    picture.see_controller(
+        ControllerStatus.parse({"state": "STEERING", "starts": "1", "target_offset_m": "0.003"})
+    )
     for depth in depths:
         picture.see_joints(depth, 0.1, now=0.0)
         picture.see_estimate(np.array([-0.003 + depth / 50, 0.0, depth]), COVARIANCE)
@@ -57,7 +59,9 @@ def test_a_plane_that_the_controller_did_not_take_is_not_shown() -> None:
     tilted = plane_pose(9.0, 36.0)
     picture.see_plane(tilted)
     assert picture.snapshot(0.0).T_rig_plane[0, 3] == pytest.approx(0.003)
-    picture.see_controller({"state": "STEERING", "starts": "1", "target_offset_m": "0.009"})
+    picture.see_controller(
+        ControllerStatus.parse({"state": "STEERING", "starts": "1", "target_offset_m": "0.009"})
+    )
     assert picture.snapshot(0.0).T_rig_plane == pytest.approx(tilted)
 
 
@@ -72,19 +76,19 @@ def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
         values,
         {**values, "speed_scale": "0"},
     ):
-        picture.see_device(told)
+        picture.see_device(DeviceStatus.parse(told))
     device = picture.states().device
     assert device is not None
     assert (device.press_again, trouble_of(device)) == ("console", silent)
     # Where the console stood still itself, it heard no more than that.
     picture = RigPicture()
     for told in ({"state": "MOVING", "hold_owner": "console"}, values):
-        picture.see_device(told)
+        picture.see_device(DeviceStatus.parse(told))
     device = picture.states().device
     assert device is not None
     assert trouble_of(device) == goes_on
     stamps = "hold of 'console' does not count (hold_stamp_increases); device/reset ends this"
-    picture.see_device({**values, "reason": stamps})
+    picture.see_device(DeviceStatus.parse({**values, "reason": stamps}))
     device = picture.states().device
     assert device is not None
     assert trouble_of(device) == stamps
@@ -95,7 +99,7 @@ def test_a_controller_that_is_gone_steers_no_longer() -> None:
     picture.lose_controller()
     assert picture.states().controller is None
     assert picture.snapshot(0.0).controller is None
-    picture.see_controller({"state": "STEERING", "starts": "1"})
+    picture.see_controller(ControllerStatus.parse({"state": "STEERING", "starts": "1"}))
     assert picture.states().controller is not None
 
 
@@ -106,7 +110,7 @@ def test_a_course_goes_deeper_only_and_a_new_start_begins_a_new_one() -> None:
     assert len(picture.snapshot(0.0).shaft) == 2
     picture.see_estimate(np.array([0.0, 0.0, 0.0105]), COVARIANCE)
     assert [point.depth for point in picture.snapshot(0.0).course] == [0.010, 0.0105]
-    picture.see_controller({"state": "STEERING", "starts": "2"})
+    picture.see_controller(ControllerStatus.parse({"state": "STEERING", "starts": "2"}))
     assert picture.snapshot(0.0).course == ()
 
 
@@ -156,16 +160,18 @@ def test_statuses_that_say_nothing_sensible_become_states_without_numbers() -> N
 def test_readings_are_in_mm_and_degrees() -> None:
     picture = seen(0.05)
     picture.see_controller(
-        {
-            "state": "STEERING",
-            "starts": "1",
-            "depth_m": "0.12",
-            "target_offset_m": "0.003",
-            "r1_low_m": "-0.0025",
-            "r1_high_m": "-0.0015",
-            "reachable": "true",
-            "reachable_depth_m": "0.043",
-        }
+        ControllerStatus.parse(
+            {
+                "state": "STEERING",
+                "starts": "1",
+                "depth_m": "0.12",
+                "target_offset_m": "0.003",
+                "r1_low_m": "-0.0025",
+                "r1_high_m": "-0.0015",
+                "reachable": "true",
+                "reachable_depth_m": "0.043",
+            }
+        )
     )
     minus = "\N{MINUS SIGN}"
     told = readings(picture.snapshot(0.0))
