@@ -32,8 +32,6 @@ OPEN_ENDED = {
     "obeys below `/replay` alone.",
     "needle_bags/ros/parameter_snapshots.py:__init__": "`recorder` asks every node for its "
     "parameters.",
-    "needle_core/ros/discovery.py:all_of": "Nodes ask those that they hear for "
-    "`get_type_description`, to know that they are heard.",
 }
 """Functions whose endpoints are those of others: what a reader should know of them."""
 SOURCES = ROOT / "ros2_ws" / "src"

@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Final, cast
 
 from rclpy.duration import Duration
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -38,9 +39,8 @@ from needle_core.errors import UserError
 from needle_core.files.bag_directory import BagDirectory
 from needle_core.files.bag_topic import BagTopic
 from needle_core.process.end_request import EndRequest
-from needle_core.ros.base_node import DiagnosticsPublisher, executor_of, run_node
+from needle_core.ros.base_node import DiagnosticsPublisher, run_node
 from needle_core.ros.conversions import RELIABLE, to_stamp
-from needle_core.ros.discovery import AnsweringNodes, full_name
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, parameter
@@ -148,12 +148,10 @@ class Player(WholeNode):
                 self.beside_rig = True
                 self._make_publishers()
                 begin = time.monotonic()
-        answering = AnsweringNodes(self)
         while time.monotonic() < begin + DISCOVERY + MATCHING and not end.wanted:
-            if self._all_matched() and answering.all_of(self._listeners()):
+            if self._all_matched():
                 break
             spin()
-        answering.close()
         if end.wanted:
             return False
         self._publish_latched(self.start)
@@ -194,15 +192,6 @@ class Player(WholeNode):
             publisher.get_subscription_count() >= self.count_subscribers(publisher.topic_name)
             for publisher in self._senders.values()
         )
-
-    def _listeners(self) -> set[str]:
-        """Return the full names of the nodes that subscribe to what is played."""
-        return {
-            full_name(info.node_namespace, info.node_name)
-            for sender in self._senders.values()
-            for info in self.get_subscriptions_info_by_topic(sender.topic_name)
-            if not info.node_name.startswith("_")
-        } - {self.get_fully_qualified_name()}
 
     def _publish_latched(self, before: int) -> None:
         """Publish what late joiners would have got at a time of recording [ns]."""
@@ -303,7 +292,8 @@ class Player(WholeNode):
 
 
 def _play(player: Player, loop: bool, end: EndRequest) -> int:
-    executor = executor_of(player)
+    executor = SingleThreadedExecutor()
+    executor.add_node(player)
     bar = tqdm(
         total=round((player.end - player.start) / _NANOSECONDS, 1),
         unit="s",

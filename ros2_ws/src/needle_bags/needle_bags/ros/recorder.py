@@ -12,7 +12,7 @@ from typing import Any, cast
 import yaml
 from diagnostic_msgs.msg import DiagnosticStatus
 from rcl_interfaces.msg import ParameterEvent
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 from std_srvs.srv import Trigger
@@ -33,9 +33,7 @@ from needle_core.files.bag_topic import BagTopic
 from needle_core.files.calibration_text import read_calibration
 from needle_core.process.end_request import EndRequest
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher, run_node
-from needle_core.ros.discovery import PARAMETERS_OF
 from needle_core.ros.parameters import NodeParameters
-from needle_core.ros.wait_list import WaitListExecutor
 from needle_core.ros.whole_node import WholeNode
 
 HELP = """
@@ -71,6 +69,8 @@ REPORT_PERIOD = 0.5
 # What is said of a fault comes a little after it [s].
 AFTERMATH = 1.0
 PARAMETER_EVENTS = "/parameter_events"
+# The part of its diagnostics that names the nodes whose parameters are in the bag.
+PARAMETERS_OF = "parameters_of"
 DEVICE_STATUS = "/device/status"
 FAULTS = ("FAULT", "ESTOPPED")
 
@@ -270,12 +270,10 @@ class Recorder(WholeNode):
         return EXIT_DONE if self.recording.error is None else EXIT_MISSED
 
 
-def _spin_once(executor: WaitListExecutor, recorder: Recorder, timeout: float) -> None:
+def _spin_once(executor: SingleThreadedExecutor, recorder: Recorder, timeout: float) -> None:
     """Let the executor do one thing; what others sent that it cannot do does not end the node."""
     try:
         executor.spin_once(timeout_sec=timeout)
-    except ExternalShutdownException:
-        raise
     except Exception as error:  # noqa: BLE001
         recorder.note_not_understood("a service or the graph", error)
 
@@ -286,7 +284,7 @@ def main(args: list[str] | None = None) -> int:
 
     def spin(node: Node, end: EndRequest) -> int:
         recorder = cast(Recorder, node)
-        executor = WaitListExecutor()
+        executor = SingleThreadedExecutor()
         executor.add_node(recorder)
         try:
             while not end.wanted:
@@ -308,8 +306,6 @@ def main(args: list[str] | None = None) -> int:
         parameters=RecorderParameters,
         args=args,
         spin=spin,
-        # A bag is made whole however long its disk takes.
-        grace=None,
     )
 
 

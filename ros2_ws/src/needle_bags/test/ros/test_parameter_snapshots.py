@@ -12,8 +12,8 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
+from needle_bags.ros import question
 from needle_bags.ros.parameter_snapshots import ParameterSnapshots
-from needle_core.ros import question
 
 PATIENCE = 20.0
 

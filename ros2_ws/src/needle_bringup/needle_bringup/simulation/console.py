@@ -56,7 +56,7 @@ def console(options: ConsoleOptions) -> int:
     from needle_core.runners.paced import PacedRunner  # noqa: PLC0415
 
     settings = ConsoleParameters(address=LOOPBACK, port=options.port, hold_port=options.port + 1)
-    with EndRequest(None) as end:
+    with EndRequest() as end:
         desk = ServedDesk(settings)
         rig, ports = _make_rig(rig_parameters(options))
         components = [*rig, Console(settings)]

@@ -108,7 +108,7 @@ def simulate(options: SimulateOptions) -> int:
         given = read_parameters(options.params, nodes_of(options))
         refuse_reserved(options.params, given, options)
     # A signal is looked at between steps from here on; in the report it raises wherever it comes.
-    end = EndRequest(None)
+    end = EndRequest()
     bag = _make_folder(options)
     try:
         parameters = merge(command_line_parameters(options, bag), given)

@@ -27,12 +27,12 @@ from needle_core.commands.cli import (
 )
 from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
-from needle_core.process.end_request import GRACE, EndRequest
+from needle_core.process.end_request import EndRequest
 from needle_core.process.reach import keep_to_this_machine
 from needle_core.process.shared_memory import make_private, remove_half_made_ports
 from needle_core.ros.conversions import RELIABLE, to_diagnostic_status, to_stamp
-from needle_core.ros.discovery import signature
 from needle_core.ros.executor import NodeExecutor
+from needle_core.ros.node_names import signature
 from needle_core.settings.parameter_fields import describe
 from needle_core.settings.parameter_files import given_sections
 
@@ -41,9 +41,9 @@ _ROS_OPTIONS = ("-p", "--param", "--params-file", "-r", "--remap", "--log-level"
 STEADY_CLOCK = Clock(clock_type=ClockType.STEADY_TIME)
 # An executor that waits does not see a signal: it looks up after this time [s].
 LOOK_PERIOD = 0.1
-# A subscriber that does not acknowledge for so long keeps no node from ending [s]. After a signal
-# the node's `grace` is shorter. A recorder that stood still for 4 s acknowledged within 3 s.
-_ACKNOWLEDGED_WITHIN = 5.0
+# A subscriber that does not acknowledge for so long keeps no node from ending [s]: one that ends by
+# itself (a recorder that stood still for 4 s acknowledged within 3 s), and after a signal.
+_ACKNOWLEDGED_WITHIN, _ACKNOWLEDGED_AFTER_SIGNAL = 5.0, 0.5
 
 
 class DiagnosticsPublisher:
@@ -125,8 +125,6 @@ def run_node(
     parameters: type,
     args: list[str] | None = None,
     spin: Callable[[Node, EndRequest], int] | None = None,
-    grace: float | None = GRACE,
-    interrupted: int = EXIT_DONE,
     shared_memory: bool = True,
 ) -> int:
     """Run a node until a signal ends it; `--help` explains it instead.
@@ -144,11 +142,6 @@ def run_node(
     spin : callable, optional
         Takes the node and the wish to end it, runs it until then and returns the exit code; by
         default nothing but spins.
-    grace : float, optional
-        How long it may be busy after a signal before the process just ends [s]; None for a node
-        that must finish something, which then limits its time itself.
-    interrupted : int
-        Exit code of a process that just ends.
     shared_memory : bool
         Whether messages may go through shared memory, as images must: see `keep_to_this_machine`.
 
@@ -159,7 +152,7 @@ def run_node(
         arguments, 3 after an internal error.
     """
     argv = list(sys.argv if args is None else args)
-    with EndRequest(grace, interrupted) as end:
+    with EndRequest() as end:
         try:
             # rclpy reads the files, too, but its errors do not say what is wrong with them.
             given_sections(argv)
@@ -207,20 +200,21 @@ def _run(
         code = _refuse(error) if is_refused else internal_error(error)
     finally:
         if node is not None and node.context.ok():
-            _wait_for_acknowledgements(node)
-        end.leave(code)
+            _wait_for_acknowledgements(
+                node, _ACKNOWLEDGED_AFTER_SIGNAL if end.wanted else _ACKNOWLEDGED_WITHIN
+            )
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
     return code
 
 
-def _wait_for_acknowledgements(node: Node) -> None:
+def _wait_for_acknowledgements(node: Node, seconds: float) -> None:
     """Wait until all reliable subscribers have the node's messages: it takes the rest with it.
 
     A busy recorder would miss the end of a run, and could not tell.
     """
-    until = time.monotonic() + _ACKNOWLEDGED_WITHIN
+    until = time.monotonic() + seconds
     for publisher in node.publishers:
         left = max(until - time.monotonic(), 0.0)
         publisher.wait_for_all_acked(Duration(seconds=left))

@@ -44,7 +44,7 @@ from needle_core.message_types import rclpy_types
 from needle_core.process.claim import WAY_OUT, Claim
 from needle_core.ros.base_node import STEADY_CLOCK, DiagnosticsPublisher
 from needle_core.ros.conversions import to_qos
-from needle_core.ros.discovery import full_name, publishers_of, signature, subscribers_of
+from needle_core.ros.node_names import full_name, publishers_of, signature, subscribers_of
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.runners.handlers import Handlers

@@ -24,7 +24,6 @@ def run_component(
     *,
     help_text: str,
     ports: Callable[[Any], Mapping[str, RealPort]] = lambda _: {},
-    grace: float = 0.6,
     interrupted: int = EXIT_DONE,
     shared_memory: bool = True,
 ) -> int:
@@ -42,10 +41,8 @@ def run_component(
         What the node does, its topics and services: the first part of `--help`.
     ports : callable
         Returns the real ports of the component for its settings.
-    grace : float
-        How long the component may take to end after a signal [s].
     interrupted : int
-        Exit code of a process that ends then.
+        Exit code where a signal ended what was not done yet.
     shared_memory : bool
         Whether messages may go through shared memory, as images must.
 
@@ -59,8 +56,6 @@ def run_component(
         help_text=help_text,
         parameters=parameters,
         spin=partial(_spin, interrupted),
-        grace=grace,
-        interrupted=interrupted,
         shared_memory=shared_memory,
     )
 

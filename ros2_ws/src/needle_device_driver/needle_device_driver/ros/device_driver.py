@@ -29,8 +29,6 @@ off.
 Exit code   0 when ended, 2 when the adapter or a drive is missing, or for bad parameters
 """
 
-# From a signal to the end [s]: a drive that is not off by then is switched off by its own watchdog.
-_GRACE = 0.8
 # Longer than a node takes to look at its surroundings [s].
 _LOOK_AROUND = 0.3
 
@@ -51,7 +49,6 @@ def main() -> int:
         make_driver,
         help_text=HELP,
         ports=lambda settings: {CAN: CanPort(settings.link_settings)},
-        grace=_GRACE,
         shared_memory=False,
     )
 

@@ -44,7 +44,8 @@ SMALL_DISK = "40m"
 SIGNALS = 200
 # A bag is completed first: last words are heard for up to a second, and a disk may be slow.
 LONGEST_END = {"recorder": 10.0}
-LONGEST_END_OF_OTHERS = 1.0
+# Launchers wait so long before they send SIGTERM.
+LONGEST_END_OF_OTHERS = 5.0
 _END_CODES = (0, 130)
 _COMMANDS = "/device/joint_trajectory"
 _POLICIES = ("history", "reliability", "durability", "liveliness")

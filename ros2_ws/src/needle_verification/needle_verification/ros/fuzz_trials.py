@@ -102,7 +102,7 @@ class _Witness(ListeningNode):
     """Sees the driver's first state, and whether a motor turned, by the emulator's own word."""
 
     def __init__(self) -> None:
-        super().__init__("fuzz", careful=True)
+        super().__init__("fuzz")
         self.state = ""
         self.places: set[tuple[float, ...]] = set()
         self.create_subscription(DiagnosticStatus, "device/status", self._on_status, LATCHED)

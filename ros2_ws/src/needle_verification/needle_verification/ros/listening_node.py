@@ -12,7 +12,6 @@ from rclpy.executors import SingleThreadedExecutor
 
 from needle_core.errors import UserError
 from needle_core.process.reach import keep_to_this_machine
-from needle_core.ros.base_node import executor_of
 from needle_core.ros.whole_node import WholeNode
 
 PATIENCE = 20.0
@@ -37,14 +36,11 @@ class ListeningNode(WholeNode):
     ----------
     name : str
         The node's.
-    careful : bool
-        Whether a message that a callback fails on is refused, as the rig's nodes do; in a trial it
-        ends the trial.
     """
 
-    def __init__(self, name: str, *, careful: bool = False) -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._executor = executor_of(self) if careful else SingleThreadedExecutor()
+        self._executor = SingleThreadedExecutor()
         self._executor.add_node(self)
 
     def look(self, timeout: float = 0.0) -> None:

@@ -29,7 +29,7 @@ from trajectory_msgs.msg import JointTrajectory
 from needle_core.process.end_request import EndRequest
 from needle_core.ros.base_node import run_node
 from needle_core.ros.conversions import HOLD, IMAGES, JOINT_STATES, RELIABLE
-from needle_core.ros.discovery import unrecorded
+from needle_core.ros.node_names import subscribers_of
 from needle_core.ros.parameters import NodeParameters
 from needle_core.ros.whole_node import WholeNode
 from needle_core.settings.parameter_fields import check_fields, fixed_parameter
@@ -101,10 +101,14 @@ class RecordingLoad(WholeNode):
             if self.values.images or stream[1] is not Image
         ]
 
+    def _is_recorded(self, publisher: Publisher) -> bool:
+        names = subscribers_of(self, publisher.topic_name)
+        return any(name.endswith("/recorder") for name in names)
+
     def run(self, end: EndRequest) -> None:
         """Send until the time is over and everything has arrived, then print the counts."""
         publishers = [stream.publisher for stream in self.streams]
-        while unrecorded(self, publishers) and not end.wanted:
+        while not (end.wanted or all(map(self._is_recorded, publishers))):
             time.sleep(0.05)
         begin = time.monotonic()
         while (elapsed := time.monotonic() - begin) < self.values.duration and not end.wanted:

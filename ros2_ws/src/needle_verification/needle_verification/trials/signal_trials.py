@@ -109,7 +109,7 @@ def _trial(
         _send_at_once(nodes, number)
         if kind.endswith("twice"):
             time.sleep(rng.uniform(0.0, _SECOND_WITHIN))
-            # All have the first. To stop a node now would begin its time to end (`LateExit`) anew.
+            # All have the first: none needs to be stopped for the second.
             _send(nodes, number)
         ends = _ends(nodes)
         for node in nodes:
