@@ -48,7 +48,7 @@ class PathSettings(NamedTuple):
     committed_length: Annotated[float, Bounds(1e-3, 0.2, "m")] = 0.01
     comfort: Annotated[float, Bounds(0.0, 0.02, "m")] = 0.0015
     comfort_price: Annotated[float, Bounds(0.0, 100.0, "-")] = 4.0
-    longest: Annotated[float, Bounds(0.001, 1.0, "m")] = 0.2
+    longest: Annotated[float, Bounds(0.0, 1.0, "m")] = 0.2
 
 
 class Unknown(NamedTuple):

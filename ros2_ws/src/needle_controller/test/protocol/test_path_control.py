@@ -143,3 +143,10 @@ def test_obstacles_are_cleared_by_the_needle_at_hand() -> None:
     assert path_planner(SteeringSettings()).settings == PathSettings(
         max_rotation_per_length=thick.max_rotation_per_length, longest=thick.depth
     )
+
+
+@pytest.mark.parametrize("depth", [0.0, 1e-5, 1.0])
+def test_every_depth_that_a_parameter_may_have_is_one_of_the_planner(depth: float) -> None:
+    control = PlaneControl(SteeringSettings(), offset_plane(0.0))
+    control.configure(SteeringSettings(depth=depth))
+    assert path_planner(SteeringSettings(depth=depth)).settings.longest == depth
