@@ -46,7 +46,7 @@ from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 
 PERIOD = 0.02
 CYCLES = 250
@@ -279,7 +279,7 @@ def serve(channel: str) -> None:
     """Run the drives until a line comes, then print when each SYNC arrived."""
     values = DriveEmulatorParameters(boot_time=0.0)
     now = time.monotonic()
-    bus = EmulatedBus(values.insertion, values.rotation, MotionClock.SYNC, now)
+    bus = EmulatedBus(values.insertion, values.rotation, now)
     bus.poll(now)
     port = PtyPort(Path(channel))
     print("ready", flush=True)

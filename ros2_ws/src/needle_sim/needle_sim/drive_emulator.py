@@ -22,7 +22,7 @@ from needle_core.component import (
 from needle_core.errors import UserError
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
 from needle_sim.drives.bus_health import bus_health
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.fault_commands import obey
 from needle_sim.drives.power_state import PowerState
 
@@ -56,8 +56,7 @@ class DriveEmulator(Component):
         self, settings: DriveEmulatorParameters, name: str = name, now: float = 0.0
     ) -> None:
         self.name, self.settings = name, settings
-        clock = MotionClock.STEADY
-        self.bus = EmulatedBus(settings.insertion, settings.rotation, clock, now)
+        self.bus = EmulatedBus(settings.insertion, settings.rotation, now)
         self._states = dict.fromkeys(self.bus.drives, PowerState.NOT_READY)
         self._is_heard = False
         self.outputs = (Output(POSITIONS, m.JointState),)

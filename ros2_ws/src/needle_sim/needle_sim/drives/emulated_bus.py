@@ -1,23 +1,13 @@
-"""The CAN bus with both drives, the clock of their motion, and faults on command."""
+"""The CAN bus with both drives, and faults on command."""
 
 from __future__ import annotations
 
 import dataclasses
-import enum
 
 from needle_core.can_frame import CanFrame
 from needle_sim.bus.canopen_device import SYNC
 from needle_sim.drives.drive_motion import MOTION_STEP
 from needle_sim.drives.emulated_drive import EmulatedDrive, EmulatedDriveSettings
-
-
-class MotionClock(enum.Enum):
-    """Time that lets the motors move on."""
-
-    # One SYNC period with every SYNC: the same commands give the same positions, to the count.
-    SYNC = "sync"
-    # The steady clock, as on a bench.
-    STEADY = "steady"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,8 +33,6 @@ class EmulatedBus:
     ----------
     insertion, rotation : EmulatedDriveSettings
         The drives.
-    clock : MotionClock
-        What lets them move on.
     now : float
         Steady time at which the power comes [s].
     """
@@ -53,13 +41,11 @@ class EmulatedBus:
         self,
         insertion: EmulatedDriveSettings,
         rotation: EmulatedDriveSettings,
-        clock: MotionClock,
         now: float,
     ) -> None:
         if insertion.node_id == rotation.node_id:
             raise ValueError(f"both drives have node id {insertion.node_id}")
         self.drives = {"insertion": EmulatedDrive(insertion), "rotation": EmulatedDrive(rotation)}
-        self.clock = clock
         self._moved_until = now
         self.syncs = 0
         self.is_cut = False
@@ -74,8 +60,6 @@ class EmulatedBus:
         if frame.identifier == SYNC and not frame.remote:
             self.syncs += 1
             for drive in self.drives.values():
-                if self.clock is MotionClock.SYNC:
-                    drive.advance(round(drive.sync_period / MOTION_STEP))
                 drive.sync()
             return
         for drive in self.drives.values():
@@ -134,8 +118,6 @@ class EmulatedBus:
                 drive.tick(now)
 
     def _move_until(self, now: float) -> None:
-        if self.clock is not MotionClock.STEADY:
-            return
         # Times are rounded; what is a whole number of steps but for that is one.
         steps = int((now - self._moved_until) / MOTION_STEP + 1e-6)
         if steps > 0:

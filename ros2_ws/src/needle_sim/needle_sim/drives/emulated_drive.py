@@ -161,12 +161,6 @@ class EmulatedDrive:
 
     # ---- motion -------------------------------------------------------------------------------
 
-    @property
-    def sync_period(self) -> float:
-        """From one SYNC to the next, as the drive was told [s]."""
-        microseconds = self._objects.value(0x1006)
-        return microseconds * 1e-6 if microseconds else self._motion.interpolation_period
-
     def advance(self, steps: int) -> None:
         """Let `steps` of `MOTION_STEP` go by."""
         for _ in range(steps):

@@ -17,7 +17,6 @@ from needle_bags.reading.bag_files import read_messages
 from needle_core import messages as m
 from needle_core.component import Publish
 from needle_core.convert import from_ros
-from needle_sim.drives.emulated_bus import MotionClock
 
 from .component_bench import DRIVER, ComponentBench
 
@@ -51,8 +50,6 @@ def send(bench: ComponentBench, command: m.Trajectory) -> None:
 def sent() -> dict[str, list[str]]:
     """COB-ID to the data of all frames that the driver has sent."""
     bench = ComponentBench()
-    # As the motors of the frozen run moved.
-    bench.drives.bus.clock = MotionClock.SYNC
     bench.ready()
     for command in recorded("drive_best", COMMANDS, m.Trajectory):
         bench.person.outcomes.clear()

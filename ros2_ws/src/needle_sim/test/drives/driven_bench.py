@@ -21,7 +21,7 @@ from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
 from needle_sim.drive_emulator_parameters import DriveEmulatorParameters
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 
 PERIOD, TICK, FRAME = 0.02, 0.001, 0.0002
 UNITS = (0x608F, 0x60A8, 0x60A9, 0x60AA)
@@ -58,7 +58,7 @@ class DrivenBench:
         emulator = DriveEmulatorParameters(**(drives or {}))
         self.now = 1000.0
         self.link: _Link | None = None
-        self.bus = EmulatedBus(emulator.insertion, emulator.rotation, MotionClock.STEADY, self.now)
+        self.bus = EmulatedBus(emulator.insertion, emulator.rotation, self.now)
         if not tells_units:
             for drive in self.bus.drives.values():
                 objects = drive._objects

@@ -10,7 +10,7 @@ import canopen
 from needle_core.can_frame import CanFrame
 from needle_sim.drives.drive_motion import LimitAction
 from needle_sim.drives.drive_objects import SERVO, STEPPER
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.emulated_drive import EmulatedDriveSettings
 from needle_sim.drives.motor import MotorSettings
 
@@ -35,14 +35,12 @@ class Master:
 
     def __init__(
         self,
-        clock: MotionClock = MotionClock.SYNC,
         limit_action: LimitAction = LimitAction.CLAMP,
         **motor: float,
     ) -> None:
         self.bus = EmulatedBus(
             settings("insertion", limit_action, **motor),
             settings("rotation", limit_action),
-            clock,
             0.0,
         )
         self.now = 0.0

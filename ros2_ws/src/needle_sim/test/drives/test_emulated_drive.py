@@ -10,7 +10,7 @@ import pytest
 
 from needle_sim.bus.object_dictionary import Abort
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.power_state import TRANSITIONS, PowerState, next_state
 
 from .master import CSP, INSERTION, MASTER, PP, ROTATION, Master, settings
@@ -103,7 +103,7 @@ def test_runs_at_once_to_an_old_target_when_enabled(master: Master) -> None:
 
 
 def test_steady_clock_moves_without_sync_and_ends_by_itself() -> None:
-    master = Master(MotionClock.STEADY)
+    master = Master()
     master.enable(CSP)
     master.target(800)
     master.sync()
@@ -308,7 +308,7 @@ def test_drive_that_comes_back_has_missed_the_heartbeat_first(master: Master) ->
 
 
 def test_cut_bus_loses_frames_both_ways() -> None:
-    master = Master(MotionClock.STEADY)
+    master = Master()
     master.write(0x1017, 0, 30, 2)
     master.write(0x1016, 1, MASTER << 16 | 100, 4)
     master.network.send_message(0x700 + MASTER, b"\5")
@@ -327,4 +327,4 @@ def test_cut_bus_loses_frames_both_ways() -> None:
 def test_two_drives_of_one_id_are_refused() -> None:
     drive = settings("insertion", LimitAction.CLAMP)
     with pytest.raises(ValueError, match="node id 1"):
-        EmulatedBus(drive, drive, MotionClock.SYNC, 0.0)
+        EmulatedBus(drive, drive, 0.0)

@@ -19,7 +19,7 @@ from needle_core.errors import UserError
 from needle_sim.bus.pty_can import PtyCan
 from needle_sim.bus.pty_port import PtyPort
 from needle_sim.drives.drive_motion import LimitAction
-from needle_sim.drives.emulated_bus import EmulatedBus, MotionClock
+from needle_sim.drives.emulated_bus import EmulatedBus
 from needle_sim.drives.fault_commands import PlugOrder, obey
 
 from .master import INSERTION, ROTATION, settings
@@ -35,7 +35,7 @@ def troubles(bus: EmulatedBus) -> tuple[bool, bool, bool]:
 def make_bus() -> EmulatedBus:
     drives = [settings(name, LimitAction.CLAMP) for name in ("insertion", "rotation")]
     # Booted long ago.
-    return EmulatedBus(drives[0], drives[1], MotionClock.SYNC, 0.0)
+    return EmulatedBus(drives[0], drives[1], 0.0)
 
 
 class Served:
