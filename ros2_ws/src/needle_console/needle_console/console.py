@@ -265,7 +265,7 @@ class Console(Component):
 
     def _on_plane(self, message: m.Pose, at: Moment) -> Actions:
         quaternion = np.array(message.orientation)
-        norm = float(np.linalg.norm(quaternion))
+        norm = math.hypot(*quaternion)
         if message.frame_id == _RIG and 0.5 < norm < 2.0:
             pose = np.eye(4)
             pose[:3, :3] = rotation_matrix(quaternion / norm)

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import json
 import os
-import random
 import re
 import signal
 import subprocess
@@ -113,13 +112,6 @@ def _heed_signals() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def _signal(pids: Sequence[int], number: signal.Signals) -> None:
-    """Send a signal to those of the processes that are still there."""
-    for pid in pids:
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(pid, number)
-
-
 class StartedRun:
     """A run of `scripts/simulate` under way.
 
@@ -186,15 +178,6 @@ class StartedRun:
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self.process.pid, number)
 
-    def stand_still(self, node: str, duration: float) -> None:
-        """Let a node do nothing for a while [s], as on a machine that has no time for it."""
-        pids = [pid for pid, command in self.running() if node in command]
-        _signal(pids, signal.SIGSTOP)
-        try:
-            time.sleep(duration)
-        finally:
-            _signal(pids, signal.SIGCONT)
-
     def running(self) -> list[tuple[int, str]]:
         """Return (pid, command) of every process of this run."""
         return processes_with(MARK, self._mark)
@@ -240,18 +223,6 @@ class Workbench:
         if name not in self._runs:
             self._runs[name] = self.start(name, *arguments).wait()
         return self._runs[name]
-
-    def run_with_pauses(
-        self, name: str, nodes: Sequence[str], generator: random.Random, *arguments: str
-    ) -> SimulateRun:
-        """Run `simulate`; now one, now another node stands still for up to 1.2 s."""
-        started = self.start(name, *arguments)
-        started.domain()
-        while started.process.poll() is None:
-            duration = generator.choice((0.02, 0.1, 0.35, 0.6, 1.2))
-            started.stand_still(generator.choice(nodes), duration)
-            time.sleep(generator.uniform(0.0, 0.1))
-        return started.wait()
 
 
 def trial_outcomes(module: str, *words: object) -> list[dict[str, Any]]:

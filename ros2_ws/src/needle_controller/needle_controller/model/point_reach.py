@@ -81,7 +81,7 @@ def least_insertion_to_point(
     inwards = radius - np.hypot(target[..., 0], target[..., 1])
     from_center = np.hypot(inwards, ahead)
     bend = np.arctan2(ahead, inwards) - np.arccos(np.minimum(radius / from_center, 1.0))
-    straight = np.sqrt(np.maximum(from_center**2 - radius**2, 0.0))
+    straight = np.sqrt(np.maximum(from_center - radius, 0.0)) * np.sqrt(from_center + radius)
     near = np.hypot(ahead, inwards - radius) <= tolerance
     reached = (ahead > 0.0) & (from_center >= radius - tolerance) & (bend <= LARGEST_PITCH)
     length = np.where(reached, radius * bend + straight, np.nan)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -86,7 +87,7 @@ def plane_from_pose(
     origin, q = np.asarray(position, dtype=float), np.asarray(quaternion, dtype=float)
     if not (np.all(np.isfinite(origin)) and np.all(np.isfinite(q))):
         raise UserError(f"target_plane is not finite: position {origin}, orientation {q}")
-    norm = float(np.linalg.norm(q))
+    norm = math.hypot(*q)
     if abs(norm - 1.0) > _UNIT_TOLERANCE:
         raise UserError(f"target_plane's quaternion has length {norm:g}, wants 1")
     transform = np.eye(4)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from needle_controller.model.kinematics import rotation_from_quaternion
@@ -49,7 +51,7 @@ def _obstacle(name: str, marker: Marker) -> Obstacle:
     across = sizes
     if marker.kind == CYLINDER:
         quaternion = np.array(marker.orientation)
-        length = float(np.linalg.norm(quaternion))
+        length = math.hypot(*quaternion)
         if not abs(length - 1.0) <= _ROUND:
             raise UserError(f"{name}'s quaternion has length {length:g}, wants 1")
         half = 0.5 * sizes[2] * rotation_from_quaternion(quaternion / length)[:, 2]

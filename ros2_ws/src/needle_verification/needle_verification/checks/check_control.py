@@ -6,8 +6,6 @@ import csv
 import dataclasses
 import json
 import math
-import os
-import sys
 import time
 from collections.abc import Iterator
 
@@ -15,16 +13,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from needle_bringup.simulation.node_process import NodeProcess, stop
-from needle_controller.model.gains import design_gains
 from needle_controller.model.reachability import reachability
 from needle_controller.model.target_plane import offset_plane
 from needle_controller.presets.steering_settings import PAPER_NOISE, SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.plane_control import PlaneControl
-from needle_core.errors import UserError
 from needle_core.files.installed import find_executable
-from needle_core.process.ros_domain import own_domain
 from needle_verification.checking import Check, Finding, Workbench
 from needle_verification.descendants import ran
 from needle_verification.studies import control_studies
@@ -139,50 +133,6 @@ def curvature(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
     )
 
 
-def bad_parameters(bench: Workbench) -> Iterator[Finding]:
-    """Refuse bad parameters and planes with what and why, and keep the last good ones."""
-    weights = np.diag(SteeringSettings.state_weights)
-    weights[0, 1] = 1.0
-    try:
-        settings = SteeringSettings(**PAPER_NOISE)
-        design_gains(
-            state_weights=weights,
-            input_weight=settings.input_weight,
-            process_noise=np.diag(settings.process_noise),
-            measurement_std=settings.measurement_std,
-            step_length=settings.step_length,
-        )
-        seen = "gains"
-    except UserError as error:
-        seen = str(error)
-    yield Finding(
-        "bad_weights", "weights that are not symmetric", "refused", seen, "symmetric" in seen
-    )
-    with own_domain() as domain:
-        environment = {**os.environ, "ROS_DOMAIN_ID": str(domain)}
-        node = NodeProcess(
-            "plane_controller",
-            [find_executable("needle_controller", "plane_controller")],
-            environment=environment,
-            log=bench.folder / "plane_controller.log",
-        )
-        try:
-            asked = ran(
-                [sys.executable, "-m", "needle_verification.ros.bad_parameters"],
-                environment=environment,
-            )
-        finally:
-            stop([node])
-    for case, answer in json.loads(asked.stdout.splitlines()[-1]).items():
-        yield Finding(
-            f"bad_{case.replace(' ', '_')}",
-            case,
-            "refused with the reason, all as before",
-            f"{answer['reason'] or 'taken'}{'' if answer['kept'] else '; CHANGED'}",
-            bool(answer["refused"] and answer["reason"] and answer["kept"]),
-        )
-
-
 def study_speed(bench: Workbench, size: Size = FULL) -> Iterator[Finding]:
     """Steer 10,000 needles over 120 steps, on one core."""
     for study, times in zip(SPEED, (3, 1), strict=True):
@@ -228,7 +178,7 @@ def node_update(_: Workbench) -> Iterator[Finding]:
 
 
 CHECKS: tuple[Check, ...] = (
-    paper, figure_3, best, trouble, points, curvature, bad_parameters, study_speed, study_memory,
+    paper, figure_3, best, trouble, points, curvature, study_speed, study_memory,
     node_update,
 )  # fmt: skip
 

@@ -63,15 +63,6 @@ BOUNDS = {
     "hang": _SILENT,
     "emcy": _TOLD,
 }
-NUISANCES = {
-    "points": "trajectories of 1,000,000 points",
-    "name": "holds with a name of 1 MB",
-    "flood": "10,000 messages/s on each topic that the driver hears",
-}
-# The drives' watchdog, and the copy of a message of 56 MB [s].
-DRIVES_WAIT, LONGEST_COPY = 0.1, 0.5
-# How long every node is fuzzed [s], and what each may grow by [MB].
-FUZZ, FUZZ_GROWTH = 900, 50.0
 # A rotation that does not follow is noticed when it is so far off [rad]; then come the patience of
 # the drive, a cycle and a ramp [s].
 _FOLLOWING = 0.1
@@ -174,46 +165,12 @@ def killed_nodes(_: Workbench, moments: int = MOMENTS) -> Iterator[Finding]:
         )
 
 
-def nuisances(_: Workbench, seconds: int = 10) -> Iterator[Finding]:
-    """Hold up neither cycle nor emergency stop by anything that others send."""
-    for outcome in _trials("nuisances", seconds, *NUISANCES):
-        kind, longest = outcome["kind"], float(outcome["longest_cycle_s"])
-        heard = float(outcome["estop_heard_s"])
-        # What copying the longest message takes is what is left; no more than this one is seen.
-        bound = LONGEST_COPY if kind == "points" else DRIVES_WAIT
-        yield Finding(
-            f"nuisance_{kind}",
-            f"{NUISANCES[kind]}, a step under way: longest cycle; emergency stop heard after",
-            f"at most {bound:g} s each",
-            f"{longest:.3f} s, {heard:.3f} s"
-            + (f"; step {outcome['step_ended_by']}" if outcome["step_ended_by"] else ""),
-            max(longest, heard) <= bound,
-        )
-
-
-def fuzz(_: Workbench, seconds: int = FUZZ) -> Iterator[Finding]:
-    """End, swell and move by nothing that every node of a rig is sent at random."""
-    for outcome in _trials("fuzz", seconds):
-        grown: dict[str, float] = outcome["memory_growth_MB"]
-        each = ", ".join(f"{name} {growth:+.1f} MB" for name, growth in grown.items())
-        yield Finding(
-            f"fuzz_{outcome['fuzz'].partition(' ')[0]}",
-            f"{outcome['sent']} random messages and requests on {outcome['topics']} topics and "
-            f"{outcome['services']} services, {outcome['fuzz']}",
-            f"no node ends, none grows by more than {FUZZ_GROWTH:g} MB, no motor turns",
-            f"none ended; {each}; " + ("a motor turned" if outcome["moved"] else "none turned"),
-            max(grown.values()) <= FUZZ_GROWTH and not outcome["moved"] and outcome["sent"] > 0,
-        )
-
-
 CHECKS: tuple[Check, ...] = (
     drive_level,
     same_joints,
     many_steps,
     faults,
     killed_nodes,
-    nuisances,
-    fuzz,
 )
 
 

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import random
-import re
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from needle_bags.reading.bag_reader import read_run
-from needle_core.commands.cli import EXIT_DONE, EXIT_MISSED
-from needle_core.errors import UserError
 from needle_verification.checking import (
     Check,
     Finding,
     SimulateRun,
     Workbench,
-    diagnostics,
     payloads,
     unreadable,
 )
@@ -37,8 +29,6 @@ MILESTONES = (
     ("simulated_operator: inserted", 1.0),
 )
 SEED = 2009
-SHORT = ("--depth-mm", "12")
-WARN = 1
 
 
 def camera(bench: Workbench) -> Iterator[Finding]:
@@ -119,31 +109,6 @@ def same_seed(bench: Workbench) -> Iterator[Finding]:
     )
 
 
-def stood_still(bench: Workbench) -> Iterator[Finding]:
-    """Nodes that stand still now and then change nothing, or the run says that they may have."""
-    nodes = ("simulated_operator", "plane_controller", "sim_rig")
-    for level in ("tip", "camera", "drive"):
-        for insertion in ("stepwise", "continuous"):
-            arguments = ("--graph", "--level", level, "--insertion", insertion, *SHORT)
-            name = f"{level}_{insertion}_12"
-            usual = bench.run(name, *arguments)
-            # A driver that hears nothing of its drives ends in a fault, as on hardware.
-            halting = nodes if level != "drive" else nodes[:1]
-            paused = bench.run_with_pauses(
-                f"{name}_paused", halting, random.Random(SEED), *arguments
-            )
-            differ = _differences(usual.bag, paused.bag)
-            trips = paused.summary.get("watchdog_trips", 0)
-            same = f"different: {', '.join(differ)}" if differ else "the same"
-            yield Finding(
-                f"stood_still_{level}_{insertion}",
-                f"level {level}, {insertion}: with {', '.join(halting)} stopped again and again",
-                "the same bit for bit, or watchdog trips told",
-                f"{same}; {trips} trips",
-                not differ or trips > 0,
-            )
-
-
 def tip_speed(bench: Workbench) -> Iterator[Finding]:
     """Run without images quickly."""
     run = bench.run("tip_1", "--level", "tip")
@@ -210,47 +175,13 @@ def bad_parameter(bench: Workbench) -> Iterator[Finding]:
         )
 
 
-def bad_tip(bench: Workbench) -> Iterator[Finding]:
-    """NaN, a wrong frame, mm for m: all named; no command comes from them."""
-    patterns = {"not_finite": "finite", "frame": "frame", "millimetres": "from the entry|jumped"}
-    for kind, pattern in patterns.items():
-        run = _run_with(bench, f"bad_tip_{kind}", kind, "--level", "tip", "--graph", *SHORT)
-        yield _named(run, "plane_controller", kind, pattern)
-        # A refused tip may cost a further exposure, and with it another noise: the run as a whole
-        # may differ from one without. But each command bears the stamp of the tip behind it.
-        recorded = read_run(run.bag)
-        strange = {result.stamp for result in recorded.results} - set(
-            recorded.truth.stamps.tolist()
-        )
-        done = sum(result.outcome == "succeeded" for result in recorded.results)
-        yield Finding(
-            f"{kind}_no_motion",
-            f"commands with bad data '{kind}' about",
-            "12 steps, all from an exposure's tip, none from a bad one",
-            f"{done} steps, {len(strange)} not from an exposure, "
-            f"{recorded.last_status('tips_rejected')} tips refused",
-            not strange and done == 12,
-        )
-
-
-def lonely_image(bench: Workbench) -> Iterator[Finding]:
-    """Name a left image without its right; the needle moves as without it."""
-    usual = bench.run("camera_short", *SHORT)
-    run = _run_with(bench, "lonely_image", "left_image", *SHORT)
-    yield _named(run, "stereo_tracker", "left_image", "without|partner|pair|match")
-    yield _unmoved(run, usual, "lonely_image")
-
-
 CHECKS: tuple[Check, ...] = (
     camera,
     open_loop,
     same_seed,
-    stood_still,
     tip_speed,
     interrupt,
     bad_parameter,
-    bad_tip,
-    lonely_image,
 )
 
 
@@ -269,48 +200,3 @@ def _differences(one: Path, other: Path, topics: Sequence[str] = SAME_TOPICS) ->
     """Return the topics whose messages differ in any bit."""
     ours, theirs = payloads(one, topics), payloads(other, topics)
     return [topic for topic in topics if ours[topic] != theirs[topic]]
-
-
-def _run_with(bench: Workbench, name: str, kind: str, *arguments: str) -> SimulateRun:
-    """Run `simulate` with a second publisher of bad data in its graph."""
-    started = bench.start(name, *arguments)
-    command = [sys.executable, "-m", "needle_verification.ros.bad_input", kind]
-    environment = {**os.environ, "ROS_DOMAIN_ID": str(started.domain())}
-    # It ends with its input.
-    with subprocess.Popen(command, env=environment, stdin=subprocess.PIPE):
-        run = started.wait()
-    if run.code not in (EXIT_DONE, EXIT_MISSED):
-        raise UserError(f"{name} ended with exit code {run.code}: {run.last_line}")
-    return run
-
-
-def _named(run: SimulateRun, node: str, kind: str, pattern: str) -> Finding:
-    """Look for a bad datum's name in the node's log and in its diagnostics."""
-    logged = [
-        line
-        for line in run.log(node).splitlines()
-        if re.search("WARN|ERROR", line) and re.search(pattern, line)
-    ]
-    told = [
-        message
-        for level, name, message in diagnostics(run.bag)
-        if level >= WARN and name.startswith(node) and re.search(pattern, message)
-    ]
-    return Finding(
-        f"{kind}_named",
-        f"bad data '{kind}'",
-        "a clear line in the log and in diagnostics",
-        f"log: {(*logged, 'nothing')[0]}; diagnostics: {(*told, 'nothing')[0]}",
-        bool(logged and told),
-    )
-
-
-def _unmoved(run: SimulateRun, usual: SimulateRun, key: str) -> Finding:
-    differ = _differences(run.bag, usual.bag, ("/device/joint_trajectory", "/sim/tip_pose"))
-    return Finding(
-        f"{key}_no_motion",
-        "motion with bad data",
-        "the same as without, bit for bit",
-        f"different: {', '.join(differ)}" if differ else "the same",
-        not differ,
-    )

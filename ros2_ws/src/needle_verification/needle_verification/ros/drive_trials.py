@@ -1,8 +1,7 @@
 """Trials of the device driver against the emulated drives, each printed as one JSON object.
 
 `python -m needle_verification.ros.drive_trials steps 10000`, `... faults 50 cut_bus unplug`,
-`... kills 50 simulated_operator`, `... nuisances 5 points flood` (5 s of each),
-`... fuzz 900` (seconds).
+`... kills 50 simulated_operator`.
 """
 
 from __future__ import annotations
@@ -13,18 +12,12 @@ from pathlib import Path
 
 from needle_core.commands.options import CommandParser
 from needle_verification.ros.drive_faults import FAULTS, fault_trials
-from needle_verification.ros.fuzz_trials import fuzz_trials
 from needle_verification.ros.graph_kills import KILLED, kill_trials
 from needle_verification.ros.listening_node import ros
-from needle_verification.ros.nuisance import NUISANCE_KINDS
-from needle_verification.ros.nuisance_trials import nuisance_trials
 from needle_verification.trials.drive_steps import random_steps
 from needle_verification.trials.trial_runner import Outcomes, run_trials, trials_of
 
-KINDS = {
-    **{name: (name,) for name in ("steps", "fuzz")},
-    **{"faults": FAULTS, "kills": KILLED, "nuisances": NUISANCE_KINDS},
-}
+KINDS = {"steps": ("steps",), "faults": FAULTS, "kills": KILLED}
 
 
 def main() -> int:
@@ -36,17 +29,12 @@ def main() -> int:
 
 
 def _outcomes(given: argparse.Namespace, folder: Path, domain: int) -> Outcomes:
-    timed = given.trial in ("nuisances", "fuzz")
-    trials = trials_of(KINDS[given.trial], given.kinds, 1 if timed else given.count, given.seed)
+    trials = trials_of(KINDS[given.trial], given.kinds, given.count, given.seed)
     with ros(domain):
         if given.trial == "steps":
             yield random_steps(given.count, given.seed)
         elif given.trial == "faults":
             yield from fault_trials(folder, domain, trials, given.watchdog)
-        elif given.trial == "nuisances":
-            yield from nuisance_trials(folder, domain, trials, float(given.count))
-        elif given.trial == "fuzz":
-            yield from fuzz_trials(folder, domain, float(given.count), given.seed)
         else:
             yield from kill_trials(folder, domain, trials)
 

@@ -57,8 +57,6 @@ def _begin_worker(folder: str) -> None:
     # Ctrl-C reaches the whole group: who asked for the runs ends those who do them.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _settle_in()
-    # Each run is collected at its end.
-    gc.disable()
 
 
 @functools.lru_cache(maxsize=1)

@@ -60,12 +60,6 @@ def test_a_sample_shows_what_it_must(
     assert [finding for finding in findings if not finding.passed] == []
 
 
-def test_bad_parameters_are_refused_by_the_running_node(bench: Workbench) -> None:
-    findings = list(check_control.bad_parameters(bench))
-    assert len(findings) > 12
-    assert [finding for finding in findings if not finding.passed] == []
-
-
 def test_the_node_s_update_is_timed_over_a_whole_run() -> None:
     seconds = check_control.update_times("best")
     assert seconds.shape == (121,)

@@ -44,12 +44,6 @@ def test_faults_are_named_and_need_a_command_to_go_on() -> None:
         assert [finding for finding in findings if not finding.passed] == []
 
 
-def test_nothing_that_every_node_is_sent_ends_or_moves_one(tmp_path: Path) -> None:
-    findings = list(check_driver.fuzz(Workbench(["simulate"], tmp_path), 10))
-    assert len(findings) == 2
-    assert [finding for finding in findings if not finding.passed] == []
-
-
 @pytest.mark.parametrize(
     ("change", "missed"),
     [

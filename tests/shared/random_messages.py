@@ -25,7 +25,7 @@ def random_message(kind: Any, rng: random.Random) -> Any:
     return message
 
 
-def _value(type_name: str, rng: random.Random) -> Any:  # noqa: PLR0911 - each return is a type
+def _value(type_name: str, rng: random.Random) -> Any:
     sequence, array = _SEQUENCE.match(type_name), _ARRAY.match(type_name)
     if sequence:
         most = min(int(sequence[2] or _LONGEST), _LONGEST)
