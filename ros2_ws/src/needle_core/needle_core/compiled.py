@@ -13,8 +13,6 @@ from typing import Any, TypeVar, cast
 
 import numba
 
-from needle_core.process.private_folder import private_folder
-
 Function = TypeVar("Function", bound=Callable[..., Any])
 _COMPILED = re.compile(rb"^(@compiled|@inlined|# Read by compiled code\.)$", re.MULTILINE)
 
@@ -30,8 +28,7 @@ def compiled(function: Function) -> Function:
     What was compiled is kept in the user's cache, in a folder named after all files of the
     function's package, from its root down, that hold compiled functions or are marked as read by
     such: numba itself looks at the file of the called function only, and would go on using old code
-    of what that function calls in another file. What lies there is run: where it cannot be this
-    user's alone, nothing is kept.
+    of what that function calls in another file.
 
     Parameters
     ----------
@@ -79,21 +76,23 @@ def _package_root(module: Path) -> Path:
 
 @functools.cache
 def _cache_directory(package: Path) -> str:
-    """Return a private folder for this state of a package's sources, or "" where there is none."""
+    """Return a folder for this state of a package's sources, or "" where none can be made."""
     digest = hashlib.sha256(numba.__version__.encode())
     for path in [Path(__file__), *sorted(package.rglob("*.py"))]:
         source = path.read_bytes()
         if _COMPILED.search(source) or path == Path(__file__):
             digest.update(source)
     for place in _places():
-        folder = private_folder(place, "needle_steering", package.name, digest.hexdigest()[:16])
-        if folder is not None:
-            return str(folder)
+        folder = place / "needle_steering" / package.name / digest.hexdigest()[:16]
+        with contextlib.suppress(OSError):
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if os.access(folder, os.W_OK | os.X_OK):
+                return str(folder)
     return ""
 
 
 def _places() -> list[Path]:
-    """Return where a cache may be, the first choice first; never one that anybody can guess."""
+    """Return where a cache may be, the first choice first."""
     named = (os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"))
     places = [Path(place) for place in named if place]
     # HOME, or else the home that the password database has; without either there is none.
