@@ -1,4 +1,4 @@
-"""A simulated rig in real time and the console's page on it, in one process: scripts/console."""
+"""A simulated rig in real time and the console's page on it: scripts/console."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from needle_bringup.simulation.console_graph import run_console_graph
 from needle_bringup.simulation.console_options import ConsoleOptions, parse_console
 from needle_bringup.simulation.rig_configuration import command_line_parameters
 from needle_core.commands.cli import EXIT_INTERRUPTED, EXIT_MISSED, run_command
@@ -48,6 +49,9 @@ def console(options: ConsoleOptions) -> int:
     UserError
         Where something is missing or a port is taken.
     """
+    if options.rig.graph:
+        with EndRequest() as end:
+            return run_console_graph(options, rig_parameters(options), end)
     # Small matrices: threads only get in each other's way. It counts for what is loaded from here.
     os.environ.update({"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"})
     from needle_console.console import PAGE, Console  # noqa: PLC0415

@@ -13,6 +13,7 @@ Steer a simulated needle by hand, in a browser, in real time.
 
 Runs sim_rig, plane_controller (at level drive also drive_emulator and device_driver) and the
 console in one process, cameras and stereo_tracker in a second one, and prints the address to open.
+With --graph each is a ROS node of this shell's domain, with live_view for RViz and Foxglove.
 Nothing moves before you have pressed the buttons in their order; Ctrl-C ends all.
 """
 
@@ -24,6 +25,8 @@ examples:
       no images: for a slow machine
   scripts/console --level drive --port 9000
       the device driver moves two emulated CANopen drives; page and hold on ports 9000 and 9001
+  scripts/console --graph
+      ROS nodes, to look at with `ros2 topic echo`, RViz or Foxglove as well
 
 exit codes: 130 ended by Ctrl-C, 1 a part of the rig ended before, 2 bad input or something missing.
 """
@@ -76,11 +79,13 @@ def parse_console(arguments: Sequence[str]) -> ConsoleOptions:
         metavar="N",
         help=f"port of the page; the hold takes the next (default: {_DEFAULT_PORT})",
     )
+    parser.add_argument("--graph", action="store_true", help="run ROS nodes, for RViz and Foxglove")
     for option, (metavar, text) in _SHARED.items():
         parser.add_argument(option, metavar=metavar, help=text)
     given = parser.parse_args(join_start(arguments))
     # Who steers by hand decides how fast the needle goes, and not where it stops in between.
-    words = ["--real-time-factor", "1", "--insertion", "continuous"]
+    words = ["--graph"] if given.graph else ["--real-time-factor", "1"]
+    words += ["--insertion", "continuous"]
     for option in _SHARED:
         value = getattr(given, option[2:].replace("-", "_"))
         if value is not None:

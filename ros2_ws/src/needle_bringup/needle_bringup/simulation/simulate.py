@@ -15,7 +15,13 @@ from types import ModuleType
 
 from needle_bringup.simulated_operator.progress import PROGRESS_FD
 from needle_bringup.simulation.needle_options import contradictions
-from needle_bringup.simulation.node_process import RECORDER_GRACE, NodeProcess, stop, wait_for
+from needle_bringup.simulation.node_graph import (
+    OPERATOR,
+    PARAMETERS,
+    NodeFailedError,
+    NodeGraph,
+)
+from needle_bringup.simulation.node_process import wait_for
 from needle_bringup.simulation.own_component import own_component
 from needle_bringup.simulation.rig_configuration import (
     PACKAGES,
@@ -28,7 +34,6 @@ from needle_bringup.simulation.rig_configuration import (
 )
 from needle_bringup.simulation.simulate_options import SimulateOptions, command_of, parse
 from needle_core.commands.cli import (
-    EXIT_BAD_INPUT,
     EXIT_DONE,
     EXIT_MISSED,
     JsonValue,
@@ -37,39 +42,19 @@ from needle_core.commands.cli import (
 )
 from needle_core.commands.executables import loaded
 from needle_core.errors import UserError
-from needle_core.files.installed import find_executable
 from needle_core.process.end_request import EndRequest
 from needle_core.process.reach import settle_environment
 from needle_core.process.ros_domain import own_domain
 from needle_core.settings.parameter_files import Parameters, read_parameters
 
-LOGS = "logs"
-PARAMETERS = "parameters.yaml"
 METADATA = "metadata.yaml"
 SUMMARY = "summary.json"
 REPORT = "report.html"
 POLL = 0.05
 # When the nodes have started, one core has time for this process [s].
 QUIET_AFTER = 4.0
-# rclpy's own log files would double those in LOGS.
-ROS_ARGUMENTS = ("--ros-args", "--disable-external-lib-logs")
 # Set by scripts/simulate: when the command was given, in seconds since the epoch.
 STARTED_AT = "NEEDLE_STARTED_AT"
-
-
-class NodeFailedError(UserError):
-    """A node that ended before its time.
-
-    Parameters
-    ----------
-    node : NodeProcess
-        Which one.
-    """
-
-    def __init__(self, node: NodeProcess) -> None:
-        self.is_bad_input = node.exit_code == EXIT_BAD_INPUT and node.name != "simulated_operator"
-        where = "" if self.is_bad_input else f" (all it said is in {node.log})"
-        super().__init__(node.describe_end() + where)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -114,11 +99,12 @@ def simulate(options: SimulateOptions) -> int:
         parameters = merge(command_line_parameters(options, bag), given)
         for line in contradictions(parameters, nodes_of(options)):
             print(f"warning: {line}", file=sys.stderr)
-        write_parameters(bag / PARAMETERS, {node: parameters[node] for node in nodes_of(options)})
+        parameters = {node: parameters[node] for node in nodes_of(options)}
         with end:
             if options.graph:
-                _run_graph(options, bag, end)
+                _run_graph(options, parameters, bag, end)
             else:
+                write_parameters(bag / PARAMETERS, parameters)
                 _run_components(options, parameters, bag, end)
         _check(end)
         return _report(options, bag, started_at)
@@ -162,84 +148,37 @@ def _run_components(
     )
 
 
-def _run_graph(options: SimulateOptions, bag: Path, end: EndRequest) -> None:
+def _run_graph(
+    options: SimulateOptions, parameters: Parameters, bag: Path, end: EndRequest
+) -> None:
     """Run the rig as ROS nodes until the operator ends."""
-    executables = {node: find_executable(PACKAGES[node], node) for node in nodes_of(options)}
     with own_domain() as domain:
-        _run_nodes(executables, bag, domain, end)
-
-
-def _run_nodes(executables: dict[str, str], bag: Path, domain: int, end: EndRequest) -> None:
-    """Run the graph until the operator ends."""
-    logs = bag / LOGS
-    logs.mkdir()
-    progress = os.dup(sys.stderr.fileno())
-    environment = {
-        **os.environ,
-        "ROS_DOMAIN_ID": str(domain),
+        print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
         # Nodes write into their log files; only the operator's progress goes to the terminal.
-        PROGRESS_FD: str(progress),
-        "PYTHONUNBUFFERED": "1",
-        # Small matrices: threads only get in each other's way, and in the way of the other nodes.
-        "OPENBLAS_NUM_THREADS": "1",
-        "OMP_NUM_THREADS": "1",
-    }
-    nodes: dict[str, NodeProcess] = {}
-    print(f"recording into {shown(bag)} (ROS_DOMAIN_ID {domain})", file=sys.stderr)
-    failure: NodeProcess | None = None
-    try:
-        for name, executable in executables.items():
-            _check(end)
-            nodes[name] = NodeProcess(
-                name,
-                [executable, *ROS_ARGUMENTS, "--params-file", str(bag / PARAMETERS)],
-                environment=environment,
-                log=logs / f"{name}.log",
-                pass_fds=[progress] if name == "simulated_operator" else [],
-            )
-        operator = nodes["simulated_operator"]
-        begin = time.monotonic()
-        while operator.exit_code is None and failure is None:
-            _check(end)
-            if time.monotonic() - begin > QUIET_AFTER:
-                _import_report()
-            failure = _first_dead(nodes)
-            wait_for([operator], POLL)
-        failure = failure or _first_dead(nodes)
-        if failure is None and operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
-            failure = operator
-        if failure is not None:
-            raise NodeFailedError(failure)
-    finally:
-        os.close(progress)
-        _stop_nodes(nodes)
+        progress = os.dup(sys.stderr.fileno())
+        variables = {"ROS_DOMAIN_ID": str(domain), PROGRESS_FD: str(progress)}
+        graph = NodeGraph(bag, parameters, **variables)
+        try:
+            for name in nodes_of(options):
+                _check(end)
+                graph.start(PACKAGES[name], name, [progress] if name == OPERATOR else [])
+            _await_operator(graph, end)
+        finally:
+            os.close(progress)
+            graph.stop()
 
 
-def _first_dead(nodes: dict[str, NodeProcess]) -> NodeProcess | None:
-    """Return a node that ended although it should run."""
-    for name, node in nodes.items():
-        if name != "simulated_operator" and node.exit_code is not None:
-            return node
-    return None
-
-
-def _stop_nodes(nodes: dict[str, NodeProcess]) -> None:
-    """End the operator, then the others, then the recorder that still records their ends.
-
-    The driver switches the drives off before they, too, are gone.
-    """
-    operator, recorder = nodes.get("simulated_operator"), nodes.get("recorder")
-    driver = nodes.get("device_driver")
-    rest = [node for node in nodes.values() if node not in (operator, driver, recorder)]
-    warnings = stop([operator]) if operator else []
-    warnings += stop([driver]) if driver else []
-    warnings += stop(rest)
-    warnings += stop([recorder], RECORDER_GRACE) if recorder else []
-    if recorder is not None and recorder.exit_code == EXIT_MISSED:
-        said = [line for line in recorder.tail(3) if line.startswith("error: ")]
-        warnings += [line.removeprefix("error: ") for line in said] or [recorder.describe_end()]
-    for warning in warnings:
-        print(f"warning: {warning}", file=sys.stderr)
+def _await_operator(graph: NodeGraph, end: EndRequest) -> None:
+    operator, begin = graph.nodes[OPERATOR], time.monotonic()
+    while operator.exit_code is None:
+        _check(end)
+        graph.check()
+        if time.monotonic() - begin > QUIET_AFTER:
+            _import_report()
+        wait_for([operator], POLL)
+    graph.check()
+    if operator.exit_code not in (EXIT_DONE, EXIT_MISSED):
+        raise NodeFailedError(operator)
 
 
 def _report(options: SimulateOptions, bag: Path, started_at: float) -> int:

@@ -24,6 +24,12 @@ def test_options_of_the_rig_mean_what_they_mean_for_simulate() -> None:
     assert rig.insertion == "stepwise"
 
 
+def test_a_graph_has_the_same_rig() -> None:
+    one, graph = (rig_parameters(parse_console(words)) for words in ([], ["--graph"]))
+    del graph["simulated_operator"], one["simulated_operator"], graph["recorder"], one["recorder"]
+    assert graph == one
+
+
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
