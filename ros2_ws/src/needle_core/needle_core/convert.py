@@ -19,6 +19,7 @@ from needle_core.message_types import NANOSECONDS, MessageTypes
 from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
 
 _STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _LOG_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
 
 
@@ -157,6 +158,32 @@ def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[s
     return {"header": t.header(message.stamp_ns, message.frame_id), "pose": pose}
 
 
+def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
+    header, make = t.header(message.stamp_ns, message.frame_id), t.make(ros_type(m.Pose))
+    poses = [make(header=header, pose=t.pose(at, _UPRIGHT)) for at in message.positions]
+    return {"header": header, "poses": poses}
+
+
+def _ros_transform(message: m.Transform, t: MessageTypes) -> Any:
+    return t.make("geometry_msgs/msg/TransformStamped")(
+        header=t.header(message.stamp_ns, message.frame_id),
+        child_frame_id=message.child_frame_id,
+        transform=t.make("geometry_msgs/msg/Transform")(
+            translation=t.vector(message.translation), rotation=t.quaternion(message.rotation)
+        ),
+    )
+
+
+def _transform(message: Any) -> m.Transform:
+    return m.Transform(
+        to_nanoseconds(message.header.stamp),
+        message.header.frame_id,
+        message.child_frame_id,
+        _xyz(message.transform.translation),
+        _xyzw(message.transform.rotation),
+    )
+
+
 def _image_fields(message: m.Image, t: MessageTypes) -> dict[str, Any]:
     return {
         "header": t.header(message.stamp_ns, message.frame_id),
@@ -221,6 +248,7 @@ def _camera_info(message: Any) -> m.CameraInfo:
 
 
 def _marker(message: Any) -> m.Marker:
+    colour = message.color
     return m.Marker(
         message.header.frame_id,
         message.ns,
@@ -230,14 +258,18 @@ def _marker(message: Any) -> m.Marker:
         _xyz(message.pose.position),
         _xyzw(message.pose.orientation),
         _xyz(message.scale),
+        to_nanoseconds(message.header.stamp),
+        (float(colour.r), float(colour.g), float(colour.b), float(colour.a)),
+        tuple(map(_xyz, message.points)),
     )
 
 
 def _ros_marker(marker: m.Marker, t: MessageTypes) -> Any:
-    color = t.make("std_msgs/msg/ColorRGBA")(r=0.8, g=0.2, b=0.2, a=0.5)
+    red, green, blue, opacity = marker.colour
+    color = t.make("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity)
     image = t.make("sensor_msgs/msg/CompressedImage")
     return t.make("visualization_msgs/msg/Marker")(
-        header=t.header(0, marker.frame_id),
+        header=t.header(marker.stamp_ns, marker.frame_id),
         ns=marker.namespace,
         id=marker.number,
         type=marker.kind,
@@ -247,7 +279,7 @@ def _ros_marker(marker: m.Marker, t: MessageTypes) -> Any:
         color=color,
         lifetime=t.duration(0.0),
         frame_locked=False,
-        points=[],
+        points=[t.point(at) for at in marker.points],
         colors=[],
         texture_resource="",
         texture=image(header=t.header(0), format="", data=t.array(np.uint8, ())),
@@ -373,7 +405,32 @@ TABLE: dict[type[Any], Row] = {
             _floats(r.pose.covariance),
         ),
     ),
+    m.Path: Row(
+        "nav_msgs/msg/Path",
+        _path_fields,
+        lambda r: m.Path(
+            to_nanoseconds(r.header.stamp),
+            r.header.frame_id,
+            tuple(_xyz(pose.pose.position) for pose in r.poses),
+        ),
+    ),
+    m.Transforms: Row(
+        "tf2_msgs/msg/TFMessage",
+        lambda message, t: {"transforms": [_ros_transform(one, t) for one in message.transforms]},
+        lambda r: m.Transforms(tuple(map(_transform, r.transforms))),
+    ),
     m.Image: Row("sensor_msgs/msg/Image", _image_fields, _image),
+    m.CompressedImage: Row(
+        "sensor_msgs/msg/CompressedImage",
+        lambda message, t: {
+            "header": t.header(message.stamp_ns, message.frame_id),
+            "format": message.format,
+            "data": t.octets(message.data),
+        },
+        lambda r: m.CompressedImage(
+            to_nanoseconds(r.header.stamp), r.header.frame_id, r.format, bytes(r.data)
+        ),
+    ),
     m.CameraInfo: Row("sensor_msgs/msg/CameraInfo", _camera_info_fields, _camera_info),
     m.Text: Row(
         "std_msgs/msg/String",

@@ -70,12 +70,15 @@ class MessageTypes:
         x, y, z = values
         return self.make("geometry_msgs/msg/Vector3")(x=x, y=y, z=z)
 
+    def quaternion(self, values: Quaternion) -> Any:
+        """Return a geometry_msgs/Quaternion."""
+        x, y, z, w = values
+        return self.make("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
+
     def pose(self, position: Vector3, orientation: Quaternion) -> Any:
         """Return a geometry_msgs/Pose."""
-        x, y, z, w = orientation
-        quaternion = self.make("geometry_msgs/msg/Quaternion")(x=x, y=y, z=z, w=w)
         make = self.make("geometry_msgs/msg/Pose")
-        return make(position=self.point(position), orientation=quaternion)
+        return make(position=self.point(position), orientation=self.quaternion(orientation))
 
 
 def rclpy_types() -> MessageTypes:

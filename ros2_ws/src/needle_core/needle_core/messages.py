@@ -143,6 +143,33 @@ class PoseWithCovariance:
 
 
 @dataclass(frozen=True)
+class Path:
+    """Positions [m], one after the other."""
+
+    stamp_ns: int
+    frame_id: str
+    positions: tuple[Vector3, ...]
+
+
+@dataclass(frozen=True)
+class Transform:
+    """Where a frame is in another one: the child's origin [m] and axes in `frame_id`."""
+
+    stamp_ns: int
+    frame_id: str
+    child_frame_id: str
+    translation: Vector3
+    rotation: Quaternion
+
+
+@dataclass(frozen=True)
+class Transforms:
+    """A set of transforms."""
+
+    transforms: tuple[Transform, ...]
+
+
+@dataclass(frozen=True)
 class Image:
     """An image; `data` has `height` rows of `step` bytes."""
 
@@ -153,6 +180,16 @@ class Image:
     encoding: str
     step: int
     data: bytes | memoryview = field(repr=False)
+
+
+@dataclass(frozen=True)
+class CompressedImage:
+    """An image as the bytes of a file; `format` is jpeg or png."""
+
+    stamp_ns: int
+    frame_id: str
+    format: str
+    data: bytes = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -192,7 +229,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Marker:
-    """A shape of visualization_msgs, with the fields that an obstacle has."""
+    """A shape of visualization_msgs; `colour` is red, green, blue and opacity, 0 to 1.
+
+    Without a stamp it is shown where its frame is now; its default colour is that of an obstacle.
+    """
 
     frame_id: str
     namespace: str
@@ -202,6 +242,9 @@ class Marker:
     position: Vector3
     orientation: Quaternion
     scale: Vector3
+    stamp_ns: int = 0
+    colour: tuple[float, float, float, float] = (0.8, 0.2, 0.2, 0.5)
+    points: tuple[Vector3, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,10 @@ MESSAGES = (
     m.Vector(STAMP, "target_plane", (0.1, -0.2, 0.3)),
     m.Pose(STAMP, "rig", (0.1, -0.2, 0.3), TURN),
     m.PoseWithCovariance(STAMP, "rig", (0.1, -0.2, math.inf), TURN, tuple(np.arange(36.0))),
+    m.Path(STAMP, "rig", ((0.1, -0.2, 0.3), (0.4, 0.5, -0.6))),
+    m.Transforms((m.Transform(STAMP, "rig", "needle_tip", (0.1, -0.2, 0.3), TURN),)),
     m.Image(STAMP, "left_camera_optical", 2, 3, "mono8", 4, bytes(range(8))),
+    m.CompressedImage(STAMP, "left_camera_optical", "jpeg", bytes(range(8))),
     m.CameraInfo(
         stamp_ns=STAMP,
         frame_id="left_camera_optical",
@@ -46,7 +49,24 @@ MESSAGES = (
         roi=m.RegionOfInterest(10, 20, 30, 40),
     ),
     m.Text("a calibration"),
-    m.Markers((m.Marker("rig", "bone", 4, 2, 0, (0.1, 0.2, 0.3), TURN, (0.6, 0.6, 0.6)),)),
+    m.Markers(
+        (
+            m.Marker(
+                frame_id="rig",
+                namespace="shaft",
+                number=4,
+                kind=4,
+                action=0,
+                position=(0.1, 0.2, 0.3),
+                orientation=TURN,
+                scale=(0.6, 0.6, 0.6),
+                stamp_ns=STAMP,
+                # Of 32 bits there.
+                colour=(0.25, 0.5, 0.75, 1.0),
+                points=((0.0, 0.0, 0.0), (0.1, -0.2, 0.3)),
+            ),
+        )
+    ),
     m.Status("rig1/device_driver", "device", Level.WARN, "text", {"state": "MOVING"}),
     m.Diagnostics(STAMP, (m.Status("sim_rig", "simulation", Level.OK, "runs", {"a": "1"}),)),
     m.LogLine(STAMP, "warning", "plane_controller", "a line"),
@@ -82,11 +102,21 @@ def test_there_and_back_without_ros(message: Any) -> None:
 def test_there_and_back_with_ros_and_across(message: Any) -> None:
     types = rclpy_types()
     kind = ros_type(type(message))
+    # No wheel on PyPI brings tf2_msgs.
+    pytest.importorskip(kind.partition("/")[0])
     data = serialize_message(Converter(types).to_ros(message))
     assert from_ros(type(message), deserialize_message(data, types.make(kind))) == message
     written = STORE.serialize_cdr(Converter(rosbags_types(STORE)).to_ros(message), kind)
     heard = deserialize_message(bytes(written), types.make(kind))
     assert from_ros(type(message), heard) == message
+
+
+def test_a_plain_marker_looks_like_an_obstacle() -> None:
+    ball = m.Marker("rig", "bone", 4, 2, 0, (0.1, 0.2, 0.3), TURN, (0.6, 0.6, 0.6))
+    (marker,) = Converter(rclpy_types()).to_ros(m.Markers((ball,))).markers
+    color, stamp = marker.color, marker.header.stamp
+    assert (color.r, color.g, color.b, color.a) == (0.8, 0.2, 0.2, 0.5)
+    assert (stamp.sec, stamp.nanosec, list(marker.points)) == (0, 0, [])
 
 
 def test_a_hold_without_button_or_axis_is_a_release() -> None:
