@@ -7,29 +7,18 @@ read with and without ROS.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from needle_core import messages as m
 from needle_core.diagnostics import Level
-from needle_core.message_types import NANOSECONDS, MessageTypes
+from needle_core.message_types import MessageTypes, Row, floats, head, to_nanoseconds, xyz, xyzw
 from needle_core.status_messages import ControllerStatus, DeviceStatus, KeyValues
+from needle_core.view_rows import VIEW_ROWS
 
 _STATUS = "diagnostic_msgs/msg/DiagnosticStatus"
-_UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 _LOG_LEVELS = {"debug": 10, "info": 20, "warning": 30, "error": 40, "fatal": 50}
-
-
-@dataclass(frozen=True)
-class Row:
-    """A message's ROS type, the fields of its ROS message, and the way back."""
-
-    ros_type: str
-    to_fields: Callable[[Any, MessageTypes], dict[str, Any]]
-    from_ros: Callable[[Any], Any]
 
 
 class Converter:
@@ -63,23 +52,6 @@ def from_ros(kind: type[Any], message: Any) -> Any:
     return TABLE[kind].from_ros(message)
 
 
-def to_nanoseconds(stamp: Any) -> int:
-    """Return a builtin_interfaces/Time in nanoseconds."""
-    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
-
-
-def _floats(values: Any) -> tuple[float, ...]:
-    return tuple(float(value) for value in values)
-
-
-def _xyz(v: Any) -> m.Vector3:
-    return (float(v.x), float(v.y), float(v.z))
-
-
-def _xyzw(q: Any) -> m.Quaternion:
-    return (float(q.x), float(q.y), float(q.z), float(q.w))
-
-
 def _joint_state_fields(message: m.JointState, t: MessageTypes) -> dict[str, Any]:
     return {
         "header": t.header(message.stamp_ns),
@@ -109,9 +81,9 @@ def _trajectory_fields(message: m.Trajectory, t: MessageTypes) -> dict[str, Any]
 def _trajectory(message: Any) -> m.Trajectory:
     points = [
         m.TrajectoryPoint(
-            _floats(point.positions),
+            floats(point.positions),
             int(point.time_from_start.sec) + int(point.time_from_start.nanosec) * 1e-9,
-            _floats((*point.velocities, *point.accelerations, *point.effort)),
+            floats((*point.velocities, *point.accelerations, *point.effort)),
         )
         for point in message.points
     ]
@@ -129,7 +101,7 @@ def _joystick_fields(message: m.Joystick, t: MessageTypes, frame_id: str = "") -
 
 def _joystick(message: Any) -> m.Joystick:
     buttons = tuple(int(button) for button in message.buttons)
-    return m.Joystick(to_nanoseconds(message.header.stamp), _floats(message.axes), buttons)
+    return m.Joystick(to_nanoseconds(message.header.stamp), floats(message.axes), buttons)
 
 
 def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
@@ -142,8 +114,7 @@ def _hold(message: Any) -> m.HoldState:
     """Return the hold of a Joy; one without a button or an axis is a release."""
     axes, buttons = message.axes, message.buttons
     return m.HoldState(
-        to_nanoseconds(message.header.stamp),
-        message.header.frame_id,
+        *head(message),
         len(buttons) > 0 and int(buttons[0]) == 1,
         float(axes[0]) if len(axes) > 0 else math.nan,
         float(axes[1]) if len(axes) > 1 else math.inf,
@@ -155,142 +126,7 @@ def _covariance_fields(message: m.PoseWithCovariance, t: MessageTypes) -> dict[s
         pose=t.pose(message.position, message.orientation),
         covariance=t.array(np.float64, message.covariance),
     )
-    return {"header": t.header(message.stamp_ns, message.frame_id), "pose": pose}
-
-
-def _path_fields(message: m.Path, t: MessageTypes) -> dict[str, Any]:
-    header, make = t.header(message.stamp_ns, message.frame_id), t.make(ros_type(m.Pose))
-    poses = [make(header=header, pose=t.pose(at, _UPRIGHT)) for at in message.positions]
-    return {"header": header, "poses": poses}
-
-
-def _ros_transform(message: m.Transform, t: MessageTypes) -> Any:
-    return t.make("geometry_msgs/msg/TransformStamped")(
-        header=t.header(message.stamp_ns, message.frame_id),
-        child_frame_id=message.child_frame_id,
-        transform=t.make("geometry_msgs/msg/Transform")(
-            translation=t.vector(message.translation), rotation=t.quaternion(message.rotation)
-        ),
-    )
-
-
-def _transform(message: Any) -> m.Transform:
-    return m.Transform(
-        to_nanoseconds(message.header.stamp),
-        message.header.frame_id,
-        message.child_frame_id,
-        _xyz(message.transform.translation),
-        _xyzw(message.transform.rotation),
-    )
-
-
-def _image_fields(message: m.Image, t: MessageTypes) -> dict[str, Any]:
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "height": message.height,
-        "width": message.width,
-        "encoding": message.encoding,
-        "is_bigendian": 0,
-        "step": message.step,
-        "data": t.octets(message.data),
-    }
-
-
-def _image(message: Any) -> m.Image:
-    return m.Image(
-        to_nanoseconds(message.header.stamp),
-        message.header.frame_id,
-        int(message.height),
-        int(message.width),
-        message.encoding,
-        int(message.step),
-        # Not copied: images are large, and come 60 a second.
-        memoryview(message.data),
-    )
-
-
-def _camera_info_fields(message: m.CameraInfo, t: MessageTypes) -> dict[str, Any]:
-    roi = message.roi
-    return {
-        "header": t.header(message.stamp_ns, message.frame_id),
-        "height": message.height,
-        "width": message.width,
-        "distortion_model": message.distortion_model,
-        **{name: t.array(np.float64, getattr(message, name)) for name in "dkrp"},
-        "binning_x": message.binning_x,
-        "binning_y": message.binning_y,
-        "roi": t.make("sensor_msgs/msg/RegionOfInterest")(
-            x_offset=roi.x_offset,
-            y_offset=roi.y_offset,
-            height=roi.height,
-            width=roi.width,
-            do_rectify=False,
-        ),
-    }
-
-
-def _camera_info(message: Any) -> m.CameraInfo:
-    roi = message.roi
-    return m.CameraInfo(
-        to_nanoseconds(message.header.stamp),
-        message.header.frame_id,
-        int(message.height),
-        int(message.width),
-        message.distortion_model,
-        _floats(message.d),
-        _floats(message.k),
-        _floats(message.r),
-        _floats(message.p),
-        int(message.binning_x),
-        int(message.binning_y),
-        m.RegionOfInterest(*(int(v) for v in (roi.x_offset, roi.y_offset, roi.width, roi.height))),
-    )
-
-
-def _marker(message: Any) -> m.Marker:
-    colour = message.color
-    return m.Marker(
-        message.header.frame_id,
-        message.ns,
-        int(message.id),
-        int(message.type),
-        int(message.action),
-        _xyz(message.pose.position),
-        _xyzw(message.pose.orientation),
-        _xyz(message.scale),
-        to_nanoseconds(message.header.stamp),
-        (float(colour.r), float(colour.g), float(colour.b), float(colour.a)),
-        tuple(map(_xyz, message.points)),
-    )
-
-
-def _ros_marker(marker: m.Marker, t: MessageTypes) -> Any:
-    red, green, blue, opacity = marker.colour
-    color = t.make("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity)
-    image = t.make("sensor_msgs/msg/CompressedImage")
-    return t.make("visualization_msgs/msg/Marker")(
-        header=t.header(marker.stamp_ns, marker.frame_id),
-        ns=marker.namespace,
-        id=marker.number,
-        type=marker.kind,
-        action=marker.action,
-        pose=t.pose(marker.position, marker.orientation),
-        scale=t.vector(marker.scale),
-        color=color,
-        lifetime=t.duration(0.0),
-        frame_locked=False,
-        points=[t.point(at) for at in marker.points],
-        colors=[],
-        texture_resource="",
-        texture=image(header=t.header(0), format="", data=t.array(np.uint8, ())),
-        uv_coordinates=[],
-        text="",
-        mesh_resource="",
-        mesh_file=t.make("visualization_msgs/msg/MeshFile")(
-            filename="", data=t.array(np.uint8, ())
-        ),
-        mesh_use_embedded_materials=False,
-    )
+    return {"header": t.header_of(message), "pose": pose}
 
 
 def _status_fields(message: m.Status, t: MessageTypes) -> dict[str, Any]:
@@ -349,7 +185,7 @@ TABLE: dict[type[Any], Row] = {
         "sensor_msgs/msg/JointState",
         _joint_state_fields,
         lambda r: m.JointState(
-            to_nanoseconds(r.header.stamp), tuple(r.name), _floats(r.position), _floats(r.velocity)
+            to_nanoseconds(r.header.stamp), tuple(r.name), floats(r.position), floats(r.velocity)
         ),
     ),
     m.Trajectory: Row("trajectory_msgs/msg/JointTrajectory", _trajectory_fields, _trajectory),
@@ -367,80 +203,36 @@ TABLE: dict[type[Any], Row] = {
     ),
     m.Point: Row(
         "geometry_msgs/msg/PointStamped",
-        lambda message, t: {
-            "header": t.header(message.stamp_ns, message.frame_id),
-            "point": t.point(message.position),
-        },
-        lambda r: m.Point(to_nanoseconds(r.header.stamp), r.header.frame_id, _xyz(r.point)),
+        lambda message, t: {"header": t.header_of(message), "point": t.point(message.position)},
+        lambda r: m.Point(*head(r), xyz(r.point)),
     ),
     m.Vector: Row(
         "geometry_msgs/msg/Vector3Stamped",
-        lambda message, t: {
-            "header": t.header(message.stamp_ns, message.frame_id),
-            "vector": t.vector(message.values),
-        },
-        lambda r: m.Vector(to_nanoseconds(r.header.stamp), r.header.frame_id, _xyz(r.vector)),
+        lambda message, t: {"header": t.header_of(message), "vector": t.vector(message.values)},
+        lambda r: m.Vector(*head(r), xyz(r.vector)),
     ),
     m.Pose: Row(
         "geometry_msgs/msg/PoseStamped",
         lambda message, t: {
-            "header": t.header(message.stamp_ns, message.frame_id),
+            "header": t.header_of(message),
             "pose": t.pose(message.position, message.orientation),
         },
-        lambda r: m.Pose(
-            to_nanoseconds(r.header.stamp),
-            r.header.frame_id,
-            _xyz(r.pose.position),
-            _xyzw(r.pose.orientation),
-        ),
+        lambda r: m.Pose(*head(r), xyz(r.pose.position), xyzw(r.pose.orientation)),
     ),
     m.PoseWithCovariance: Row(
         "geometry_msgs/msg/PoseWithCovarianceStamped",
         _covariance_fields,
         lambda r: m.PoseWithCovariance(
-            to_nanoseconds(r.header.stamp),
-            r.header.frame_id,
-            _xyz(r.pose.pose.position),
-            _xyzw(r.pose.pose.orientation),
-            _floats(r.pose.covariance),
+            *head(r),
+            xyz(r.pose.pose.position),
+            xyzw(r.pose.pose.orientation),
+            floats(r.pose.covariance),
         ),
     ),
-    m.Path: Row(
-        "nav_msgs/msg/Path",
-        _path_fields,
-        lambda r: m.Path(
-            to_nanoseconds(r.header.stamp),
-            r.header.frame_id,
-            tuple(_xyz(pose.pose.position) for pose in r.poses),
-        ),
-    ),
-    m.Transforms: Row(
-        "tf2_msgs/msg/TFMessage",
-        lambda message, t: {"transforms": [_ros_transform(one, t) for one in message.transforms]},
-        lambda r: m.Transforms(tuple(map(_transform, r.transforms))),
-    ),
-    m.Image: Row("sensor_msgs/msg/Image", _image_fields, _image),
-    m.CompressedImage: Row(
-        "sensor_msgs/msg/CompressedImage",
-        lambda message, t: {
-            "header": t.header(message.stamp_ns, message.frame_id),
-            "format": message.format,
-            "data": t.octets(message.data),
-        },
-        lambda r: m.CompressedImage(
-            to_nanoseconds(r.header.stamp), r.header.frame_id, r.format, bytes(r.data)
-        ),
-    ),
-    m.CameraInfo: Row("sensor_msgs/msg/CameraInfo", _camera_info_fields, _camera_info),
     m.Text: Row(
         "std_msgs/msg/String",
         lambda message, t: {"data": message.text},
         lambda r: m.Text(r.data),
-    ),
-    m.Markers: Row(
-        "visualization_msgs/msg/MarkerArray",
-        lambda message, t: {"markers": [_ros_marker(marker, t) for marker in message.markers]},
-        lambda r: m.Markers(tuple(_marker(marker) for marker in r.markers)),
     ),
     m.Status: Row(_STATUS, _status_fields, _status),
     DeviceStatus: _key_values(DeviceStatus),
@@ -452,6 +244,7 @@ TABLE: dict[type[Any], Row] = {
             to_nanoseconds(r.header.stamp), tuple(_status(status) for status in r.status)
         ),
     ),
+    **VIEW_ROWS,
     m.LogLine: Row("rcl_interfaces/msg/Log", _log_fields, _log),
 }
 """Kind of message to its row."""

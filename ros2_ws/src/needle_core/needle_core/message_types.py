@@ -6,6 +6,7 @@ import array
 import functools
 import importlib
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -49,6 +50,10 @@ class MessageTypes:
         """Return a std_msgs/Header."""
         return self.make("std_msgs/msg/Header")(stamp=self.time(stamp_ns), frame_id=frame_id)
 
+    def header_of(self, message: Any) -> Any:
+        """Return the header of one of our messages that has a stamp and a frame."""
+        return self.header(message.stamp_ns, message.frame_id)
+
     def time(self, stamp_ns: int) -> Any:
         """Return a builtin_interfaces/Time; beyond its range the nearest that it can tell."""
         sec = min(max(stamp_ns // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
@@ -79,6 +84,40 @@ class MessageTypes:
         """Return a geometry_msgs/Pose."""
         make = self.make("geometry_msgs/msg/Pose")
         return make(position=self.point(position), orientation=self.quaternion(orientation))
+
+
+@dataclass(frozen=True)
+class Row:
+    """A message's ROS type, the fields of its ROS message, and the way back."""
+
+    ros_type: str
+    to_fields: Callable[[Any, MessageTypes], dict[str, Any]]
+    from_ros: Callable[[Any], Any]
+
+
+def to_nanoseconds(stamp: Any) -> int:
+    """Return a builtin_interfaces/Time in nanoseconds."""
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def head(message: Any) -> tuple[int, str]:
+    """Return stamp [ns] and frame of a message's header."""
+    return to_nanoseconds(message.header.stamp), message.header.frame_id
+
+
+def floats(values: Any) -> tuple[float, ...]:
+    """Return numbers as Python's floats."""
+    return tuple(float(value) for value in values)
+
+
+def xyz(v: Any) -> Vector3:
+    """Return the numbers of a geometry_msgs/Point or Vector3."""
+    return (float(v.x), float(v.y), float(v.z))
+
+
+def xyzw(q: Any) -> Quaternion:
+    """Return the numbers of a geometry_msgs/Quaternion."""
+    return (float(q.x), float(q.y), float(q.z), float(q.w))
 
 
 def rclpy_types() -> MessageTypes:

@@ -153,7 +153,7 @@ class Path:
 
 @dataclass(frozen=True)
 class Transform:
-    """Where a frame is in another one: the child's origin [m] and axes in `frame_id`."""
+    """Place of a frame in another one: the child's origin [m] and axes in `frame_id`."""
 
     stamp_ns: int
     frame_id: str

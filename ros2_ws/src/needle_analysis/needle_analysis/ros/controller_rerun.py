@@ -23,9 +23,9 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import SteeringState
 from needle_core.component import Actions, Input, Moment, Publish
-from needle_core.convert import Converter, from_ros, to_nanoseconds
+from needle_core.convert import Converter, from_ros
 from needle_core.errors import UserError
-from needle_core.message_types import rclpy_types
+from needle_core.message_types import rclpy_types, to_nanoseconds
 from needle_core.messages import JointState
 from needle_core.ros.conversions import values_of
 
