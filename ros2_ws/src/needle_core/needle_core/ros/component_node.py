@@ -100,12 +100,12 @@ class ComponentNode(WholeNode):
         # A service that answers later keeps no other callback from running.
         self._group = ReentrantCallbackGroup()
         settings = NodeParameters(self, parameters, self._on_parameters).values
-        if self.get_parameter("use_sim_time").value:
+        self.component = make(settings, signature(self))
+        if self.get_parameter("use_sim_time").value and not self.component.takes_simulated_time:
             raise UserError(
                 f"{self.get_fully_qualified_name()}: use_sim_time = true: this node runs in real "
                 "time; only viewers of a replay take simulated time"
             )
-        self.component = make(settings, signature(self))
         self.exit: Exit | None = None
         self._types = rclpy_types()
         self._converter = Converter(self._types)
