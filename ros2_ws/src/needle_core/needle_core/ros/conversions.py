@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from geometry_msgs.msg import Quaternion
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 
 from needle_core.component import Delivery
 from needle_core.diagnostics import Diagnostic
-from needle_core.rotations import quaternion_from_rotation
 
 NANOSECONDS = 1_000_000_000
 # A stamp's fields: int32 and uint32, also where more than a second is told in nanoseconds.
@@ -55,12 +51,6 @@ def to_stamp(nanoseconds: int) -> Time:
     sec = min(max(nanoseconds // NANOSECONDS, _FIRST_SEC), _LAST_SEC)
     nanosec = min(max(nanoseconds - sec * NANOSECONDS, 0), _LAST_NANOSEC)
     return Time(sec=sec, nanosec=nanosec)
-
-
-def to_quaternion(rotation: Sequence[Sequence[float]]) -> Quaternion:
-    """Return the unit quaternion of a rotation matrix, given as three rows, as a message."""
-    x, y, z, w = quaternion_from_rotation(rotation)
-    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def to_diagnostic_status(name: str, hardware_id: str, diagnostic: Diagnostic) -> DiagnosticStatus:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from needle_core.ros.conversions import to_quaternion
+from needle_core.rotations import quaternion_from_rotation
 
 HALF_TURNS = [Rotation.from_rotvec(np.pi * axis) for axis in np.eye(3)]
 NEAR_NONE = [Rotation.from_rotvec(1e-8 * axis) for axis in np.eye(3)]
@@ -17,5 +17,5 @@ NEAR_NONE = [Rotation.from_rotvec(1e-8 * axis) for axis in np.eye(3)]
 )
 def test_a_rotation_is_scipys_quaternion(rotation: Rotation) -> None:
     matrix = rotation.as_matrix()
-    q = to_quaternion(matrix.tolist())
-    assert (q.x, q.y, q.z, q.w) == tuple(Rotation.from_matrix(matrix).as_quat())
+    quaternion = quaternion_from_rotation(matrix.tolist())
+    assert quaternion == tuple(Rotation.from_matrix(matrix).as_quat())

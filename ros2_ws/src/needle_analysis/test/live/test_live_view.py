@@ -1,0 +1,307 @@
+"""live_view on virtual time, before a rig that the test plays and viewers that come and go."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from needle_analysis.live import live_view
+from needle_analysis.live.live_messages import ADD
+from needle_analysis.live.live_view import LiveView, LiveViewParameters
+from needle_core import messages as m
+from needle_core.component import (
+    LATCHED,
+    Actions,
+    Component,
+    Input,
+    Listen,
+    Moment,
+    Output,
+    Peers,
+    Publish,
+    Timer,
+)
+from needle_core.runners.virtual import VirtualRunner
+from needle_core.status_messages import ControllerStatus
+from needle_tracker.optics.calibration import load_calibration
+from needle_tracker.optics.refraction import stereo_views
+
+CALIBRATION = Path(__file__).parents[4] / "src/needle_tracker/config/calibration.yaml"
+TIP = (0.001, 0.002, 0.04)
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+LEFT = live_view.PICTURES["left"]
+EXPOSED = 5_000_000_000
+
+
+class PlayedRig(Component):
+    """Says what the test wants."""
+
+    name = "played_rig"
+
+    def __init__(self, view: LiveView) -> None:
+        self.todo: deque[Publish] = deque()
+        self.outputs = tuple(Output(row.topic, row.message, row.delivery) for row in view.inputs)
+        self.timers = (Timer(0.01, self._say),)
+
+    def _say(self, at: Moment) -> Actions:
+        while self.todo:
+            yield self.todo.popleft()
+
+
+class Viewer(Component):
+    """Looks at some topics of the live view."""
+
+    name = "viewer"
+
+    def __init__(self, view: LiveView, topics: Iterable[str]) -> None:
+        self.seen: dict[str, list[Any]] = {topic: [] for topic in topics}
+        rows = {row.topic: row for row in view.outputs}
+        self.inputs = tuple(
+            Input(topic, rows[topic].message, partial(self._keep, topic), rows[topic].delivery)
+            for topic in topics
+        )
+
+    def _keep(self, topic: str, message: Any, at: Moment) -> Actions:
+        self.seen[topic].append(message)
+        return ()
+
+
+class Scene:
+    def __init__(self, *, transforms: bool = False) -> None:
+        self.view = LiveView(LiveViewParameters(), transforms=transforms)
+        self.rig = PlayedRig(self.view)
+        self.published: list[tuple[str, Any]] = []
+        self.health: dict[str, str] = {}
+        self.runner = VirtualRunner([self.view, self.rig], taps=[self._tap])
+        self.runner.run(0.5)
+
+    def _tap(self, stamp_ns: int, sender: str, message: Any, output: Output) -> None:
+        if sender == self.view.name and isinstance(message, m.Diagnostics):
+            self.health |= {status.part: status.text for status in message.statuses}
+        elif sender == self.view.name and not isinstance(message, m.LogLine):
+            self.published.append((output.topic, message))
+
+    def look_at(self, *topics: str) -> Viewer:
+        viewer = Viewer(self.view, topics)
+        self.runner.start(viewer)
+        self.runner.run(0.5)
+        return viewer
+
+    def say(self, topic: str, message: Any) -> None:
+        self.rig.todo.append(Publish(topic, message))
+        self.runner.run(0.3)
+
+
+def pose(frame: str, sigma: float, stamp_ns: int = EXPOSED) -> m.PoseWithCovariance:
+    covariance = tuple(np.diag(np.full(6, sigma**2)).ravel().tolist())
+    return m.PoseWithCovariance(stamp_ns, frame, TIP, UPRIGHT, covariance)
+
+
+def inserted(insertion: float) -> m.JointState:
+    return m.JointState(1, ("insertion_joint",), (insertion,))
+
+
+def steered() -> Scene:
+    """Return a scene with a tip that is seen, an estimate, a plane and a point."""
+    scene = Scene()
+    scene.say("joint_states", inserted(0.04))
+    status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
+    scene.say("needle/controller_status", status)
+    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    # In the frame of the plane, 3 mm beside.
+    scene.say("needle/estimate", pose("target_plane", 2e-4))
+    return scene
+
+
+def shown(markers: m.Markers) -> dict[str, m.Marker]:
+    return {marker.namespace: marker for marker in markers.markers if marker.action == ADD}
+
+
+def test_what_is_known_is_drawn_and_the_rest_is_taken_away() -> None:
+    scene = Scene()
+    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
+    status = ControllerStatus(target_offset_m=0.003, target_point_m=(0.01, 0.0, 0.1))
+    scene.say("needle/controller_status", status)
+    assert set(shown(markers[-1])) == {"plane", "target_point"}
+    assert len(markers[-1].markers) == 6
+    scene.say("joint_states", inserted(0.04))
+    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    seen = shown(markers[-1])
+    assert seen["shaft"].points[-1] == TIP
+    assert seen["uncertainty"].scale == pytest.approx((2 * 2.7955e-4,) * 3)
+    assert seen["plane"].position[0] == pytest.approx(0.003)
+    assert seen["plane"].frame_id == "rig"
+    assert seen["plane"].stamp_ns == pytest.approx(scene.runner.timeline.stamp_ns, abs=2e8)
+    scene.say("needle/estimate", pose("target_plane", 2e-4))
+    seen = shown(markers[-1])
+    assert seen["estimate"].points[0] == pytest.approx((TIP[0] + 0.003, *TIP[1:]))
+    assert seen["uncertainty"].scale == pytest.approx((4 * 2.7955e-4,) * 3)
+    # What is not found is grey.
+    scene.say("needle/tip_pose", pose("rig", np.inf, 2 * EXPOSED))
+    assert shown(markers[-1])["tip"].colour == (0.7, 0.7, 0.7, 1.0)
+
+
+def test_tip_and_way_are_sent() -> None:
+    scene = steered()
+    seen = scene.look_at(live_view.TIP, live_view.PATH).seen
+    assert seen[live_view.TIP][-1] == m.Pose(EXPOSED, "rig", TIP, UPRIGHT)
+    assert seen[live_view.PATH][-1].positions[-1] == TIP
+    assert len(seen[live_view.PATH][-1].positions) == 2
+
+
+def test_nothing_is_sent_that_nobody_looks_at() -> None:
+    scene = steered()
+    assert scene.published == []
+    scene.look_at(live_view.PATH)
+    assert {topic for topic, _ in scene.published} == {live_view.PATH}
+    scene.runner.stop("viewer")
+    scene.runner.run(0.5)
+    scene.published.clear()
+    scene.runner.run(0.5)
+    assert scene.published == []
+
+
+@pytest.mark.parametrize(
+    ("topic", "message"),
+    [
+        ("joint_states", inserted(1e300)),
+        ("joint_states", m.JointState(1, ("other_joint",), (0.0,))),
+        ("needle/estimate", pose("target_plane", np.nan)),
+        ("needle/estimate", pose("target_plane", 1e150)),
+        ("needle/controller_status", ControllerStatus(target_offset_m=20.0)),
+        ("needle/controller_status", ControllerStatus(target_point_m=(0.0, 0.0, 20.0))),
+        ("target_plane", m.Pose(1, "elsewhere", (0.0, 0.0, 0.0), UPRIGHT)),
+        ("stereo_tracker/calibration", m.Text("none")),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name_and_changes_nothing(topic: str, message: Any) -> None:
+    scene = steered()
+    markers = scene.look_at(live_view.MARKERS).seen[live_view.MARKERS]
+    before = shown(markers[-1])
+    scene.say(topic, message)
+    assert scene.health[topic].startswith("refused: ")
+    assert "handlers" not in scene.health
+    after = shown(markers[-1])
+    assert after["estimate"].points == before["estimate"].points
+    assert after["shaft"].points == before["shaft"].points
+    assert after.keys() == before.keys()
+
+
+def test_health_is_told_again_after_a_good_message() -> None:
+    scene = Scene()
+    scene.say("joint_states", inserted(np.nan))
+    assert scene.health["joint_states"].startswith("refused: ")
+    scene.say("joint_states", inserted(0.04))
+    assert scene.health["joint_states"] == "ok"
+
+
+# ---- images
+
+
+def black(stamp_ns: int) -> m.Image:
+    camera = load_calibration(CALIBRATION).left
+    size = camera.width * camera.height
+    return m.Image(stamp_ns, "", camera.height, camera.width, "mono8", camera.width, bytes(size))
+
+
+def test_an_image_is_drawn_with_its_answer() -> None:
+    scene = steered()
+    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    pictures = scene.look_at(LEFT).seen[LEFT]
+    scene.rig.todo.append(Publish("stereo/left/image_raw", black(2 * EXPOSED)))
+    scene.say("needle/tip_pose", pose("rig", 1e-4, 2 * EXPOSED))
+    (seen,) = pictures
+    assert (seen.stamp_ns, seen.format) == (2 * EXPOSED, "jpeg")
+    assert seen.frame_id == "left_camera_optical"
+    picture = cv2.imdecode(np.frombuffer(seen.data, np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    camera = load_calibration(CALIBRATION).left
+    assert picture.shape == (camera.height, camera.width, 3)
+    u, v = np.round(stereo_views(load_calibration(CALIBRATION))[0].project(np.array(TIP)))
+    ring = picture[int(v) - 12 : int(v) + 13, int(u) - 12 : int(u) + 13]
+    # Orange: red over green over blue.
+    assert (ring[..., 2].astype(int) - ring[..., 0] > 100).sum() > 20
+
+
+def test_an_image_of_another_camera_is_refused_by_name() -> None:
+    scene = Scene()
+    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    pictures = scene.look_at(LEFT).seen[LEFT]
+    scene.say("stereo/left/image_raw", m.Image(1, "", 2, 3, "mono8", 3, bytes(6)))
+    assert "the calibration is for" in scene.health["stereo/left/image_raw"]
+    scene.runner.run(1.0)
+    assert pictures == []
+
+
+def test_images_that_came_while_nobody_looked_are_not_shown_later() -> None:
+    scene = Scene()
+    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    scene.say("stereo/left/image_raw", black(1))
+    first = Viewer(scene.view, [LEFT])
+    scene.runner.start(first)
+    scene.runner.run(0.25)
+    # It waits for its answer, which takes longer than anybody looks.
+    scene.rig.todo.append(Publish("stereo/left/image_raw", black(2)))
+    scene.runner.run(0.05)
+    scene.runner.stop("viewer")
+    scene.say("stereo/left/image_raw", black(3))
+    pictures = scene.look_at(LEFT).seen[LEFT]
+    scene.runner.run(1.0)
+    assert pictures == []
+    scene.say("stereo/left/image_raw", black(4))
+    scene.runner.run(1.0)
+    assert [picture.stamp_ns for picture in pictures] == [4]
+    assert first.seen[LEFT] == []
+
+
+def test_images_are_received_only_while_their_view_is_looked_at() -> None:
+    view = LiveView(LiveViewParameters(), transforms=False)
+    at = Moment(0.0, 0)
+    peers = Peers(subscribers={LEFT: ("viewer",)})
+    left, right = "stereo/left/image_raw", "stereo/right/image_raw"
+    assert list(view.on_peers(peers, at)) == [Listen(left, True), Listen(right, False)]
+    assert list(view.on_peers(Peers(), at)) == [Listen(left, False), Listen(right, False)]
+    assert {row.topic for row in view.inputs if row.lazy} == {left, right}
+
+
+# ---- transforms
+
+
+def test_transforms_are_sent_where_there_is_a_message_for_them() -> None:
+    scene = Scene(transforms=True)
+    assert Output(live_view.TF_STATIC, m.Transforms, LATCHED) in scene.view.outputs
+    scene.say("stereo_tracker/calibration", m.Text(CALIBRATION.read_text("utf-8")))
+    seen = scene.look_at(live_view.TF, live_view.TF_STATIC).seen
+    (fixed,) = seen[live_view.TF_STATIC]
+    assert [one.child_frame_id for one in fixed.transforms] == [
+        "left_camera_optical",
+        "right_camera_optical",
+    ]
+    assert {one.frame_id for one in fixed.transforms} == {"rig"}
+    T_optical_rig = load_calibration(CALIBRATION).left.T_optical_rig
+    origin = T_optical_rig @ (*fixed.transforms[0].translation, 1.0)
+    assert origin[:3] == pytest.approx(np.zeros(3), abs=1e-12)
+    # Before anything is known there is nothing to be sent.
+    assert seen[live_view.TF] == []
+    scene.say("needle/controller_status", ControllerStatus(target_offset_m=0.003))
+    scene.say("needle/tip_pose", pose("rig", 1e-4))
+    plane, tip = seen[live_view.TF][-1].transforms
+    assert (plane.child_frame_id, plane.translation) == ("target_plane", (0.003, 0.0, 0.0))
+    assert tip == m.Transform(EXPOSED, "rig", "needle_tip", TIP, UPRIGHT)
+
+
+def test_without_a_message_for_transforms_there_is_no_topic_of_them() -> None:
+    topics = {row.topic for row in LiveView(LiveViewParameters(), transforms=False).outputs}
+    assert topics == {
+        live_view.TIP,
+        live_view.PATH,
+        live_view.MARKERS,
+        *live_view.PICTURES.values(),
+    }
