@@ -127,12 +127,14 @@ def rclpy_types() -> MessageTypes:
         package, kind, short = name.split("/")
         return getattr(importlib.import_module(f"{package}.{kind}"), short)
 
-    return MessageTypes(
-        lookup,
-        lambda _, values: list(values),
-        lambda value: bytes([value]),
+    def octets(data: bytes | memoryview) -> array.array[int]:
         # Anything but an array of bytes is copied element by element.
-        lambda data: array.array("B", bytes(data)),
+        field = array.array("B")
+        field.frombytes(data)
+        return field
+
+    return MessageTypes(
+        lookup, lambda _, values: list(values), lambda value: bytes([value]), octets
     )
 
 
