@@ -248,7 +248,7 @@ def _tick(node: Any, noted: Noted) -> None:
 
 def _camera(module: ModuleType) -> Node:
     """Make what publishes images, without any."""
-    with mock.patch.object(module, "open_source"):
+    with mock.patch("needle_tracker.stereo_camera.open_source"):
         return _class_of(module)()
 
 
@@ -286,7 +286,7 @@ WAYS: dict[str, tuple[Way, ...]] = {
         Way(then=_tick),
         Way("with `wait_for_recorder`", ("wait_for_recorder:=true",)),
     ),
-    "stereo_camera": (Way(make=_camera),),
+    "stereo_camera": (Way(make=_camera, then=_tick),),
     "stereo_tracker": (
         Way(then=_turn),
         Way("with `heading_from_estimate`", ("heading_from_estimate:=true",), then=_turn),

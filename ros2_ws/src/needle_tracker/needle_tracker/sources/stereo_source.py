@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Protocol, cast
@@ -29,33 +28,33 @@ class StampedPair:
     right_stamp: int
 
 
+@dataclasses.dataclass(frozen=True)
+class EndOfRecording:
+    """A recording has no further pair.
+
+    Attributes
+    ----------
+    missing : str
+        Frames that it lacked; empty where nothing is missing.
+    """
+
+    missing: str = ""
+
+
 class StereoSource(Protocol):
     """Gives one pair after the other."""
 
-    dropped: int
-    """Pairs that could not be read so far."""
-
-    @property
-    def missing(self) -> str:
-        """Frames that a recording lacked, known at its end; empty where nothing is missing."""
-
-    def next(self) -> StampedPair | None:
+    def next(self) -> StampedPair | EndOfRecording | None:
         """Return the next pair; None where this one could not be read.
 
         Raises
         ------
-        EndOfRecordingError
-            After the last pair of a recording.
         UserError
             A source that is gone, or images of another size.
         """
 
     def close(self) -> None:
         """Let go of devices and files."""
-
-
-class EndOfRecordingError(Exception):
-    """The recording has no further pair."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,22 +99,18 @@ def open_source(settings: SourceSettings, clock: Callable[[], int]) -> StereoSou
     for side, name in given.items():
         if not name:
             raise UserError(f"{side} is empty: a device number, /dev/videoN, a folder or a video")
-    devices = {side: is_device(name) for side, name in given.items()}
-    if devices["left"] != devices["right"]:
+    # A camera is a number, or below /dev/.
+    are_cameras = [name.isdecimal() or name.startswith("/dev/") for name in given.values()]
+    if are_cameras[0] != are_cameras[1]:
         raise UserError(
             f"left = {settings.left!r} and right = {settings.right!r}: one is a camera, the other "
             "a recording"
         )
-    if devices["left"]:
+    if are_cameras[0]:
         if settings.left == settings.right:
             raise UserError(f"left and right are the same camera, {settings.left!r}")
         return CameraPair(settings, clock)
     return RecordedPairs(settings, clock)
-
-
-def is_device(name: str) -> bool:
-    """Return whether a source's name is that of a camera: a number, or below /dev/."""
-    return name.isdecimal() or name.startswith("/dev/")
 
 
 class CameraPair:
@@ -140,7 +135,6 @@ class CameraPair:
         clock: Callable[[], int],
         open_capture: Callable[[str], cv2.VideoCapture] | None = None,
     ) -> None:
-        self.dropped = 0
         self._clock = clock
         self._sizes = settings.sizes
         self._failed = 0
@@ -164,21 +158,14 @@ class CameraPair:
             ):
                 capture.set(key, value)
 
-    @property
-    def missing(self) -> str:
-        """Nothing: cameras do not end."""
-        return ""
-
     def next(self) -> StampedPair | None:
         """Return the next pair; None where a camera gave none."""
         stamps, grabbed = {}, True
         for side, capture in self._captures.items():
             grabbed = bool(capture.grab()) and grabbed
             stamps[side] = self._clock()
-        images = [self._retrieve(side) if grabbed else None for side in ("left", "right")]
-        left, right = images
+        left, right = (self._retrieve(side) if grabbed else None for side in ("left", "right"))
         if left is None or right is None:
-            self.dropped += 1
             self._failed += 1
             if self._failed >= LOST_AFTER:
                 raise UserError(f"the cameras gave no pair {LOST_AFTER} times in a row: unplugged?")
@@ -222,7 +209,6 @@ class RecordedPairs:
             raise UserError(
                 f"images without a partner ({len(self._pairs.unpaired)}): {self._pairs.unpaired[0]}"
             )
-        self.dropped = 0
         self._any = False
         self._next: Iterator[NamedPair] = iter(self._pairs)
         # A recording of another size is refused before anything is published.
@@ -230,22 +216,16 @@ class RecordedPairs:
             _check_sizes(pair, settings.sizes)
             break
 
-    @property
-    def missing(self) -> str:
-        """Frames of one video only, or that neither has though its file promises them."""
-        return self._pairs.missing
-
-    def next(self) -> StampedPair | None:
+    def next(self) -> StampedPair | EndOfRecording | None:
         """Return the next pair; None where one of its images cannot be read."""
         pair = next(self._next, None)
         if pair is None and self._settings.loop and self._any:
             self._next = iter(self._pairs)
             pair = next(self._next, None)
         if pair is None:
-            raise EndOfRecordingError
+            return EndOfRecording(self._pairs.missing)
         stamp = self._clock()
         if pair.left is None or pair.right is None:
-            self.dropped += 1
             return None
         _check_sizes(pair, self._settings.sizes)
         self._any = True
@@ -273,21 +253,19 @@ def check_size(side: str, image: Image, sizes: Sizes, name: str = "") -> None:
 
 
 class RateMeter:
-    """Pairs a second over the last seconds, on the steady clock."""
+    """Pairs a second over the last seconds."""
 
     def __init__(self, window: float = 5.0) -> None:
         self._window = window
         self._times: list[float] = []
 
-    def tick(self, now: float | None = None) -> None:
+    def tick(self, now: float) -> None:
         """Note a pair."""
-        now = time.monotonic() if now is None else now
         self._times = [t for t in self._times if now - t <= self._window]
         self._times.append(now)
 
-    def rate(self, now: float | None = None) -> float:
+    def rate(self, now: float) -> float:
         """Return pairs a second; 0 before the second pair."""
-        now = time.monotonic() if now is None else now
         recent = [t for t in self._times if now - t <= self._window]
         span = recent[-1] - recent[0] if len(recent) > 1 else 0.0
         return (len(recent) - 1) / span if span > 0.0 else 0.0

@@ -1,0 +1,231 @@
+"""stereo_camera as a component: image pairs of a source, published with their calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from needle_core import messages as m
+from needle_core.commands.cli import EXIT_BAD_INPUT, EXIT_DONE
+from needle_core.component import (
+    Actions,
+    Component,
+    Delivery,
+    Diagnose,
+    Exit,
+    Log,
+    Moment,
+    Output,
+    Peers,
+    Port,
+    PortChange,
+    Publish,
+    Send,
+    Timer,
+)
+from needle_core.diagnostics import Diagnostic, Level
+from needle_core.files.installed import find_shared
+from needle_core.settings.parameter_fields import check_fields, fixed_parameter
+from needle_tracker.optics.calibration import SIDES, Camera, StereoCalibration, load_calibration
+from needle_tracker.sources.pair_port import Event, PairPort
+from needle_tracker.sources.stereo_source import (
+    EndOfRecording,
+    RateMeter,
+    SourceSettings,
+    StampedPair,
+    open_source,
+)
+
+PAIRS = "pairs"
+_IMAGES = Delivery(depth=5)
+
+
+@dataclasses.dataclass(frozen=True)
+class StereoCameraParameters:
+    """Parameters of the node; all are fixed at start."""
+
+    left: str = fixed_parameter(
+        "", "-", "Left source: device number or /dev/..., folder of images, or video file."
+    )
+    right: str = fixed_parameter("", "-", "Right source, of the same kind.")
+    calibration_file: str = fixed_parameter(
+        "", "-", "Calibration file of the stereo rig; empty: the simulated bench's."
+    )
+    rate: float = fixed_parameter(20.0, "Hz", "Image pairs a second.", 0.1, 1000.0)
+    loop: bool = fixed_parameter(
+        False, "-", "Begin a recording again at its end, instead of ending with it."
+    )
+    latency: float = fixed_parameter(
+        0.0, "s", "Time from exposure to grab, taken off the stamp (cameras only).", 0.0, 1.0
+    )
+    triggered: bool = fixed_parameter(
+        False, "-", "One trigger line exposes both cameras: both images get the left's stamp."
+    )
+    wait_for_subscribers: bool = fixed_parameter(
+        False, "-", "Begin when somebody subscribes to both images (for recordings)."
+    )
+
+    def __post_init__(self) -> None:
+        """Check the fields."""
+        check_fields(self)
+
+    def calibration(self) -> StereoCalibration:
+        """Return the cameras' calibration, the installed one by default."""
+        installed = "needle_tracker", "config/calibration.yaml"
+        return load_calibration(Path(self.calibration_file or find_shared(*installed)))
+
+
+class StereoCamera(Component):
+    """Asks for a pair at each tick, and publishes the pairs that come.
+
+    Parameters
+    ----------
+    settings : StereoCameraParameters
+        The node's parameters.
+    calibration : StereoCalibration
+        The cameras.
+    name : str
+        Full name of the node.
+    """
+
+    name = "stereo_camera"
+    outputs = tuple(
+        Output(f"stereo/{side}/{topic}", message, _IMAGES)
+        for side in SIDES
+        for topic, message in (("image_raw", m.Image), ("camera_info", m.CameraInfo))
+    )
+
+    def __init__(
+        self, settings: StereoCameraParameters, calibration: StereoCalibration, name: str = name
+    ) -> None:
+        self.name, self.settings = name, settings
+        self._infos = {side: _camera_info(getattr(calibration, side), side) for side in SIDES}
+        self._has_begun = not settings.wait_for_subscribers
+        # Whether a tick has not asked yet, and whether what was asked for has not come yet.
+        self._is_due = self._is_awaited = False
+        self._started_at = math.inf
+        self._rate = RateMeter()
+        self._pairs = self._dropped = self._skew_ns = 0
+        self.ports = (Port(PAIRS, self._on_pairs, self._on_change),)
+        self.timers = (Timer(1.0 / settings.rate, self._tick), Timer(0.5, self._report))
+
+    def on_peers(self, peers: Peers, at: Moment) -> Actions:
+        """Begin, once somebody receives both images."""
+        topics = [f"stereo/{side}/image_raw" for side in SIDES]
+        self._has_begun |= all(topic in peers.subscribers for topic in topics)
+        return ()
+
+    def _tick(self, at: Moment) -> Actions:
+        if self._started_at == math.inf:
+            self._started_at = at.steady
+            yield Log("info", f"publishes images at {self.settings.rate:g} Hz")
+        self._is_due = self._has_begun
+        yield from self._ask()
+
+    def _ask(self) -> Actions:
+        """Ask for the pair that is due; a camera slower than the ticks is asked again at once."""
+        if self._is_due and not self._is_awaited:
+            self._is_due, self._is_awaited = False, True
+            yield Send(PAIRS, ("next",))
+
+    def _on_pairs(self, events: Sequence[Event], at: Moment) -> Actions:
+        for event in events:
+            self._is_awaited = False
+            match event:
+                case StampedPair():
+                    yield from self._publish(event, at)
+                case EndOfRecording(missing):
+                    told = f"{self._pairs} pairs, {self._dropped} unreadable"
+                    yield Log("info", f"end of the recording: {told}")
+                    if missing:
+                        yield Log("warning", f"the recording is not whole: {missing}")
+                    yield Exit(EXIT_DONE)
+                    return
+                case None:
+                    self._dropped += 1
+                    yield Log("warning", "a pair could not be read", kind="unreadable")
+        yield from self._ask()
+
+    def _on_change(self, change: PortChange, at: Moment) -> Actions:
+        yield Exit(EXIT_BAD_INPUT, change.lost)
+
+    def _publish(self, pair: StampedPair, at: Moment) -> Actions:
+        latency_ns = round(1e9 * self.settings.latency)
+        left_ns, right_ns = pair.left_stamp - latency_ns, pair.right_stamp - latency_ns
+        self._skew_ns = max(self._skew_ns, abs(right_ns - left_ns))
+        if self.settings.triggered:
+            right_ns = left_ns
+        views = ("left", pair.left, left_ns), ("right", pair.right, right_ns)
+        for side, pixels, stamp_ns in views:
+            info = dataclasses.replace(self._infos[side], stamp_ns=stamp_ns)
+            yield Publish(f"stereo/{side}/camera_info", info)
+            height, width = pixels.shape
+            # A view, not a copy, of pixels that lie in one piece.
+            data = pixels.reshape(-1).data
+            image = m.Image(stamp_ns, info.frame_id, height, width, "mono8", width, data)
+            yield Publish(f"stereo/{side}/image_raw", image)
+        self._pairs += 1
+        self._rate.tick(at.steady)
+
+    def _report(self, at: Moment) -> Actions:
+        rate, wanted = self._rate.rate(at.steady), self.settings.rate
+        values = {
+            "pairs": str(self._pairs),
+            "rate_hz": f"{rate:.1f}",
+            "dropped": str(self._dropped),
+            "skew_max_ms": f"{1e-6 * self._skew_ns:.2f}",
+        }
+        level, message = Level.OK, "images published"
+        if not self._has_begun:
+            level, message = Level.WARN, "waiting for subscribers"
+        elif self._dropped:
+            level, message = Level.WARN, "some pairs could not be read"
+        elif at.steady - self._started_at > 3.0 and rate < 0.8 * wanted:
+            level, message = Level.WARN, f"slower than the {wanted:g} Hz asked for"
+        yield Diagnose("images", Diagnostic(level, message, values))
+
+
+def make_camera(settings: StereoCameraParameters, name: str = StereoCamera.name) -> StereoCamera:
+    """Return the component with the calibration of its settings.
+
+    Raises
+    ------
+    UserError
+        A bad calibration file.
+    """
+    return StereoCamera(settings, settings.calibration(), name)
+
+
+def open_pairs(settings: StereoCameraParameters) -> PairPort:
+    """Return the port `pairs`, its source open: its images are stamped with the wall clock.
+
+    Raises
+    ------
+    UserError
+        A bad source.
+    """
+    rig = settings.calibration()
+    cameras = zip(SIDES, (rig.left, rig.right), strict=True)
+    sizes = {side: (camera.width, camera.height) for side, camera in cameras}
+    source = SourceSettings(settings.left, settings.right, sizes, settings.rate, settings.loop)
+    return PairPort(open_source(source, time.time_ns))
+
+
+def _camera_info(camera: Camera, side: str) -> m.CameraInfo:
+    matrix = camera.camera_matrix
+    return m.CameraInfo(
+        0,
+        f"{side}_camera_optical",
+        camera.height,
+        camera.width,
+        "plumb_bob",
+        tuple(camera.distortion.tolist()),
+        tuple(matrix.ravel().tolist()),
+        tuple(np.eye(3).ravel().tolist()),
+        tuple(np.hstack([matrix, np.zeros((3, 1))]).ravel().tolist()),
+    )
