@@ -14,6 +14,7 @@ from typing import Any
 from unittest import mock
 
 import rclpy
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from std_msgs.msg import String
@@ -31,7 +32,6 @@ from needle_core.convert import from_ros, ros_type
 from needle_core.message_types import rclpy_types
 from needle_core.process.ros_domain import own_domain
 from needle_core.ros.component_node import ComponentNode
-from needle_core.ros.executor import NodeExecutor
 from reference.endpoints import SOURCES, Endpoint, Noted, noting
 
 BAG = ROOT / "bags" / "regression"
@@ -172,9 +172,11 @@ def _class_of(module: ModuleType) -> Callable[[], Node]:
 
 def _turn(node: Any, _: Noted) -> None:
     """Let everything happen that happens by itself."""
-    with NodeExecutor(node, lambda *_: None, lambda _: None) as executor:
-        for _turns in range(5):
-            executor.spin_once(timeout_sec=0.0)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    for _turns in range(5):
+        executor.spin_once(timeout_sec=0.0)
+    executor.shutdown()
 
 
 def _live_view(module: ModuleType) -> Node:

@@ -1,4 +1,4 @@
-"""Fast DDS's shared memory: kept from other users, and taken away where a process was killed.
+"""Fast DDS's shared memory, taken away where a process was killed.
 
 A port is a file that every process of a domain opens. Who is killed never closes it: the count of
 its users stays wrong for good, and the next run in that domain inherits the file. Who is killed
@@ -23,21 +23,6 @@ _PORT = re.compile(rf"{_PREFIX}port\d+")
 _HALF_MADE = (0, 1)
 # Making one takes less than a millisecond; on a busy machine its maker may have to wait [s].
 _MAKING = 1.0
-
-
-def make_private() -> None:
-    """Keep other users from reading the shared memory that this process has open.
-
-    It holds every image. Fast DDS opens it to all readers, whatever the umask (mode 0644).
-    """
-    maps = Path("/proc/self/maps").read_text(encoding="utf-8", errors="replace")
-    open_here = {
-        line.split()[-1] for line in maps.splitlines() if f" {SHARED_MEMORY}/{_PREFIX}" in line
-    }
-    for path in open_here:
-        # Another user's, or gone.
-        with contextlib.suppress(OSError):
-            Path(path).chmod(0o600)
 
 
 def dead_ports(ports: Iterable[int], folder: Path = SHARED_MEMORY) -> list[str]:

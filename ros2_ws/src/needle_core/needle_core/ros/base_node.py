@@ -6,13 +6,13 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from typing import ClassVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
+from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -29,9 +29,8 @@ from needle_core.diagnostics import Diagnostic, Level
 from needle_core.errors import UserError
 from needle_core.process.end_request import EndRequest
 from needle_core.process.reach import keep_to_this_machine
-from needle_core.process.shared_memory import make_private, remove_half_made_ports
+from needle_core.process.shared_memory import remove_half_made_ports
 from needle_core.ros.conversions import RELIABLE, to_diagnostic_status, to_stamp
-from needle_core.ros.executor import NodeExecutor
 from needle_core.ros.node_names import signature
 from needle_core.settings.parameter_fields import describe
 from needle_core.settings.parameter_files import given_sections
@@ -55,11 +54,7 @@ class DiagnosticsPublisher:
         The node whose health it is.
     """
 
-    _OF_NODE: ClassVar[str] = "_needle_diagnostics"
-
     def __init__(self, node: Node) -> None:
-        # Kept by the node itself: what keeps a node from outside keeps it for ever.
-        vars(node)[self._OF_NODE] = self
         self._node = node
         self._refused: Counter[str] = Counter()
         self._complaints: set[tuple[str, str]] = set()
@@ -67,12 +62,6 @@ class DiagnosticsPublisher:
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         # Health is told also while simulated time stands still, hence the steady clock.
         node.create_timer(1.0, self._publish_all, clock=STEADY_CLOCK)
-
-    @classmethod
-    def of(cls, node: Node) -> DiagnosticsPublisher:
-        """Return the node's own, made where it has none."""
-        known: DiagnosticsPublisher | None = vars(node).get(cls._OF_NODE)
-        return known or cls(node)
 
     def set(self, part: str, diagnostic: Diagnostic) -> None:
         """Take the health of one part; published at once where level or message changed."""
@@ -187,7 +176,6 @@ def _run(
     code = EXIT_INTERNAL_ERROR
     try:
         node = create()
-        make_private()
         code = spin(node, end)
     except (UserError, ParameterException) as error:
         code = _refuse(error)
@@ -226,24 +214,15 @@ def _explain(help_text: str, parameters: type) -> int:
     return EXIT_DONE
 
 
-def executor_of(node: Node, on_failure: Callable[[str], None] = lambda _: None) -> NodeExecutor:
-    """Return what runs a node's callbacks, so that nothing which it is sent ends it.
-
-    Parameters
-    ----------
-    node : Node
-        The node.
-    on_failure : callable, optional
-        Called when a callback of the node's own failed, for one that must not go on as if not.
-    """
-    return NodeExecutor(node, DiagnosticsPublisher.of(node).refuse, on_failure)
-
-
 def _spin(node: Node, end: EndRequest) -> int:
-    # An executor that outlives the context complains when it is collected.
-    with executor_of(node) as executor:
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    try:
         while not end.wanted:
             executor.spin_once(timeout_sec=LOOK_PERIOD)
+    finally:
+        # One that outlives the context complains when it is collected.
+        executor.shutdown()
     return EXIT_DONE
 
 

@@ -175,15 +175,17 @@ HEARS = """
 import sys
 from rclpy.node import Node
 from std_msgs.msg import String
-from needle_core.ros.base_node import executor_of, run_node
+from rclpy.executors import SingleThreadedExecutor
+from needle_core.ros.base_node import run_node
 from needle_core.ros.conversions import RELIABLE
 
 def spin(node, end):
     heard = []
     node.create_subscription(String, "words", lambda word: heard.append(word.data), RELIABLE)
-    with executor_of(node) as executor:
-        while "9" not in heard:
-            executor.spin_once(timeout_sec=0.1)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while "9" not in heard:
+        executor.spin_once(timeout_sec=0.1)
     print(*heard, flush=True)
     return 0
 
