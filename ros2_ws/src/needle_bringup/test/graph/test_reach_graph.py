@@ -147,20 +147,6 @@ def test_another_middleware_is_named_and_not_loaded(domain: int) -> None:
     )
 
 
-def segments(process: NodeProcess) -> set[Path]:
-    """Return the shared memory that a process has open, but ports, which hold no messages."""
-    maps = Path(f"/proc/{process.pid}/maps").read_text("utf-8")
-    return {Path(path) for path in re.findall(r"/dev/shm/fastrtps_[0-9a-f]+$", maps, re.MULTILINE)}
-
-
-def test_other_users_cannot_read_its_memory(start: Start, domain: int) -> None:
-    process = start("closed", bare(domain), node="plane_controller")
-    deadline = time.monotonic() + LIMIT
-    # It is closed once the node is whole, which is after its first word.
-    while {stat.S_IMODE(file.stat().st_mode) for file in segments(process)} != {0o600}:
-        assert time.monotonic() < deadline, segments(process)
-
-
 @pytest.mark.parametrize(
     ("node", "asked"),
     [

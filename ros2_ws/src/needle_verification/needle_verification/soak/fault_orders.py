@@ -23,7 +23,8 @@ from needle_verification.soak.parts.stranger import Stranger
 from needle_verification.soak.rig import SECOND_JOYSTICK, SECOND_OPERATOR, SoakRig
 
 _LINKS = (*faults.TOPICS, *faults.SERVICES, faults.BUS, faults.PAGE_LINE)
-_SLOWEST_HANDLER = 0.05
+SLOWEST_HANDLER = 0.05
+"""What the slowest of nodes takes for each handler [s]."""
 LATEST_MESSAGE = 1.0
 """What the worst of faults delays a message by [s]."""
 _LATEST_FRAME = 0.1
@@ -100,7 +101,7 @@ class FaultOrders:
             if fault.kind is Kind.STUCK:
                 rig.runner.freeze(name, fault.lasts)
             else:
-                rig.runner.slow_down(name, fault.lasts, fault.size * _SLOWEST_HANDLER)
+                rig.runner.slow_down(name, fault.lasts, fault.size * SLOWEST_HANDLER)
         return _nothing
 
     def _unplug(self, _: Fault) -> Undo:

@@ -9,7 +9,7 @@ from typing import Any
 from needle_core import messages as m
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_verification.soak.course import Course, told_by_moments
-from needle_verification.soak.fault_orders import LATEST_MESSAGE, FaultOrders
+from needle_verification.soak.fault_orders import LATEST_MESSAGE, SLOWEST_HANDLER, FaultOrders
 from needle_verification.soak.faults import (
     CONSOLE,
     DISK,
@@ -169,7 +169,9 @@ def _watched(rig: SoakRig, faults: Sequence[Fault]) -> Watch:
     )
     # A page may be silent for 0.25 s, a joystick for 0.1 s.
     late += 0.15 if rig.hand_node == CONSOLE else 0.0
-    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late)
+    slow = (f.size for f in faults if f.part == "device_driver" and f.kind is Kind.SLOW)
+    slowness = max(slow, default=0.0) * SLOWEST_HANDLER
+    watch = Watch(bounds_of_the_rig(), RELEASE_BOUND + late, slowness)
     strange = {strange_topic(fault) for fault in faults}
     joints_spoilt = _JOINTS in strange or any(fault.part in _TAKE_JOINTS for fault in faults)
 

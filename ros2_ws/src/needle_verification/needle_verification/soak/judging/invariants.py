@@ -70,6 +70,8 @@ class Watch:
         Of the rig.
     release_bound : float
         From a release, or a loss, to the last motion [s].
+    late : float
+        How late the driver may send a set-point [s].
 
     Attributes
     ----------
@@ -79,11 +81,13 @@ class Watch:
         Of the holds that reach the device; it is asked where it hears any.
     """
 
-    def __init__(self, bounds: Bounds, release_bound: float = RELEASE_BOUND) -> None:
+    def __init__(
+        self, bounds: Bounds, release_bound: float = RELEASE_BOUND, late: float = 0.0
+    ) -> None:
         self._release_bound = release_bound
         self.violations: list[Violation] = []
         self.witness = HoldWitness()
-        self._limits = LimitWitness(bounds)
+        self._limits = LimitWitness(bounds, late)
         self._before: tuple[float, float, float] | None = None
         self._pressed_until = self._told_until = self._other_until = -1.0
         self._pressed_since = self._other_since = -1.0

@@ -98,10 +98,14 @@ class LimitWitness:
     ----------
     bounds : Bounds
         Of the rig.
+    late : float
+        How late a set-point may be sent: the next one may then follow it so much sooner [s].
     """
 
-    def __init__(self, bounds: Bounds) -> None:
+    def __init__(self, bounds: Bounds, late: float = 0.0) -> None:
         self._bounds = bounds
+        # One may be early by all of its period.
+        self._early = _SET_POINT_PERIOD + late
 
         def axis(name: str, unit: str, scale: float, speed: float, behind: float) -> _Axis:
             behind += _SET_POINTS_BEHIND * _SET_POINT_PERIOD * speed
@@ -133,8 +137,7 @@ class LimitWitness:
         if place is None:
             its.set_points.forget()
             return
-        # One may be early by all of its period.
-        ahead, bound = its.set_points.ahead(at, place), its.speed * _SET_POINT_PERIOD
+        ahead, bound = its.set_points.ahead(at, place), its.speed * self._early
         if ahead > bound:
             yield (
                 f"set-points of {its.name} are {ahead * its.scale:.4g} {its.unit} ahead of its "

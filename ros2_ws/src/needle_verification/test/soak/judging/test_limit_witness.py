@@ -83,3 +83,11 @@ def test_set_points_are_no_faster_than_their_limit() -> None:
     # A drive that was not to go there begins anew wherever it is.
     assert not send(102 * PERIOD, None)
     assert not send(103 * PERIOD, math.pi)
+
+
+def test_what_was_sent_late_may_be_followed_so_much_sooner() -> None:
+    for late, is_beyond in ((0.0, True), (0.005, False)):
+        witness = LimitWitness(BOUNDS, late)
+        places = [(0.005, 0.0), (0.021, 1e-4), (0.022, 2e-4)]
+        said = [text for at, place in places for text in witness.see_set_point(at, 0, place)]
+        assert bool(said) is is_beyond
