@@ -111,12 +111,16 @@ class Rerun:
         Today's, as they came.
     tips_without_images : int
         Recorded answers of the tracker whose images are not in the bag.
+    unanswered : int
+        Recorded pairs that the tracker never answered, since it did not hear them: before it knew
+        the cameras, or where its queue was full. They are left out.
     """
 
     recorded: list[Record]
     today: list[Record]
     outputs: list[Output]
     tips_without_images: int
+    unanswered: int
 
 
 def has_images(run: Run) -> bool:
@@ -155,11 +159,16 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
     recorded: list[Record] = []
     outputs: list[Output] = []
     exposed: set[int] = set()
-    without_images = last_time = 0
+    answered = _answered(run) if tracker is not None else set()
+    without_images = last_time = unanswered = 0
     for topic, sent, message in _inputs(run, watched | _topics(tracker)):
         last_time = max(last_time, sent.log_time)
         if IMAGE_TOPICS.get(topic) == "left":
-            exposed.add(nanoseconds(message.header.stamp))
+            stamp = nanoseconds(message.header.stamp)
+            if answered and stamp not in answered:
+                unanswered += 1
+                continue
+            exposed.add(stamp)
         if topic in watched:
             stamp = nanoseconds(message.header.stamp)
             recorded.append(Record(topic, stamp, dict(members(message))))
@@ -179,7 +188,7 @@ def run_again(run: Run, tracker: FinishingStage | None, controller: Stage | None
         Record(o.topic, o.stamp, dict(members(o.message)))
         for o in _recordable(recorded, outputs, last_time)
     ]
-    return Rerun(recorded, today, outputs, without_images)
+    return Rerun(recorded, today, outputs, without_images, unanswered)
 
 
 def run_tips(run: Run, controller: Stage, answers: Sequence[Output]) -> list[Output]:
@@ -256,6 +265,11 @@ def _recordable(
         newer = output.stamp > last.get(output.topic, 0)
         if not (newer and output.log_time > end - _LAST_ANSWERS):
             yield output
+
+
+def _answered(run: Run) -> set[int]:
+    """Return the stamps [ns] of the pairs that the recorded tracker answered; it answers each."""
+    return {nanoseconds(message.header.stamp) for _, _, message in _inputs(run, {POSE})}
 
 
 def _topics(stage: Stage | None) -> frozenset[str]:

@@ -146,6 +146,8 @@ def _run(words: Sequence[str]) -> int:
         print(f"note: {note}")
     if rerun.tips_without_images:
         print(f"note: {rerun.tips_without_images} recorded tips have no images in the bag")
+    if rerun.unanswered:
+        print(f"note: {rerun.unanswered} pairs are left out: stereo_tracker did not hear them")
     print("CHANGED" if comparison.changed else f"UNCHANGED: {len(rerun.recorded)} messages agree")
     for text in (describe(run, comparison), errors_text(run, rerun.outputs)):
         if text:

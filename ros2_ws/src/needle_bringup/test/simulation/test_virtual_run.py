@@ -10,12 +10,13 @@ from typing import Any
 import pytest
 
 from needle_analysis.ros import rerun
+from needle_bags.recording.bag_tap import BagTap
 from needle_bringup.simulation.rig_configuration import command_line_parameters, run_info
 from needle_bringup.simulation.simulate_options import parse
 from needle_bringup.simulation.virtual_run import COMPUTE, make_components, run_virtually
 from needle_core.component import Output
 from needle_core.runners.faults import Fault, delay, drop, duplicate
-from needle_core.runners.virtual import VirtualRunner
+from needle_core.runners.virtual import DIAGNOSTICS, LOG, VirtualRunner
 from needle_sim.sim_rig import SimRig
 
 SHORT = ("--level", "tip", "--depth-mm", "10")
@@ -199,3 +200,18 @@ def test_at_level_drive_a_driver_that_stands_still_stops_the_needle(insertion: s
     while not rig.runner.run(1.0):
         assert rig.runner.now < 30.0
     assert "heartbeat was missed" in rig.runner.exits["simulated_operator"].text
+
+
+def test_pairs_that_the_tracker_did_not_hear_are_left_out_when_it_runs_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = parse(CAMERA)
+    components = make_components(command_line_parameters(options, tmp_path / "bag"))
+    tap = BagTap(tmp_path / "bag", components, (DIAGNOSTICS, LOG), run_info(options))
+    lossy = drop("stereo/left/image_raw", 0.4)
+    runner = VirtualRunner(components, 1, compute=COMPUTE, faults=(lossy,), taps=(tap,))
+    while not runner.run(1.0):
+        assert runner.now < 60.0
+    tap.close()
+    assert rerun.main([str(tmp_path / "bag")]) == 0
+    assert "pairs are left out: stereo_tracker did not hear them" in capsys.readouterr().out
