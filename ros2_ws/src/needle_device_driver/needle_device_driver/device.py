@@ -309,7 +309,6 @@ def device_status(status: DeviceStatus, source: str) -> m_status.DeviceStatus:
         needle_out_confirmed=status.needle_out_confirmed,
         watchdog_trips=status.watchdog_trips,
         commands_refused=status.commands_refused,
-        needs_time=status.needs_time,
         command_ns=status.command_ns,
         rotation_owed_rad=status.rotation_owed,
         simulated=status.simulated,

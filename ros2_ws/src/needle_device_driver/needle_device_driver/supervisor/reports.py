@@ -126,8 +126,6 @@ class DeviceStatus:
         How often a hold, tip or reply was too old; a lapse that only pauses is none.
     commands_refused : int
         How many commands were refused.
-    needs_time : bool
-        Whether something goes on when time does: a simulated clock may stand still otherwise.
     command_ns : int
         Stamp of the newest command, whatever became of it [ns]; 0: none yet.
     rotation_owed : float
@@ -149,7 +147,6 @@ class DeviceStatus:
     needle_out_confirmed: bool
     watchdog_trips: int
     commands_refused: int
-    needs_time: bool
     command_ns: int
     rotation_owed: float
     simulated: bool | None = None

@@ -122,7 +122,6 @@ class MotionSupervisor:
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
-            needs_time=self.may_move(now) or self._switching(),
             command_ns=self.command_ns,
             rotation_owed=self._core.rotation_owed,
             simulated=simulated,

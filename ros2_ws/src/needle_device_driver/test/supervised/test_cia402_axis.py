@@ -56,7 +56,6 @@ def test_enable_and_home_wait_until_the_axes_are_off(drive_bench: DriveBench) ->
         assert not reply.success
         assert reply.message.startswith("waiting for")
     bench.cycle(10)
-    assert not bench.status.needs_time
     assert bench.supervisor.enable(True, bench.clock()).success
 
 
