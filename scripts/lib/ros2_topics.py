@@ -119,7 +119,9 @@ def pub(node: Node, options: argparse.Namespace) -> None:
     message = find_type(options.message_type, "msg")()
     stamps = fill(message, parse(options.values))
     times = 1 if options.once else options.times
-    publisher = node.create_publisher(type(message), options.topic_name, 10)
+    # Heard by whoever wants the last message of a topic, as of targets, and by all others, too.
+    latched = QoSProfile(depth=10, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+    publisher = node.create_publisher(type(message), options.topic_name, latched)
     # As the real one: who is to hear a number of messages must be there.
     while times and not spin_until(node, publisher.get_subscription_count, 1.0):
         print("Waiting for at least 1 matching subscription(s)...", flush=True)
