@@ -17,13 +17,14 @@ from needle_console.hold import page_session
 from needle_console.hold.page_session import PageSession
 from needle_controller.controller_status import controller_status
 from needle_controller.laws.roll_law import RollLaw
+from needle_core.messages import HoldState
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.device import DeviceRows
 from needle_device_driver.device_driver import DeviceDriver
 from needle_device_driver.supervisor.device_core import DeviceCore
-from needle_device_driver.supervisor.hold import Hold, HoldMessage
+from needle_device_driver.supervisor.hold import Hold
 from needle_device_driver.supervisor.reports import Reply
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -50,15 +51,14 @@ class PlantedBug(NamedTuple):
 
 def _hold_never_lapses(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Hold, "is_fresh", lambda hold, _: hold.owner is not None)
-    patch.setattr(Hold, "lapses", lambda *_: False)
 
 
 def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
     receive = Hold.receive
 
-    def armed(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
-        if (sender := hold._senders.get(message.sender)) is not None:
-            sender.armed = True
+    def armed(hold: Hold, message: HoldState, now: float, *, counting: bool) -> Any:
+        if (source := hold._sources.get(message.source)) is not None:
+            source.released = True
         return receive(hold, message, now, counting=counting)
 
     patch.setattr(Hold, "receive", armed)
@@ -67,22 +67,21 @@ def _old_press_counts(patch: pytest.MonkeyPatch) -> None:
 def _press_beside_the_owner_waits(patch: pytest.MonkeyPatch) -> None:
     receive = Hold.receive
 
-    def waiting(hold: Hold, message: HoldMessage, now: float, *, counting: bool) -> Any:
-        beside = hold.owner not in (None, message.sender)
+    def waiting(hold: Hold, message: HoldState, now: float, *, counting: bool) -> Any:
+        beside = hold.owner not in (None, message.source)
         rule = receive(hold, message, now, counting=counting)
-        if beside and message.sender in hold._senders:
-            hold._senders[message.sender].armed = True
+        if beside and message.source in hold._sources:
+            hold._sources[message.source].released = True
         return rule
 
     patch.setattr(Hold, "receive", waiting)
 
 
 def _anybody_keeps_a_hold_fresh(patch: pytest.MonkeyPatch) -> None:
-    def youngest(hold: Hold, now: float) -> float:
-        ages = [now - one.arrival for one in hold._senders.values() if hold._presses(one, now)]
-        return min(ages, default=math.inf)
+    def anybodys(hold: Hold) -> float:
+        return max((one.until for one in hold._sources.values()), default=-math.inf)
 
-    patch.setattr(Hold, "age", youngest)
+    patch.setattr(Hold, "until", property(anybodys))
 
 
 def _hold_of_a_page_outlives_its_words(patch: pytest.MonkeyPatch) -> None:

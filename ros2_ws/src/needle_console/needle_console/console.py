@@ -40,6 +40,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.hold_session import HoldSession
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 from needle_tracker.optics.calibration import rotation_matrix
 from needle_tracker.sources.image_encodings import ENCODINGS, bytes_per_pixel, grey_image
@@ -122,7 +123,7 @@ class Console(Component):
         self.settings = settings
         self._picture = RigPicture()
         self._retraction = Retraction()
-        self._stamp_ns = 0
+        self._session = HoldSession(OWNER)
         self._hand_at = -math.inf
         self._refused: Mapping[str, int] = {}
         self._looked_at = -math.inf
@@ -212,10 +213,7 @@ class Console(Component):
             yield from self._check(at)
 
     def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
-        # Stamps must increase whatever the clock does.
-        self._stamp_ns = stamp_ns = max(at.stamp_ns, self._stamp_ns + 1)
-        speed = speed if pressed else 0.0
-        return Publish(_HOLD, m.HoldState(stamp_ns, OWNER, pressed, speed, m.HOLD_LIFETIME))
+        return Publish(_HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _on_lag(self, seconds: float, at: Moment) -> None:
         if seconds - self._lag >= _LAG_GROWS:

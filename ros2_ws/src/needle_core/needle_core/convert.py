@@ -106,15 +106,16 @@ def _joystick(message: Any) -> m.Joystick:
 
 def _hold_fields(message: m.HoldState, t: MessageTypes) -> dict[str, Any]:
     axes = (message.speed_scale, *filter(math.isfinite, (message.lifetime,)))
-    joystick = m.Joystick(message.stamp_ns, axes, (int(message.pressed),))
-    return _joystick_fields(joystick, t, message.source)
+    joystick = m.Joystick(message.count, axes, (int(message.pressed),))
+    return _joystick_fields(joystick, t, message.sender)
 
 
 def _hold(message: Any) -> m.HoldState:
     """Return the hold of a Joy; one without a button or an axis is a release."""
     axes, buttons = message.axes, message.buttons
     return m.HoldState(
-        *head(message),
+        *m.HoldState.split_sender(message.header.frame_id),
+        to_nanoseconds(message.header.stamp),
         len(buttons) > 0 and int(buttons[0]) == 1,
         float(axes[0]) if len(axes) > 0 else math.nan,
         float(axes[1]) if len(axes) > 1 else math.inf,

@@ -68,10 +68,12 @@ class HoldState:
 
     Attributes
     ----------
-    stamp_ns : int
-        The sender's own count [ns]; increases.
     source : str
         Whose hand.
+    session : str
+        Of the source's process, made once at its start; empty where it does not say.
+    count : int
+        Of the session's messages; increases.
     pressed : bool
         Whether hold to run is pressed.
     speed_scale : float
@@ -80,11 +82,24 @@ class HoldState:
         How long the message counts [s]; infinite where it does not say.
     """
 
-    stamp_ns: int
     source: str
+    session: str
+    count: int
     pressed: bool
     speed_scale: float
     lifetime: float = math.inf
+
+    @property
+    def sender(self) -> str:
+        """Source and session in one word; a source without a session stands alone."""
+        has_slash = self.session or "/" in self.source
+        return f"{self.source}/{self.session}" if has_slash else self.source
+
+    @staticmethod
+    def split_sender(sender: str) -> tuple[str, str]:
+        """Return source and session; a source in a namespace has slashes of its own."""
+        before, slash, after = sender.rpartition("/")
+        return (before, after) if slash else (sender, "")
 
 
 @dataclass(frozen=True)

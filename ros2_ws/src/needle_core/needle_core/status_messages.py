@@ -99,6 +99,8 @@ class DeviceStatus(KeyValues):
         Whether a person said that the needle is out.
     watchdog_trips, commands_refused : int
         How often a hold, tip or reply was too old; how many commands were refused.
+    holds_ignored : int
+        How many hold messages came late, twice, or from a session that is over.
     command_ns : int
         Stamp of the newest command, whatever became of it; 0: none yet.
     rotation_owed_rad : float
@@ -121,6 +123,7 @@ class DeviceStatus(KeyValues):
     needle_out_confirmed: bool = False
     watchdog_trips: int = 0
     commands_refused: int = 0
+    holds_ignored: int = 0
     command_ns: int = 0
     rotation_owed_rad: float = field(default=0.0, metadata={"format": ".2f"})
     simulated: bool | None = None

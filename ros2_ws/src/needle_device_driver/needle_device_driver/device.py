@@ -29,7 +29,6 @@ from needle_core.diagnostics import Level
 from needle_core.process.claim import WAY_OUT
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import (
     DeviceStatus,
     Notice,
@@ -50,11 +49,10 @@ _EMERGENCY_STOPS = Delivery(depth=1000)
 _LONGEST = 4096
 # Four seconds of them, at 50 Hz, for a receiver that stands still meanwhile.
 _JOINT_STATES = Delivery(depth=200)
-# Positions alone change device/status so often at most [s]; joint_states has them all.
+# Positions, or messages that are ignored, alone change device/status so often at most [s].
 _STATUS_PERIOD = 0.5
-_BUT_FOR_PLACES = operator.attrgetter(
-    *({row.name for row in dataclasses.fields(DeviceStatus)} - {"insertion", "rotation"})
-)
+_OFTEN = {"insertion", "rotation", "holds_ignored"}
+_SELDOM = operator.attrgetter(*({row.name for row in dataclasses.fields(DeviceStatus)} - _OFTEN))
 _LEVELS = {State.FAULT: Level.ERROR, State.ESTOPPED: Level.ERROR, State.UNCONFIGURED: Level.WARN}
 
 
@@ -219,7 +217,7 @@ class DeviceRows:
         told = self._told
         if told is None or now - self._told_at > _STATUS_PERIOD:
             return told != status
-        return _BUT_FOR_PLACES(told) != _BUT_FOR_PLACES(status)
+        return _SELDOM(told) != _SELDOM(status)
 
     def _on_command(self, message: m.Trajectory, at: Moment) -> Actions:
         points = tuple(
@@ -231,14 +229,7 @@ class DeviceRows:
         return self.report(at)
 
     def _on_hold(self, message: m.HoldState, at: Moment) -> Actions:
-        hold = HoldMessage(
-            message.source,
-            message.stamp_ns,
-            message.pressed,
-            message.speed_scale,
-            message.lifetime,
-        )
-        self._supervisor.receive_hold(hold, at.steady)
+        self._supervisor.receive_hold(message, at.steady)
         return self.report(at)
 
     def _on_emergency_stop(self, message: m.EmergencyStop, at: Moment) -> Actions:
@@ -309,6 +300,7 @@ def device_status(status: DeviceStatus, source: str) -> m_status.DeviceStatus:
         needle_out_confirmed=status.needle_out_confirmed,
         watchdog_trips=status.watchdog_trips,
         commands_refused=status.commands_refused,
+        holds_ignored=status.holds_ignored,
         command_ns=status.command_ns,
         rotation_owed_rad=status.rotation_owed,
         simulated=status.simulated,

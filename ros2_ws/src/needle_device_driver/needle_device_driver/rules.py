@@ -12,7 +12,7 @@ class Rule(enum.Enum):
     HOLD_AGE = "hold_age"
     HOLD_NEW_PRESS = "hold_new_press"
     HOLD_ONE_OWNER = "hold_one_owner"
-    HOLD_STAMP_INCREASES = "hold_stamp_increases"
+    HOLD_IN_ORDER = "hold_in_order"
     SPEED_SCALE = "speed_scale"
     ONE_DEVICE = "one_device"
     NO_MOTION_BY_ITSELF = "no_motion_by_itself"

@@ -85,7 +85,7 @@ class Person(Component):
 
     def _act(self, at: Moment) -> Actions:
         if self.speaks:
-            hold = m.HoldState(at.stamp_ns, "person", self.pressed, self.scale, 0.1)
+            hold = m.HoldState("person", "", at.stamp_ns, self.pressed, self.scale, 0.1)
             yield Publish("device/hold", hold)
         yield from self.actions
         self.actions = []

@@ -313,7 +313,8 @@ class _Collector:
     def _take_hold(self, log_time: int, message: Any) -> None:
         pressed = float(message.buttons[0]) if len(message.buttons) else 0.0
         scale = float(message.axes[0]) if len(message.axes) else 0.0
-        self._add("holds", log_time, message, (pressed, scale))
+        # Its stamp is a count, of each source its own.
+        self._rows.setdefault("holds", []).append((log_time, log_time, (pressed, scale)))
 
     def _take_joints(self, log_time: int, message: Any) -> None:
         position = dict(zip(message.name, message.position, strict=False))

@@ -31,6 +31,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.hold_session import HoldSession
 from needle_core.status_messages import DeviceStatus
 
 HOLD, INPUT_DEVICE = "device/hold", "input device"
@@ -73,7 +74,7 @@ class Operator(Component):
         self._grip = Grip()
         self._press_again = False
         self._told = ""
-        self._last_stamp = 0
+        self._session = HoldSession(name)
         self.inputs = (Input("device/status", DeviceStatus, self._on_device, LATCHED),)
         self.outputs = (Output(HOLD, m.HoldState, BEST_EFFORT),)
         if settings.source == JOY:
@@ -108,17 +109,11 @@ class Operator(Component):
     def on_stop(self, at: Moment) -> Actions:
         """Release what is held, and exit."""
         for _ in range(RELEASES):
-            yield self.hold(at, pressed=False, speed=0.0)
+            yield self._hold(at, pressed=False)
         yield Exit(EXIT_DONE)
 
-    def hold(self, at: Moment, *, pressed: bool, speed: float) -> Publish:
-        """Return the message of a hold."""
-        # Stamps must increase whatever the system clock does.
-        self._last_stamp = max(at.stamp_ns, self._last_stamp + 1)
-        speed = speed if pressed else 0.0
-        return Publish(
-            HOLD, m.HoldState(self._last_stamp, self.name, pressed, speed, m.HOLD_LIFETIME)
-        )
+    def _hold(self, at: Moment, *, pressed: bool, speed: float = 0.0) -> Publish:
+        return Publish(HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _on_joy(self, message: m.Joystick, at: Moment) -> Actions:
         stamp = message.stamp_ns / 1e9
@@ -133,7 +128,7 @@ class Operator(Component):
         controller = STOP_STEERING in self._peers.services
         call = self._retraction.look(grip.held is Held.RETRACT, at.steady, controller=controller)
         pressed = grip.held is Held.INSERT or self._retraction.holds
-        yield self.hold(at, pressed=pressed, speed=grip.speed)
+        yield self._hold(at, pressed=pressed, speed=grip.speed)
         if grip.stop:
             yield Call(DEVICE_STOP)
         if call is not None:

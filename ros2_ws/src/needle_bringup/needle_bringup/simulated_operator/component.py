@@ -32,6 +32,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.diagnostics import Diagnostic, Level
+from needle_core.hold_session import HoldSession
 from needle_core.status_messages import ControllerStatus, DeviceStatus
 
 HOLD, PROGRESS = "device/hold", "progress"
@@ -68,6 +69,7 @@ class SimulatedOperator(Component):
             wait_timeout=settings.wait_timeout,
             stall_timeout=settings.stall_timeout,
         )
+        self._session = HoldSession(name)
         self._pending: ServiceCall | None = None
         self._is_finished = False
         self._missing: list[str] = ["everything"]
@@ -137,7 +139,8 @@ class SimulatedOperator(Component):
         return ()
 
     def _on_timer(self, at: Moment) -> Actions:
-        if self._sequence.steering:
+        # Also before it presses: a press counts only after a release.
+        if self._sequence.may_act and not self._is_finished:
             yield self._hold(at, pressed=self._sequence.hold())
         self._sequence.check_time(at.steady)
         yield from self._advance(at)
@@ -175,9 +178,8 @@ class SimulatedOperator(Component):
             yield Exit(EXIT_DONE if outcome.done else EXIT_MISSED, outcome.reason)
 
     def _hold(self, at: Moment, *, pressed: bool) -> Publish:
-        speed = self.settings.speed_scale if pressed else 0.0
-        state = m.HoldState(at.stamp_ns, self.name, pressed, speed, m.HOLD_LIFETIME)
-        return Publish(HOLD, state)
+        speed = self.settings.speed_scale
+        return Publish(HOLD, self._session.say(at.stamp_ns, pressed=pressed, speed=speed))
 
     def _report(self) -> Diagnose:
         if self._sequence.steering:

@@ -132,7 +132,7 @@ class OperatorSequence:
 
     def hold(self) -> bool:
         """Return whether the hold is pressed."""
-        return self.steering and not self._must_release and self._may_act
+        return self.steering and not self._must_release and self.may_act
 
     @property
     def touched(self) -> bool:
@@ -145,7 +145,7 @@ class OperatorSequence:
 
     def next_call(self, now: float) -> ServiceCall | None:
         """Return the service to call now; its answer goes to `take_answer`."""
-        waits = bool(self._missing) or now < self._retry_at or not self._may_act
+        waits = bool(self._missing) or now < self._retry_at or not self.may_act
         if waits or self.outcome is not None or self._prepared == len(PREPARATION):
             return None
         call = PREPARATION[self._prepared]
@@ -275,7 +275,7 @@ class OperatorSequence:
             )
 
     @property
-    def _may_act(self) -> bool:
+    def may_act(self) -> bool:
         """Tell whether the only device that is there has said that it is simulated."""
         return self._simulated and list(self._devices) == [self._speaker]
 
@@ -288,7 +288,7 @@ class OperatorSequence:
             return f"no answer from {call}"
         if call == START.service and self._starts is None:
             return "needle/controller_status has not been heard"
-        if not self._may_act:
+        if not self.may_act:
             names = ", ".join(self._devices)
             return f"device/status of one simulated device is wanted, of {names} it is there"
         return self._refusal or f"device/status does not say homed, {call} has to wait"

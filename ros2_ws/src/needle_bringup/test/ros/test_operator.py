@@ -94,7 +94,7 @@ def test_a_joystick_inserts_retracts_and_stops_until_it_falls_silent(scene: Scen
     rig.down = {INSERT}
     scene.until(scene.is_held)
     held = rig.holds[-1]
-    assert held.header.frame_id == "operator"
+    assert held.header.frame_id.startswith("operator/")
     # Half of 1.6 / 2 of the axis' way; and what a message promises.
     assert list(held.axes) == pytest.approx([0.4, 0.1])
     stamps = [to_nanoseconds(hold.header.stamp) for hold in rig.holds]

@@ -87,7 +87,7 @@ def test_why_the_device_ended_a_hold_outlasts_that_the_press_goes_on() -> None:
     device = picture.states().device
     assert device is not None
     assert trouble_of(device) == goes_on
-    stamps = "hold of 'console' does not count (hold_stamp_increases); device/reset ends this"
+    stamps = "hold of 'console' does not count (hold_in_order); device/reset ends this"
     picture.see_device(DeviceStatus.parse({**values, "reason": stamps}))
     device = picture.states().device
     assert device is not None

@@ -2,55 +2,40 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import math
 
 from needle_core.foreign_text import plain
+from needle_core.messages import HoldState
 from needle_device_driver.rules import Rule
 
-MAX_SENDERS = 16
-LONGEST_NAME = 64
-
-# So much may a press's way here be quicker than that of the release before it [ns].
-_JITTER_NS = 20_000_000
-
-
-@dataclasses.dataclass(frozen=True)
-class HoldMessage:
-    """One message of an operator's hand.
-
-    Attributes
-    ----------
-    sender : str
-        Who says it.
-    stamp_ns : int
-        The sender's own count [ns]; must increase.
-    pressed : bool
-        Whether hold to run is pressed.
-    speed_scale : float
-        Share of the nominal speed, 0..1.
-    lifetime : float
-        How long it counts by its sender's own word [s]; never longer than the time-out.
-    """
-
-    sender: str
-    stamp_ns: int
-    pressed: bool
-    speed_scale: float
-    lifetime: float = math.inf
+MAX_SOURCES = 16
+# Sessions of a source that are remembered as over. One name cannot be told from another by its age:
+# clocks are set back. A message is late by seconds at most, and meanwhile nobody starts as often.
+_MAX_REPLACED = 16
+# Below every count.
+_NOTHING_HEARD = -1
 
 
 @dataclasses.dataclass
-class _Sender:
-    # A press must be above it.
-    stamp_ns: int
-    pressed: bool
-    arrival: float
-    timeout: float
+class _Source:
+    session: str
     # Whether a release came since the last press.
-    armed: bool
-    # Time from stamp to arrival of a release that was stamped before a reset [ns].
-    delay_ns: int | None = None
+    released: bool
+    arrival: float
+    count: int = _NOTHING_HEARD
+    # Last moment of its press; minus infinity: it does not press.
+    until: float = -math.inf
+    replaced: collections.deque[str] = dataclasses.field(
+        default_factory=lambda: collections.deque(maxlen=_MAX_REPLACED)
+    )
+
+    def begin(self, session: str) -> None:
+        """Let a new session take the place of the present one, for good."""
+        self.replaced.append(self.session)
+        self.session, self.count = session, _NOTHING_HEARD
+        self.released, self.until = False, -math.inf
 
 
 class Hold:
@@ -64,19 +49,16 @@ class Hold:
 
     Attributes
     ----------
-    presses : int
-        How often a press has begun to count.
+    ignored : int
+        How many messages came late, twice, or from a session that is over.
     """
 
     def __init__(self, timeout: float) -> None:
         self._timeout = timeout
-        self._senders: dict[str, _Sender] = {}
+        self._sources: dict[str, _Source] = {}
         self._owner: str | None = None
         self._speed_scale = 0.0
-        self._lapsed = False
-        self._spent_ns: int | None = None
-        self._strangers_armed = True
-        self.presses = 0
+        self.ignored = 0
 
     @property
     def owner(self) -> str | None:
@@ -87,38 +69,32 @@ class Hold:
         """Return who presses while nobody's press counts, and must release first; None: nobody."""
         if self._owner is not None:
             return None
-        return next((name for name, s in self._senders.items() if self._presses(s, now)), None)
+        return next((name for name, one in self._sources.items() if now <= one.until), None)
 
     @property
     def speed_scale(self) -> float:
         """The owner's share of the nominal speed, 0 without owner."""
         return self._speed_scale if self._owner is not None else 0.0
 
-    def age(self, now: float) -> float:
-        """Return the time since the owner was last heard [s]; infinite without owner."""
-        return math.inf if self._owner is None else now - self._senders[self._owner].arrival
+    @property
+    def until(self) -> float:
+        """Last moment in which the owner's press counts [s]; minus infinity without owner."""
+        return -math.inf if self._owner is None else self._sources[self._owner].until
 
     def is_fresh(self, now: float) -> bool:
         """Return whether there is an owner who was heard within the time-out."""
-        return self._owner is not None and self.age(now) <= self.timeout
-
-    @property
-    def timeout(self) -> float:
-        """Time for which the owner's last message counts [s]; without owner, the longest of any."""
-        return self._timeout if self._owner is None else self._senders[self._owner].timeout
+        return now <= self.until
 
     def is_off(self, now: float) -> bool:
         """Return whether nobody who was heard within the time-out presses."""
-        return not any(self._presses(sender, now) for sender in self._senders.values())
+        return all(now > source.until for source in self._sources.values())
 
-    def receive(  # noqa: PLR0911 - each return is a rule
-        self, message: HoldMessage, now: float, *, counting: bool
-    ) -> Rule | None:
+    def receive(self, message: HoldState, now: float, *, counting: bool) -> Rule | None:
         """Take one message.
 
         Parameters
         ----------
-        message : HoldMessage
+        message : HoldState
             What was received.
         now : float
             Its arrival on the steady clock [s].
@@ -128,137 +104,109 @@ class Hold:
         Returns
         -------
         Rule or None
-            The rule that kept a press from counting.
+            The rule that kept a message from counting.
         """
+        source = self._source_of(message, now)
+        if source is None:
+            return Rule.HOLD_ONE_OWNER
+        is_owner = self._owner == message.source
+        if message.session != source.session and message.session not in source.replaced:
+            source.begin(message.session)
+            if is_owner:
+                self._owner = None
+                is_owner = False
+        if message.session != source.session or message.count <= source.count:
+            self.ignored += 1
+            return Rule.HOLD_IN_ORDER
+        source.count, source.arrival = message.count, now
         scale = message.speed_scale
         # What cannot be understood counts as the safe thing, a release.
-        pressed = message.pressed and 0.0 <= scale <= 1.0 and message.lifetime > 0.0
-        sender = self._senders.get(message.sender)
-        if sender is None:
-            if len(self._senders) >= MAX_SENDERS or len(message.sender) > LONGEST_NAME:
-                return Rule.HOLD_ONE_OWNER
-            sender = self._senders[message.sender] = _Sender(
-                stamp_ns=message.stamp_ns - 1,
-                pressed=False,
-                arrival=now,
-                timeout=self._timeout,
-                armed=self._strangers_armed and not self._is_spent(message.stamp_ns),
-            )
-        if pressed and not self._is_new(sender, message.stamp_ns, now):
-            return Rule.HOLD_STAMP_INCREASES
-        sender.pressed = pressed
-        sender.arrival = now
-        sender.timeout = min(message.lifetime, self._timeout)
-        if not pressed:
-            self._take_release(sender, message.stamp_ns, now)
-            if self._owner == message.sender:
+        if not (message.pressed and 0.0 <= scale <= 1.0 and message.lifetime > 0.0):
+            source.until, source.released = -math.inf, True
+            if is_owner:
                 self._owner = None
             return Rule.SPEED_SCALE if message.pressed else None
-        sender.stamp_ns = message.stamp_ns
-        armed, sender.armed = sender.armed, False
-        if self._owner == message.sender:
-            self._speed_scale = scale
-            self._lapsed = False
-            return None
-        if not armed or not counting:
-            return Rule.HOLD_NEW_PRESS
-        if self._owner is not None:
-            return Rule.HOLD_ONE_OWNER
-        self._owner = message.sender
-        self.presses += 1
+        source.until = now + min(message.lifetime, self._timeout)
+        released, source.released = source.released, False
+        if not is_owner:
+            if not released or not counting:
+                return Rule.HOLD_NEW_PRESS
+            if self._owner is not None:
+                return Rule.HOLD_ONE_OWNER
+            self._owner = message.source
         self._speed_scale = scale
-        self._lapsed = False
         return None
 
-    def lapses(self, now: float) -> bool:
-        """Return True once when the owner falls silent for longer than the time-out."""
-        if self._owner is None or self._lapsed or self.is_fresh(now):
-            return False
-        self._lapsed = True
-        return True
+    def lapse(self, now: float) -> str:
+        """End a hold whose owner fell silent for too long; return what to say, empty: it is none.
+
+        It takes a release and a new press.
+        """
+        if self._owner is None or self.is_fresh(now):
+            return ""
+        source = self._sources[self._owner]
+        self.require_new_press()
+        lasted = source.until - source.arrival
+        return f"no hold message for {now - source.arrival:.3f} s, limit {lasted:g} s"
 
     def require_new_press(self) -> None:
         """Take the hold from its owner; who presses now must release first to count again."""
         self._owner = None
 
-    def knows(self, sender: str) -> bool:
-        """Return whether a sender is among those whose hold may count."""
-        return sender in self._senders
+    def knows(self, source: str) -> bool:
+        """Return whether a source is among those whose hold may count."""
+        return source in self._sources
 
-    def readmit(self, now: float) -> None:
-        """Let in who was shut out, as a person at the rig wants it; nobody's press counts then.
+    def readmit(self) -> None:
+        """Let in a source without a session whose stamps were once ahead; nobody's press counts.
 
-        Who is silent is forgotten, and a release may bear a lower stamp than was heard before. What
-        was stamped before must not let anything move, though it comes late or twice: a press after
-        such a release counts only if it was as long on its way, which nothing in a burst is, and
-        nothing that follows an older one.
-
-        Parameters
-        ----------
-        now : float
-            Steady time [s].
+        Who names a session begins with a count of its own, and needs no such way out.
         """
         self.require_new_press()
-        for name, sender in tuple(self._senders.items()):
-            if not self._is_spent(sender.stamp_ns):
-                self._spent_ns = sender.stamp_ns
-            if now - sender.arrival > self._timeout:
-                del self._senders[name]
-                # One that was cut off while it pressed may come back, still pressing.
-                self._strangers_armed = self._strangers_armed and sender.armed
+        for source in self._sources.values():
+            if not source.session:
+                source.count = _NOTHING_HEARD
 
-    def _presses(self, sender: _Sender, now: float) -> bool:
-        return sender.pressed and now - sender.arrival <= sender.timeout
+    def _source_of(self, message: HoldState, now: float) -> _Source | None:
+        """Return what is known of a message's source; None where there are too many.
 
-    def _is_spent(self, stamp_ns: int) -> bool:
-        """Return whether a stamp is none above all that were heard before the last reset."""
-        return self._spent_ns is not None and stamp_ns <= self._spent_ns
-
-    def _is_new(self, sender: _Sender, stamp_ns: int, now: float) -> bool:
-        """Return whether a press comes after what was heard, and in its time."""
-        if stamp_ns <= sender.stamp_ns:
-            sender.armed = False
-            return False
-        least = sender.delay_ns
-        return least is None or _delay_ns(stamp_ns, now) >= least - _JITTER_NS
-
-    def _take_release(self, sender: _Sender, stamp_ns: int, now: float) -> None:
-        if self._is_spent(stamp_ns):
-            delay, least = _delay_ns(stamp_ns, now), sender.delay_ns
-            goes_on = least is not None and stamp_ns > sender.stamp_ns
-            sender.delay_ns = min(delay, least) if least is not None and goes_on else delay
-        elif stamp_ns > sender.stamp_ns:
-            sender.delay_ns = None
-        else:
-            # It ends a hold like any other, but what follows it is no new press.
-            return
-        sender.stamp_ns = stamp_ns
-        sender.armed = True
+        One that is first heard has to release before it counts. Only without a session, as typed by
+        hand, its first press counts.
+        """
+        source = self._sources.get(message.source)
+        if source is not None:
+            return source
+        if len(self._sources) >= MAX_SOURCES:
+            oldest = min(self._sources, key=lambda name: self._sources[name].arrival)
+            if now - self._sources[oldest].arrival <= self._timeout:
+                return None
+            # Should it come back it is as if first heard.
+            del self._sources[oldest]
+        source = _Source(message.session, released=not message.session, arrival=now)
+        self._sources[message.source] = source
+        return source
 
 
 class HoldRefusals:
     """Notices of holds that do not count: each once, until it changes."""
 
     def __init__(self) -> None:
-        # Those whose name is not known share one entry.
-        self._rules: dict[str | None, Rule | None] = {}
+        # Those whose name is not known share one entry. What is ignored changes nothing, and may
+        # come between messages that count: it has an entry of its own.
+        self._rules: dict[tuple[str | None, bool], Rule | None] = {}
 
     def clear(self) -> None:
         """Begin anew: everything is worth saying again."""
         self._rules.clear()
 
-    def take(self, sender: str, rule: Rule | None, *, known: bool) -> str:
+    def take(self, message: HoldState, rule: Rule | None, *, known: bool) -> str:
         """Take what became of a message, and return what there is to say; empty: nothing."""
-        key = sender if known else None
+        ignored = rule is Rule.HOLD_IN_ORDER
+        key = message.source if known else None, ignored
         if rule is self._rules.get(key):
             return ""
         self._rules[key] = rule
         if rule is None:
             return ""
-        lasting = rule is Rule.HOLD_STAMP_INCREASES or not known
-        way_out = "; device/reset ends this" if lasting else ""
-        return f"hold of '{plain(sender)}' does not count ({rule.value}){way_out}"
-
-
-def _delay_ns(stamp_ns: int, arrival: float) -> int:
-    return round(arrival * 1e9) - stamp_ns
+        way_out = "; device/reset ends this" if ignored and not message.session else ""
+        return f"hold of '{plain(message.sender)}' does not count ({rule.value}){way_out}"

@@ -126,6 +126,8 @@ class DeviceStatus:
         How often a hold, tip or reply was too old; a lapse that only pauses is none.
     commands_refused : int
         How many commands were refused.
+    holds_ignored : int
+        How many hold messages came late, twice, or from a session that is over.
     command_ns : int
         Stamp of the newest command, whatever became of it [ns]; 0: none yet.
     rotation_owed : float
@@ -147,6 +149,7 @@ class DeviceStatus:
     needle_out_confirmed: bool
     watchdog_trips: int
     commands_refused: int
+    holds_ignored: int
     command_ns: int
     rotation_owed: float
     simulated: bool | None = None

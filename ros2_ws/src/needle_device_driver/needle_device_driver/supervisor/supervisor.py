@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from needle_core.foreign_text import plain
+from needle_core.messages import HoldState
 from needle_device_driver.axes.axis import Axis
 from needle_device_driver.axes.axis_pair import AxisPair, PairSnapshot
 from needle_device_driver.axes.motion import Leg
@@ -13,7 +14,7 @@ from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command
 from needle_device_driver.supervisor.command_desk import CommandDesk
 from needle_device_driver.supervisor.device_core import DeviceCore
-from needle_device_driver.supervisor.hold import Hold, HoldMessage, HoldRefusals
+from needle_device_driver.supervisor.hold import Hold, HoldRefusals
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Reply
 from needle_device_driver.supervisor.states import Activity, State, Trigger
@@ -122,6 +123,7 @@ class MotionSupervisor:
             needle_out_confirmed=self._needle_out,
             watchdog_trips=self._core.watchdog_trips,
             commands_refused=self._commands.refused,
+            holds_ignored=self._hold.ignored,
             command_ns=self.command_ns,
             rotation_owed=self._core.rotation_owed,
             simulated=simulated,
@@ -150,15 +152,13 @@ class MotionSupervisor:
         """Note that ROS time is `ros_ns` [ns] now; call it in each cycle."""
         self._commands.note_time(ros_ns, now)
 
-    def receive_hold(self, message: HoldMessage, now: float) -> None:
+    def receive_hold(self, message: HoldState, now: float) -> None:
         """Take a hold message that arrived now."""
         # A silence that nobody watched is one all the same.
         self._watch_hold(now)
         counting = self._core.state in (State.HOLDING, State.MOVING)
         rule = self._hold.receive(message, now, counting=counting)
-        text = self._hold_refusals.take(
-            message.sender, rule, known=self._hold.knows(message.sender)
-        )
+        text = self._hold_refusals.take(message, rule, known=self._hold.knows(message.source))
         if text and counting:
             self._core.explain(text)
             self._core.notice(text, rule)
@@ -284,7 +284,7 @@ class MotionSupervisor:
         """Leave FAULT or ESTOPPED, let in whom old stamps shut out; moves and enables nothing."""
         if self._core.state is State.MOVING:
             return Reply(False, f"a {self._core.activity.value} is under way")
-        self._hold.readmit(now)
+        self._hold.readmit()
         self._hold_refusals.clear()
         self._commands.readmit()
         if self._core.state not in (State.FAULT, State.ESTOPPED):
@@ -322,14 +322,12 @@ class MotionSupervisor:
         self._core.end_what_has_ended()
 
     def _watch_hold(self, now: float) -> None:
-        age = self._hold.age(now)
-        if not self._hold.lapses(now):
+        text = self._hold.lapse(now)
+        if not text:
             return
         core = self._core
         moving = core.moves_with_hold
-        text = f"no hold message for {age:.3f} s, limit {self._hold.timeout:g} s"
         core.notice(text, Rule.HOLD_AGE)
-        self._hold.require_new_press()
         core.explain(text + ": release and press again")
         if moving:
             core.count_watchdog_trip()

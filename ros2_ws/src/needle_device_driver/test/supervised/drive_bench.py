@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from needle_core.can_frame import CanFrame
+from needle_core.messages import HoldState
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
@@ -15,7 +16,6 @@ from needle_device_driver.link.frame_link import FrameLink
 from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
-from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -149,7 +149,7 @@ class DriveBench:
             self.supervisor.observe(self.clock())
 
     def hold(self, pressed: bool = True, *, scale: float = 1.0) -> None:
-        message = HoldMessage("a", next(self.stamps), pressed, scale)
+        message = HoldState("a", "", next(self.stamps), pressed, scale)
         self.supervisor.receive_hold(message, self.clock())
 
     def written(self, node: int, index: int, subindex: int = 0) -> bytes:

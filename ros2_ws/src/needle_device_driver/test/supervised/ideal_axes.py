@@ -5,11 +5,11 @@ from __future__ import annotations
 import itertools
 import math
 
+from needle_core.messages import HoldState
 from needle_device_driver.axes.axis import Axis, AxisError, AxisSnapshot
 from needle_device_driver.procedure import Procedure, run_at_once
 from needle_device_driver.rules import Rule
 from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice, StepResult
 from needle_device_driver.supervisor.states import State
@@ -161,11 +161,13 @@ class Bench:
         *,
         sender: str = "a",
         scale: float = 1.0,
-        stamp_ns: int | None = None,
+        session: str = "",
+        count: int | None = None,
         lifetime: float = math.inf,
     ) -> None:
-        stamp = next(self.stamps) if stamp_ns is None else stamp_ns
-        self.supervisor.receive_hold(HoldMessage(sender, stamp, pressed, scale, lifetime), self.now)
+        number = next(self.stamps) if count is None else count
+        message = HoldState(sender, session, number, pressed, scale, lifetime)
+        self.supervisor.receive_hold(message, self.now)
 
     def cycle(self, count: int = 1, *, holding: bool = False, scale: float = 1.0) -> None:
         for _ in range(count):

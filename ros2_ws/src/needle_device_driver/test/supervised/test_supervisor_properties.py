@@ -61,7 +61,7 @@ _others = st.sampled_from(
         _named("release a", lambda bench: bench.hold(False)),
         _named("hold b", lambda bench: bench.hold(sender="b")),
         _named("release b", lambda bench: bench.hold(False, sender="b")),
-        _named("old hold a", lambda bench: bench.hold(stamp_ns=0)),
+        _named("old hold a", lambda bench: bench.hold(count=-1)),
         _named("enable", lambda bench: bench.supervisor.enable(True, bench.now)),
         _named("disable", lambda bench: bench.supervisor.enable(False, bench.now)),
         _named("confirm", lambda bench: bench.supervisor.confirm_needle_out(True)),
@@ -93,7 +93,7 @@ class Witness:
 
     def hold(self, pressed: bool = True, *, sender: str = "a", **more: Any) -> None:
         good = 0.0 <= more.get("scale", 1.0) <= 1.0
-        if not pressed or not good or more.get("stamp_ns") is None:
+        if not pressed or not good or more.get("count") is None:
             self.heard[sender] = (self.bench.now, pressed and good)
         self._hold(pressed, sender=sender, **more)
 

@@ -82,7 +82,9 @@ class Person(Component):
 
     def _act(self, at: Moment) -> Actions:
         scale = 1.0 if self.pressed else 0.0
-        yield Publish("device/hold", m.HoldState(at.stamp_ns, "person", self.pressed, scale, 0.1))
+        yield Publish(
+            "device/hold", m.HoldState("person", "", at.stamp_ns, self.pressed, scale, 0.1)
+        )
         yield from self.actions
         self.actions = []
 

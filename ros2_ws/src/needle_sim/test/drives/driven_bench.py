@@ -8,6 +8,7 @@ import random
 from collections.abc import Callable
 from typing import Any
 
+from needle_core.messages import HoldState
 from needle_device_driver.axes.axis import AxisError
 from needle_device_driver.cia402.cia402_axis import Cia402Axis
 from needle_device_driver.cia402.drive_cycle import DriveCycle
@@ -16,7 +17,6 @@ from needle_device_driver.link.link_settings import LinkSettings
 from needle_device_driver.parameters import DeviceDriverParameters
 from needle_device_driver.procedure import Procedure, T, run
 from needle_device_driver.supervisor.command import Command, CommandPoint
-from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.reports import DeviceStatus, Event, Notice
 from needle_device_driver.supervisor.states import State
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -137,7 +137,7 @@ class DrivenBench:
             self.supervisor.observe(self.now)
 
     def hold(self, pressed: bool, scale: float = 1.0) -> None:
-        message = HoldMessage("a", next(self.stamps), pressed, scale)
+        message = HoldState("a", "", next(self.stamps), pressed, scale)
         self.supervisor.receive_hold(message, self.now)
 
     def home(self, most: int = 20_000) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 from rclpy.node import Node
 from sensor_msgs.msg import Joy
 
-from needle_core.ros.conversions import HOLD, to_stamp
+from needle_core.convert import Converter
+from needle_core.hold_session import HoldSession
+from needle_core.message_types import rclpy_types
+from needle_core.ros.conversions import HOLD
 
 
 class HoldTopic:
@@ -23,18 +27,12 @@ class HoldTopic:
         How long a message promises the hold [s]; the device's own if none is given.
     """
 
-    def __init__(self, node: Node, owner: str, lifetime: float | None = None) -> None:
+    def __init__(self, node: Node, owner: str, lifetime: float = math.inf) -> None:
         self._publisher = node.create_publisher(Joy, "device/hold", HOLD)
-        self._owner = owner
-        self._promise = [] if lifetime is None else [lifetime]
-        self._last_stamp = 0
+        self._session = HoldSession(owner, lifetime)
+        self._converter = Converter(rclpy_types())
 
     def publish(self, *, pressed: bool, speed: float) -> None:
         """Say whether the hold is pressed, and at which share of the nominal speed."""
-        # Stamps must increase whatever the system clock does.
-        self._last_stamp = max(time.time_ns(), self._last_stamp + 1)
-        axes = [speed if pressed else 0.0, *self._promise]
-        message = Joy(axes=axes, buttons=[int(pressed)])
-        message.header.stamp = to_stamp(self._last_stamp)
-        message.header.frame_id = self._owner
-        self._publisher.publish(message)
+        message = self._session.say(time.time_ns(), pressed=pressed, speed=speed)
+        self._publisher.publish(self._converter.to_ros(message))

@@ -27,6 +27,7 @@ from needle_core.component import (
     Timer,
 )
 from needle_core.errors import UserError
+from needle_core.hold_session import HoldSession
 from needle_core.runners.virtual import VirtualRunner
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.device_driver import DeviceDriver
@@ -85,6 +86,7 @@ class _Person(Component):
         self.results: dict[int, str] = {}
         self.answers: list[Answer] = []
         self.pressed = False
+        self._session = HoldSession(self.name)
         self.actions: list[Action] = []
         self.inputs = (
             Input("device/status", DeviceStatus, self._on_status, LATCHED),
@@ -120,8 +122,7 @@ class _Person(Component):
         return ()
 
     def _act(self, at: Moment) -> Actions:
-        hold = m.HoldState(at.stamp_ns, self.name, self.pressed, float(self.pressed), 0.1)
-        yield Publish("device/hold", hold)
+        yield Publish("device/hold", self._session.say(at.stamp_ns, pressed=self.pressed))
         yield from self.actions
         self.actions = []
 

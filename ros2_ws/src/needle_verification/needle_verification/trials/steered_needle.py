@@ -25,13 +25,13 @@ from needle_controller.protocol.steering_types import (
     SteeringState,
 )
 from needle_controller.protocol.tip_gate import TipMeasurement
+from needle_core.messages import HoldState
 from needle_core.status_messages import DeviceStatus
 from needle_device_driver.procedure import run_at_once
 from needle_device_driver.supervisor.command import (
     Command,
     CommandPoint,
 )
-from needle_device_driver.supervisor.hold import HoldMessage
 from needle_device_driver.supervisor.limits import SafetyLimits
 from needle_device_driver.supervisor.reports import StepResult
 from needle_device_driver.supervisor.supervisor import MotionSupervisor
@@ -146,7 +146,7 @@ class SteeredNeedle:
         now = self.time_ns * 1e-9
         hand = self._hand(self.seconds)
         self.device.receive_hold(
-            HoldMessage("person", self.time_ns, hand.pressed, hand.speed_scale), now
+            HoldState("person", "", self.time_ns, hand.pressed, hand.speed_scale), now
         )
         self.device.note_time(self.time_ns, now)
         self.device.drive(_TICK, now)
@@ -179,7 +179,7 @@ class SteeredNeedle:
         assert run_at_once(self.device.home(now)).success
         self.device.observe(now)
         assert self.device.enable(True, now).success
-        self.device.receive_hold(HoldMessage("person", 0, False, 0.0), now)
+        self.device.receive_hold(HoldState("person", "", 0, False, 0.0), now)
         self._tell_device()
         self._tell_joints()
         reply, actions = self.steering.on_start()

@@ -16,7 +16,9 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from sensor_msgs.msg import JointState, Joy
 from trajectory_msgs.msg import JointTrajectory
 
+from needle_core.convert import from_ros
 from needle_core.errors import UserError
+from needle_core.messages import HoldState
 from needle_core.process.ros_domain import own_domain
 from needle_core.ros.conversions import HOLDS_HEARD, JOINT_STATES, RELIABLE, values_of
 from needle_core.status_messages import DeviceStatus
@@ -101,9 +103,10 @@ class Witness(DriveHand):
         self.release()
 
     def _on_hold(self, message: Joy, info: dict[str, int]) -> None:
-        if message.header.frame_id == self._holder:
+        hold = from_ros(HoldState, message)
+        if hold.source == self._holder:
             self._hears_person = True
-            pressed, at = any(message.buttons), self._sent_at(info)
+            pressed, at = hold.pressed, self._sent_at(info)
             self.watch.see_hand(at, holds=pressed)
             if pressed:
                 self.watch.see_hold(at)

@@ -77,7 +77,8 @@ class Stranger(Component):
         return self._chance.choice((math.nan, math.inf, -1e300)) if self._garbage else value
 
     def _hold(self, stamp_ns: int) -> m.HoldState:
-        return m.HoldState(stamp_ns, "stranger", True, self._number(1.0), m.HOLD_LIFETIME)
+        # As typed by hand, without a session: only so does a first press count.
+        return m.HoldState("stranger", "", stamp_ns, True, self._number(1.0), m.HOLD_LIFETIME)
 
     def _trajectory(self, stamp_ns: int) -> m.Trajectory:
         at = self._bench.motors

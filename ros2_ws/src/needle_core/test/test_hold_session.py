@@ -1,0 +1,24 @@
+"""Messages of one source, as the device tells them from those of an earlier process."""
+
+from __future__ import annotations
+
+import math
+
+from needle_core.hold_session import HoldSession
+from needle_core.messages import HOLD_LIFETIME, HoldState
+
+
+def test_a_session_counts_whatever_the_clock_does() -> None:
+    session = HoldSession("operator")
+    said = [session.say(stamp, pressed=stamp > 5, speed=0.5) for stamp in (255, 7, 3)]
+    assert said == [
+        HoldState("operator", "ff", 1, True, 0.5, HOLD_LIFETIME),
+        HoldState("operator", "ff", 2, True, 0.5, HOLD_LIFETIME),
+        HoldState("operator", "ff", 3, False, 0.0, HOLD_LIFETIME),
+    ]
+
+
+def test_a_process_that_starts_anew_has_another_session() -> None:
+    before, after = (HoldSession("operator", math.inf).say(at, pressed=True) for at in (16, 0))
+    assert (before.session, after.session) == ("10", "0")
+    assert (after.count, after.lifetime) == (1, math.inf)
