@@ -115,7 +115,7 @@ class Run:
     commands : Series
         Commanded insertion [m] and rotation [rad], (N, 2), stamped with the tip that caused them.
     holds : Series
-        The hold pressed (0 or 1) and its speed scale, (N, 2).
+        The hold pressed (0 or 1) and its speed scale, (N, 2), stamped with their arrival.
     controller_status, device_status : list of Status
         In order of arrival.
     results : list of Result

@@ -121,6 +121,17 @@ def test_health_is_the_chosen_rigs() -> None:
         assert [event.part for event in collected.health] == kept
 
 
+def test_holds_of_two_sessions_are_both_kept_at_the_times_of_their_arrival() -> None:
+    collected = _Collector("/", ["/"])
+    for time, session in ((10, "a"), (20, "b")):
+        # The first message of each.
+        header = SimpleNamespace(stamp=SimpleNamespace(sec=0, nanosec=1), frame_id=f"me/{session}")
+        joy = SimpleNamespace(header=header, axes=[0.5], buttons=[1])
+        collected.takers()["device/hold"](time, joy)
+    holds = collected.series("holds", 2)
+    assert holds.stamps.tolist() == holds.received.tolist() == [10, 20]
+
+
 def test_reduced_states_undo_the_rotation() -> None:
     rng = np.random.default_rng(3)
     angles = rng.uniform(-1.2, 1.2, (50, 3))
