@@ -2,46 +2,34 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-from collections.abc import Callable
 from typing import Any
 
 from needle_console.hold.hold_arbiter import HoldArbiter
 from needle_console.hold.refusals import Refusal
 
 
-def counting() -> Callable[[], str]:
-    numbers = itertools.count()
-    return lambda: f"n{next(numbers)}"
-
-
 class Scene:
-    """An arbiter and its pages, in a time of their own."""
+    """An arbiter and its pages, in a time of their own.
+
+    `bars` says why a page may not hold, by whether it is on the rig's machine.
+    """
 
     def __init__(self) -> None:
-        self.arbiter = HoldArbiter(counting())
+        self.bars = {True: "", False: ""}
+        self.arbiter = HoldArbiter(lambda is_local: self.bars[is_local])
         self.now = 100.0
-        self._sequences: dict[int, int] = {}
 
-    def page(self) -> int:
-        page = self.arbiter.open(self.now)
-        assert page is not None
-        self._sequences[page] = 0
-        return page
+    def page(self, *, is_local: bool = True) -> int:
+        return self.arbiter.open(self.now, is_local=is_local)
 
-    def message(self, page: int, pressed: bool, nonce: str | None = None, **changes: Any) -> str:
-        if nonce is None:
-            nonce = self.arbiter.issue(page, self.now)
-            assert nonce is not None
-        self._sequences[page] += 1
-        fields = {
-            "nonce": nonce,
-            "sequence": self._sequences[page],
-            "pressed": pressed,
-            "speed": 0.5,
-            "mode": "insert",
-        }
+    def count(self, page: int) -> int:
+        """Send a page a count now."""
+        return int(str(self.arbiter.tell(page, self.now)["count"]))
+
+    def message(self, page: int, pressed: bool, count: int | None = None, **changes: Any) -> str:
+        count = self.count(page) if count is None else count
+        fields = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
         return json.dumps({**fields, **changes})
 
     def say(self, page: int, pressed: bool, **changes: Any) -> Refusal | None:

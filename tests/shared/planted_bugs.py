@@ -200,7 +200,7 @@ PLANTED = {
         "no_motion_by_another", _anybody_keeps_a_hold_fresh, 3, faults_of=466
     ),
     "a page's hold that outlives its words": PlantedBug(
-        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 30
+        "hold_is_of_now", _hold_of_a_page_outlives_its_words, 73
     ),
     "a page's lost press that goes on": PlantedBug(
         "hold_is_of_now", _lost_press_of_a_page_goes_on, 15

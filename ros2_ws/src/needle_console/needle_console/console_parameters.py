@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 from needle_console.access.access import Access
 from needle_core.errors import UserError
@@ -14,13 +13,11 @@ from needle_core.settings.parameter_fields import check_fields, fixed_parameter
 class ConsoleParameters:
     """Parameters of the console, fixed at start."""
 
-    address: str = fixed_parameter(
-        "127.0.0.1", "-", "Where page and hold are served; beyond loopback only with a token."
-    )
+    address: str = fixed_parameter("127.0.0.1", "-", "Where page and hold are served.")
     port: int = fixed_parameter(8080, "-", "Port of the page.", 1, 65535)
     hold_port: int = fixed_parameter(8081, "-", "Port of the hold.", 1, 65535)
-    token_file: str = fixed_parameter(
-        "", "-", "File whose first line is the token that a page has to know; empty: none."
+    hold_real_rig: bool = fixed_parameter(
+        False, "-", "Pages on the rig's own machine may hold a real rig, too; others never."
     )
     hosts: tuple[str, ...] = fixed_parameter(
         ("",),
@@ -44,25 +41,23 @@ class ConsoleParameters:
         if self.port == self.hold_port:
             raise UserError(f"port and hold_port are both {self.port}, wants two")
 
-    def token(self) -> str:
-        """Return the token that a page has to know; empty: none.
+    def why_no_hold(self, simulated: bool | None, *, is_local: bool) -> str:
+        """Return why a page may only watch, and stop; empty: it may hold.
 
-        Raises
-        ------
-        UserError
-            The file cannot be read, or does not begin with one.
+        Parameters
+        ----------
+        simulated : bool or None
+            What the device says of itself; None: nothing.
+        is_local : bool
+            Whether the page is shown on the rig's own machine.
         """
-        if not self.token_file:
+        if simulated or (self.hold_real_rig and is_local):
             return ""
-        try:
-            lines = Path(self.token_file).expanduser().read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"token_file = {self.token_file!r} cannot be read: {error}") from error
-        if not lines or not lines[0].strip():
-            raise UserError(f"token_file = {self.token_file!r} has no first line")
-        return lines[0].strip()
+        if self.hold_real_rig:
+            return "only watching: a real rig is held at its own machine"
+        return "only watching: hold_real_rig is off, and this is no simulation"
 
     def access(self) -> Access:
-        """Return who may connect; errors as of `Access` and `token`."""
+        """Return who may connect; errors as of `Access`."""
         hosts = [host for host in self.hosts if host]
-        return Access(self.address, self.port, self.token(), hosts)
+        return Access(self.address, self.port, hosts)

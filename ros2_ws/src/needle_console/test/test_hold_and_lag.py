@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Callable
 
@@ -62,13 +61,8 @@ class Scene:
             bell=self.wall,
             clock=self.wall,
         )
-        numbers, self._sequence = itertools.count(), itertools.count()
-        self.talk = HoldTalk(
-            lambda: f"n{next(numbers)}", self.desk.hold, self.desk.notice, self.now()
-        )
-        page = self.talk.open(self.now())
-        assert page is not None
-        self._page = page
+        self.talk = HoldTalk(lambda _: "", self.desk.hold, self.desk.notice, self.now())
+        self._page = self.talk.open(self.now(), is_local=True)
         self._echo(pressed=False)
         self.wall.every(ECHO_PERIOD, self._serve)
 
@@ -82,11 +76,9 @@ class Scene:
         self.talk.look(self.now())
 
     def _echo(self, *, pressed: bool) -> None:
-        word = self.talk.word_for(self._page, self.now())
-        assert word is not None
-        fields = {"nonce": json.loads(word)["nonce"], "sequence": next(self._sequence)}
-        message = {**fields, "pressed": pressed, "speed": 0.5, "mode": "insert"}
-        assert self.talk.hear(self._page, json.dumps(message), self.now())
+        count = json.loads(self.talk.word_for(self._page, self.now()))["count"]
+        message = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
+        self.talk.hear(self._page, json.dumps(message), self.now())
 
     def forward(self, seconds: float) -> None:
         """Let time of the wall clock go by."""

@@ -1,1 +1,1 @@
-"""Access control of connections: token, Origin and Host."""
+"""Access control of connections: Host and Origin."""

@@ -11,19 +11,20 @@ from needle_console.hold.page_message import GarbageError, read_message
 from needle_console.hold.page_session import ECHO_AGE_LIMIT, PageSession
 from needle_console.hold.refusals import Refusal
 
-MOST_PAGES = 8
 SILENCE = 5.0
-"""A page that echoes nothing for so long is gone [s]."""
+"""A page that says nothing for so long is gone [s]."""
 
 IDLE = 30.0
 """An owner that has not pressed for so long lets another page have the hold [s]."""
 
+OTHER_PAGE = "another page steers"
 _STALLED = f"no echo from this page for {ECHO_AGE_LIMIT:g} s (browser, network or console stalled)"
 
 
 @dataclasses.dataclass
 class _Page:
     session: PageSession
+    is_local: bool
     # Why its last press did not count, or no longer does; empty: it does, or was let go.
     why: str = ""
 
@@ -36,12 +37,15 @@ class HoldArbiter:
 
     Parameters
     ----------
-    make_nonce : callable
-        Returns a text that nobody can guess.
+    why_not : callable
+        Returns why a page may only watch, empty if it may hold; takes whether it is shown on the
+        rig's own machine.
     """
 
-    def __init__(self, make_nonce: Callable[[], str]) -> None:
-        self._make_nonce = make_nonce
+    def __init__(self, why_not: Callable[[bool], str]) -> None:
+        self._why_not = why_not
+        # Of all that is sent to pages: so no count is sent on two connections.
+        self._count = 0
         self._pages: dict[int, _Page] = {}
         self._last_page = 0
         self._owner: int | None = None
@@ -57,12 +61,10 @@ class HoldArbiter:
         """Time at which the hold ends unless more comes [s]; minus infinity without one."""
         return -math.inf if self._owner is None else self._pages[self._owner].session.until
 
-    def open(self, now: float) -> int | None:
-        """Let a page in; return its number, or None where there are too many."""
-        if len(self._pages) >= MOST_PAGES:
-            return None
+    def open(self, now: float, *, is_local: bool) -> int:
+        """Let a page in; return its number."""
         self._last_page += 1
-        self._pages[self._last_page] = _Page(PageSession(self._make_nonce, now))
+        self._pages[self._last_page] = _Page(PageSession(now), is_local)
         return self._last_page
 
     def close(self, page: int) -> None:
@@ -79,8 +81,8 @@ class HoldArbiter:
         except GarbageError:
             entry.session.end()
             return Refusal.GARBAGE
-        free = self._owner in (None, page) or self._owner_is_idle(now)
-        refusal = entry.session.receive(message, now, free=free)
+        bar = self._bar(page, now)
+        refusal = entry.session.receive(message, now, free=not bar)
         counts = entry.session.state(now).pressed
         if counts:
             self._owner = page
@@ -89,26 +91,24 @@ class HoldArbiter:
             entry.why = ""
         elif refusal is not None:
             # Of a press that ended the first reason is told until it is let go.
-            entry.why = entry.why or refusal.value
+            entry.why = entry.why or (bar if refusal is Refusal.BARRED else refusal.value)
         return refusal
 
-    def issue(self, page: int, now: float) -> str | None:
-        """Return a nonce to send to a page now; None while it is behind with answers."""
-        return self._pages[page].session.nonces.issue(now)
-
     def tell(self, page: int, now: float) -> dict[str, object]:
-        """Return what a page should know."""
+        """Return what to send to a page now: the count to echo, and what it should know."""
         entry = self._pages[page]
-        owner = self._owner if not self._owner_is_idle(now) else None
+        self._count += 1
+        entry.session.send(self._count, now)
         return {
+            "count": self._count,
             "heard": entry.session.heard,
             "held": entry.session.state(now).pressed,
-            "owner": "nobody" if owner is None else "you" if owner == page else "other",
+            "bar": self._bar(page, now),
             "why": entry.why,
         }
 
     def is_silent(self, page: int, now: float) -> bool:
-        """Return whether a page has echoed nothing for too long."""
+        """Return whether a page has said nothing for too long."""
         return now - self._pages[page].session.heard_at > SILENCE
 
     def lapses(self, now: float) -> bool:
@@ -121,6 +121,13 @@ class HoldArbiter:
     def state(self, now: float) -> HoldState:
         """Return the hold that counts."""
         return RELEASED if self._owner is None else self._pages[self._owner].session.state(now)
+
+    def _bar(self, page: int, now: float) -> str:
+        """Return why a page may only watch, and stop; empty: it may hold."""
+        if why := self._why_not(self._pages[page].is_local):
+            return why
+        is_free = self._owner in (None, page) or self._owner_is_idle(now)
+        return "" if is_free else OTHER_PAGE
 
     def _owner_is_idle(self, now: float) -> bool:
         return not self.state(now).pressed and now - self._held_at > IDLE

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import http
 import ipaddress
 import logging
-import secrets
 import socket
 import threading
 import time
@@ -21,15 +19,12 @@ from websockets.http11 import Request, Response
 from needle_console.access.access import Access
 from needle_console.hold.hold_state import HoldState
 from needle_console.hold.hold_talk import PERIOD, HoldTalk
-from needle_console.hold.page_message import LONGEST, GarbageError, read_token
 from needle_console.hold.refusals import Refusal
 from needle_core.errors import UserError
 
 PATH = "/hold"
-_MOST_CONNECTIONS = 32
-# From TCP's first packet to a request, and from there to a token [s].
+# From TCP's first packet to a request [s].
 _PATIENCE = 1.0
-_POLICY_VIOLATION, _TOO_BIG = 1008, 1009
 
 
 class HoldServer:
@@ -41,7 +36,7 @@ class HoldServer:
         Who may connect.
     port : int
         Port to listen on; 0 takes any that is free.
-    on_state, on_notice : callable
+    why_not, on_state, on_notice : callable
         As of `HoldTalk`; called by the hold's thread, which must not be kept waiting.
 
     Raises
@@ -54,13 +49,12 @@ class HoldServer:
         self,
         access: Access,
         port: int,
+        why_not: Callable[[bool], str],
         on_state: Callable[[HoldState], None],
         on_notice: Callable[[str], None],
     ) -> None:
         self._access = access
-        make_nonce = functools.partial(secrets.token_hex, 8)
-        self._talk = HoldTalk(make_nonce, on_state, on_notice, time.monotonic())
-        self._connections = 0
+        self._talk = HoldTalk(why_not, on_state, on_notice, time.monotonic())
         self._socket = _listen(access.address, port)
         self._loop = asyncio.new_event_loop()
         self._called = asyncio.Event()
@@ -101,16 +95,15 @@ class HoldServer:
         # What it says of every broken connection is counted here.
         silent = logging.Logger("hold", logging.CRITICAL + 1)
         server = serve(
-            self._serve_connection,
+            self._serve_page,
             sock=self._socket,
             process_request=self._judge_request,
             compression=None,
             server_header=None,
             open_timeout=_PATIENCE,
-            # Pages are asked for life signs by their nonces.
+            # Pages are asked for life signs by the counts.
             ping_interval=None,
             close_timeout=_PATIENCE,
-            max_size=LONGEST,
             logger=silent,
         )
         async with server as serving:
@@ -149,50 +142,22 @@ class HoldServer:
             refusal = Refusal.ORIGIN
         elif request.path != PATH:
             refusal = Refusal.PATH
-        elif self._connections >= _MOST_CONNECTIONS:
-            refusal = Refusal.CONNECTIONS
         if refusal is None:
             return None
         self._talk.refuse(refusal)
         return connection.respond(http.HTTPStatus.FORBIDDEN, f"{refusal.value}\n")
 
-    async def _serve_connection(self, connection: ServerConnection) -> None:
-        self._connections += 1
-        try:
-            if await self._knows_token(connection):
-                await self._serve_page(connection)
-        except ConnectionClosed as closed:
-            if closed.sent is not None and closed.sent.code == _TOO_BIG:
-                self._talk.refuse(Refusal.SIZE)
-        finally:
-            self._connections -= 1
-
-    async def _knows_token(self, connection: ServerConnection) -> bool:
-        try:
-            token = read_token(await asyncio.wait_for(connection.recv(), _PATIENCE))
-        except asyncio.TimeoutError:
-            return await self._close(connection, Refusal.NO_TOKEN)
-        except GarbageError:
-            return await self._close(connection, Refusal.GARBAGE)
-        if not self._access.token_is_right(token):
-            return await self._close(connection, Refusal.TOKEN)
-        return True
-
-    async def _close(self, connection: ServerConnection, refusal: Refusal) -> bool:
-        """Close a connection for a reason; returns False."""
-        self._talk.refuse(refusal)
-        await connection.close(_POLICY_VIOLATION, refusal.value)
-        return False
-
     async def _serve_page(self, connection: ServerConnection) -> None:
-        page = self._talk.open(time.monotonic())
-        if page is None:
-            await self._close(connection, Refusal.PAGES)
-            return
+        # A machine that connects to itself has one address at both ends.
+        is_local = connection.remote_address[0] == connection.local_address[0]
+        page = self._talk.open(time.monotonic(), is_local=is_local)
         self._called.set()
-        sending = asyncio.ensure_future(self._send_nonces(connection, page))
+        sending = asyncio.ensure_future(self._send_counts(connection, page))
         try:
-            await self._hear(connection, page)
+            async for data in connection:
+                self._talk.hear(page, data, time.monotonic())
+        except ConnectionClosed:
+            pass
         finally:
             # First of all: what a gone page held ends now.
             self._talk.close(page, time.monotonic())
@@ -200,22 +165,13 @@ class HoldServer:
             with contextlib.suppress(asyncio.CancelledError, ConnectionClosed):
                 await sending
 
-    async def _hear(self, connection: ServerConnection, page: int) -> None:
-        async for data in connection:
-            if not self._talk.hear(page, data, time.monotonic()):
-                # Whoever floods is not waited for.
-                connection.transport.abort()
-                return
-
-    async def _send_nonces(self, connection: ServerConnection, page: int) -> None:
+    async def _send_counts(self, connection: ServerConnection, page: int) -> None:
         while True:
             now = time.monotonic()
             if self._talk.has_lost(page, now):
                 connection.transport.abort()
                 return
-            word = self._talk.word_for(page, now)
-            if word is not None:
-                await connection.send(word)
+            await connection.send(self._talk.word_for(page, now))
             await asyncio.sleep(PERIOD)
 
 

@@ -5,21 +5,18 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 
-from needle_console.access.rate_limit import RateLimit
 from needle_console.hold.hold_arbiter import HoldArbiter
 from needle_console.hold.hold_state import RELEASED, HoldState
 from needle_console.hold.refusals import Refusal, Refusals
 
 PERIOD = 0.02
-"""Nonces go to every page, and the hold's state to its taker, so often [s]."""
+"""Counts go to every page, and the hold's state to its taker, so often [s]."""
 
 ALONE_PERIOD = 0.08
 """Without a page nobody can press: the release is only repeated, above 10 times a second [s]."""
 
 # By so much later than a hold's end it is looked at [s].
 _TICK = 1e-4
-# A page answers 50 times a second, and when its button changes.
-_RATE, _BURST = 100.0, 50
 
 
 class HoldTalk:
@@ -27,8 +24,8 @@ class HoldTalk:
 
     Parameters
     ----------
-    make_nonce : callable
-        Returns a text that nobody can guess.
+    why_not : callable
+        As of `HoldArbiter`.
     on_state : callable
         Takes the hold every `PERIOD`, without a page every `ALONE_PERIOD`, and at once when it
         changes.
@@ -45,7 +42,7 @@ class HoldTalk:
 
     def __init__(
         self,
-        make_nonce: Callable[[], str],
+        why_not: Callable[[bool], str],
         on_state: Callable[[HoldState], None],
         on_notice: Callable[[str], None],
         now: float,
@@ -53,35 +50,26 @@ class HoldTalk:
         self._on_state = on_state
         self._on_notice = on_notice
         self.refusals = Refusals()
-        self._arbiter = HoldArbiter(make_nonce)
-        self._limits: dict[int, RateLimit] = {}
+        self._arbiter = HoldArbiter(why_not)
         self._told = RELEASED
         self._due = now
 
-    def open(self, now: float) -> int | None:
-        """Let a page in; return its number, or None where there are too many."""
-        page = self._arbiter.open(now)
-        if page is not None:
-            self._limits[page] = RateLimit(_RATE, _BURST)
-        return page
+    def open(self, now: float, *, is_local: bool) -> int:
+        """Let a page in; return its number."""
+        return self._arbiter.open(now, is_local=is_local)
 
     def close(self, page: int, now: float) -> None:
         """Let a page go: what it held ends now."""
-        del self._limits[page]
         self._arbiter.close(page)
         self._tell_change(now)
 
-    def hear(self, page: int, data: str | bytes, now: float) -> bool:
-        """Take a page's message; return whether it may go on: who floods may not."""
-        if not self._limits[page].lets_through(now):
-            self.refuse(Refusal.RATE)
-            return False
+    def hear(self, page: int, data: str | bytes, now: float) -> None:
+        """Take a page's message."""
         self._watch_silence(now)
         refusal = self._arbiter.receive(page, data, now)
         if refusal is not None:
             self.refuse(refusal)
         self._tell_change(now)
-        return True
 
     def has_lost(self, page: int, now: float) -> bool:
         """Return whether a page is gone, to judge by its silence."""
@@ -90,13 +78,10 @@ class HoldTalk:
         self.refuse(Refusal.SILENT)
         return True
 
-    def word_for(self, page: int, now: float) -> str | None:
-        """Return what to send a page, every `PERIOD`; None while it is behind with answers."""
+    def word_for(self, page: int, now: float) -> str:
+        """Return what to send a page, every `PERIOD`."""
         self._watch_silence(now)
-        nonce = self._arbiter.issue(page, now)
-        if nonce is None:
-            return None
-        return json.dumps({"nonce": nonce, **self._arbiter.tell(page, now)})
+        return json.dumps(self._arbiter.tell(page, now))
 
     def look(self, now: float) -> float:
         """Hand on the hold where it is time, or has run out; return when to look again [s]."""

@@ -2,47 +2,47 @@
 
 from __future__ import annotations
 
+import collections
 import math
-from collections.abc import Callable
 
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
-from needle_console.hold.nonces import Nonces
 from needle_console.hold.page_message import PageMessage
 from needle_console.hold.refusals import Refusal
 
 # Browsers on a busy machine stall for more than 0.1 s; a page's hold must end within 0.3 s.
 ECHO_AGE_LIMIT = 0.25
-"""A message counts so long after its nonce was sent: a press then is all that it proves [s]."""
+"""A message counts so long after the count that it echoes was sent: a press then is all that it
+proves [s]."""
+
+# Counts that are remembered, five seconds of them: who echoes none for so long is far behind.
+_MAX_SENT = 250
 
 
 class PageSession:
-    """Judges what one page says. `now` is everywhere the steady clock [s].
+    """Judges what one connection of a page says. `now` is everywhere the steady clock [s].
 
     A message that came late proves a press of long ago, however it was held up: by page, browser,
-    network or this server. So a hold ends `ECHO_AGE_LIMIT` after the newest nonce that a pressed
-    message has echoed was sent, and neither a burst nor a replay prolongs it.
+    network or this server. So a hold ends `ECHO_AGE_LIMIT` after the newest count that a pressed
+    message has echoed was sent, and a burst after a stall does not prolong it.
 
     Parameters
     ----------
-    make_nonce : callable
-        Returns a text that nobody can guess.
     now : float
         When the page came.
 
     Attributes
     ----------
-    nonces : Nonces
-        What this page has to echo.
     heard : int
-        Sequence number of the last message that was looked at; -1 before.
+        The newest count that was echoed; 0 before.
     heard_at : float
-        When a nonce was last echoed, or the page came [s].
+        When the page was last heard, or came [s].
     """
 
-    def __init__(self, make_nonce: Callable[[], str], now: float) -> None:
-        self.nonces = Nonces(make_nonce)
-        self.heard = -1
+    def __init__(self, now: float) -> None:
+        self.heard = 0
         self.heard_at = now
+        # Counts that were sent on this connection, and when; from the last echoed one on.
+        self._sent: collections.deque[tuple[int, float]] = collections.deque(maxlen=_MAX_SENT)
         self._armed = False
         self._until = -math.inf
         self._speed = 0.0
@@ -71,6 +71,10 @@ class PageSession:
         self._until = -math.inf
         self._armed = False
 
+    def send(self, count: int, now: float) -> None:
+        """Note that a count is sent; it is above all before, on whatever connection."""
+        self._sent.append((count, now))
+
     def receive(self, message: PageMessage, now: float, *, free: bool) -> Refusal | None:
         """Take a message.
 
@@ -81,52 +85,47 @@ class PageSession:
         now : float
             Its arrival.
         free : bool
-            Whether no other page has the hold.
+            Whether this page may hold now.
 
         Returns
         -------
         Refusal or None
             Why it does not count. A release ends the hold all the same.
         """
-        issued, refusal = self._judge(message, now)
+        self.heard_at = now
+        sent, refusal = self._judge(message, now)
         if not message.pressed:
             self.end()
             # Only a release of now lets the next press count.
             self._armed = refusal is None
             return refusal
-        if now > self._until:
-            return self._begin(message, issued, refusal, free=free)
-        if refusal is None and message.mode is not self._mode:
+        if refusal is None and not free:
+            refusal = Refusal.BARRED
             self.end()
-            return Refusal.NEW_PRESS
+        if now > self._until:
+            # A press that does not count when it comes does not count later either.
+            armed, self._armed = self._armed, False
+            if refusal is None and not armed:
+                refusal = Refusal.NEW_PRESS
+        elif refusal is None and message.mode is not self._mode:
+            refusal = Refusal.NEW_PRESS
+            self.end()
         if refusal is None:
-            self._until = max(self._until, issued + ECHO_AGE_LIMIT)
-            self._speed = message.speed
+            self._until = max(self._until, sent + ECHO_AGE_LIMIT)
+            self._speed, self._mode = message.speed, message.mode
         return refusal
 
     def _judge(self, message: PageMessage, now: float) -> tuple[float, Refusal | None]:
-        """Return when the message's nonce was sent, and why it does not count."""
-        if message.sequence <= self.heard:
-            return -math.inf, Refusal.REPEATED
-        self.heard = message.sequence
-        issued = self.nonces.take(message.nonce)
-        if issued is None:
-            return -math.inf, Refusal.NONCE
-        self.heard_at = now
-        return issued, Refusal.STALE if now - issued > ECHO_AGE_LIMIT else None
-
-    def _begin(
-        self, message: PageMessage, issued: float, refusal: Refusal | None, *, free: bool
-    ) -> Refusal | None:
-        # A press that does not count when it comes does not count later either.
-        armed, self._armed = self._armed, False
-        if refusal is not None:
-            return refusal
-        if not armed:
-            return Refusal.NEW_PRESS
-        if not free:
-            return Refusal.OTHER_PAGE
-        self._until = issued + ECHO_AGE_LIMIT
-        self._speed = message.speed
-        self._mode = message.mode
-        return None
+        """Return when the count that a message echoes was sent, and why it does not count."""
+        # A release comes at once, without waiting for the next count: it may repeat the last echo.
+        least = self.heard + 1 if message.pressed else self.heard
+        if not self._sent or not least <= message.count <= self._sent[-1][0]:
+            return -math.inf, Refusal.ECHO
+        while self._sent[0][0] < message.count:
+            self._sent.popleft()
+        count, sent = self._sent[0]
+        if count != message.count:
+            # That one went to another connection.
+            return -math.inf, Refusal.ECHO
+        self.heard = count
+        return sent, Refusal.STALE if now - sent > ECHO_AGE_LIMIT else None

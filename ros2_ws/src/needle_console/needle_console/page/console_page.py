@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 
 from nicegui import ui
@@ -25,22 +24,6 @@ _HEAD = """
 """
 
 
-@dataclasses.dataclass(frozen=True)
-class HoldLink:
-    """Address to which a page's hold connects.
-
-    Attributes
-    ----------
-    port : int
-        Of the hold's own server, on the host that the page came from.
-    token : str
-        For its first message; empty on loopback. Only who has given it gets a page.
-    """
-
-    port: int
-    token: str
-
-
 class ConsolePage:
     """Builds the page of the client that NiceGUI serves at the moment.
 
@@ -48,15 +31,14 @@ class ConsolePage:
     ----------
     desk : Desk
         The rig.
-    hold : HoldLink
-        Where the hold goes.
+    hold_port : int
+        Of the hold's own server, on the host that the page came from.
     """
 
-    def __init__(self, desk: Desk, hold: HoldLink) -> None:
+    def __init__(self, desk: Desk, hold_port: int) -> None:
         self._desk = desk
-        options = json.dumps({"port": hold.port, "token": hold.token, "speed": Controls.SPEED})
-        # A script must not end where a text in it says so.
-        ui.add_head_html(_HEAD.replace("OPTIONS", options.replace("<", "\\u003c")))
+        options = json.dumps({"port": hold_port, "speed": Controls.SPEED})
+        ui.add_head_html(_HEAD.replace("OPTIONS", options))
         ui.dark_mode(None)
         with ui.element("main").classes("console"):
             # First in the order of the keyboard; the style sheet says where they stand.

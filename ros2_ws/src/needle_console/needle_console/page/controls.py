@@ -35,7 +35,8 @@ class Controls:
 
     def __init__(self, desk: Desk) -> None:
         self._desk = desk
-        self._other_steers = False
+        # Until its hold has a connection, a page may only watch.
+        self._bar = "no hold: not connected"
         self._buttons: dict[Button, Any] = {}
         with ui.element("section").classes("controls").props('aria-label="Controls"'):
             with ui.element("div").classes("advice").props('role="status" aria-live="polite"'):
@@ -50,7 +51,7 @@ class Controls:
                     self._add_button(button)
             self._answer = ui.label().classes("answer").props('role="status"')
             self._build_targets()
-        ui.on("hold_owner", self._on_owner)
+        ui.on("hold_bar", self._on_bar)
 
     def show(self, snapshot: Snapshot) -> None:
         """Show what to do next, and which buttons make sense."""
@@ -64,7 +65,7 @@ class Controls:
         why = trouble_of(device) if device is not None and must_let_go else ""
         self._not_counted.set_text(f"not counted by the device since: {why}" if why else "")
         for button, element in self._buttons.items():
-            usable = button in possible and not self._other_steers
+            usable = button in possible and not self._bar
             if button not in _HOLDS:
                 element.set_enabled(usable)
             # What is held must stay what it is until it is let go: no hold is ever disabled.
@@ -118,8 +119,8 @@ class Controls:
 
     def _add_target(self, name: str, send: Callable[[], None]) -> None:
         def set_target() -> None:
-            if self._other_steers:
-                ui.notify("Another page steers.")
+            if self._bar:
+                ui.notify(self._bar)
                 return
             try:
                 send()
@@ -129,11 +130,11 @@ class Controls:
         ui.button(name, color=None, on_click=set_target).props("no-caps unelevated")
 
     def _press(self, button: Button) -> None:
-        if not self._other_steers:
+        if not self._bar:
             self._desk.press(button)
 
-    def _on_owner(self, event: events.GenericEventArguments) -> None:
-        self._other_steers = event.args == "other"
+    def _on_bar(self, event: events.GenericEventArguments) -> None:
+        self._bar = str(event.args)
 
 
 def _number(label: str, value: float) -> ui.number:

@@ -43,6 +43,7 @@ class Desk:
     def __init__(
         self, settings: ConsoleParameters, clock: Callable[[], float] | None = None
     ) -> None:
+        self._settings = settings
         self._clock = clock or time.monotonic
         self._arrive: Callable[[Batch], None] = lambda _: None
         self._lock = threading.Lock()
@@ -100,6 +101,12 @@ class Desk:
             self._hold, self._hold_at = state, self._clock()
             self._was_released |= not state.pressed
         self._arrive(self._take)
+
+    def why_no_hold(self, is_local: bool) -> str:
+        """Return why a page may only watch, and stop; takes whether it is on the rig's machine."""
+        device = self._snapshot.device
+        simulated = None if device is None else device.simulated
+        return self._settings.why_no_hold(simulated, is_local=is_local)
 
     def notice(self, text: str, severity: str = "warning") -> None:
         """Take a line for the log."""

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import secrets
 from collections.abc import Awaitable, Callable, MutableMapping
-from http.cookies import CookieError, SimpleCookie
 from typing import Any, TypeAlias
-from urllib.parse import parse_qs
 
 from needle_console.access.access import Access
 
@@ -14,17 +11,6 @@ _Scope: TypeAlias = MutableMapping[str, Any]
 _Receive: TypeAlias = Callable[[], Awaitable[MutableMapping[str, Any]]]
 _Send: TypeAlias = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 _App: TypeAlias = Callable[[_Scope, _Receive, _Send], Awaitable[None]]
-
-COOKIE = "needle_console"
-_LOGIN = "/login"
-_LONGEST_LOGIN = 1024
-_PAGE = """<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Needle console</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>body{{font:16px sans-serif;max-width:24rem;margin:20vh auto;padding:0 1rem}}
-input,button{{font:inherit;padding:.5rem;width:100%;box-sizing:border-box;margin:.4rem 0}}</style>
-</head><body><h1>Needle console</h1><p>{words}</p><form method="post" action="/login">
-<label>Token <input type="password" name="token" autofocus autocomplete="current-password"></label>
-<button>Open</button></form></body></html>"""
 
 
 class Gate:
@@ -41,8 +27,6 @@ class Gate:
     def __init__(self, app: _App, access: Access) -> None:
         self.app = app
         self._access = access
-        # In the browser in the token's place; it ends with the process.
-        self._session = secrets.token_urlsafe(32)
 
     async def __call__(self, scope: _Scope, receive: _Receive, send: _Send) -> None:
         """Answer, or hand on, one connection."""
@@ -52,15 +36,9 @@ class Gate:
         send = _forbid_framing(send)
         why = self._why_not(scope)
         if why:
-            await _refuse(scope, send, 403, why)
-        elif not self._access.needs_token or self._knows(_header(scope, b"cookie")):
-            await self.app(scope, receive, send)
-        elif scope["type"] == "http" and scope["path"] == _LOGIN and scope["method"] == "POST":
-            await self._log_in(receive, send)
-        elif scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET":
-            await _answer(send, 200, _PAGE.format(words="Who runs the rig knows its token."))
+            await _refuse(scope, send, why)
         else:
-            await _refuse(scope, send, 403, "not logged in")
+            await self.app(scope, receive, send)
 
     def _why_not(self, scope: _Scope) -> str:
         why = self._access.why_not_host(_header(scope, b"host"))
@@ -69,29 +47,6 @@ class Gate:
         if not why and (origin or changes):
             why = self._access.why_not_origin(origin)
         return why
-
-    def _knows(self, cookies: str) -> bool:
-        try:
-            given = SimpleCookie(cookies).get(COOKIE)
-        except CookieError:
-            return False
-        return given is not None and secrets.compare_digest(
-            given.value.encode(), self._session.encode()
-        )
-
-    async def _log_in(self, receive: _Receive, send: _Send) -> None:
-        body = b""
-        more = True
-        while more and len(body) <= _LONGEST_LOGIN:
-            message = await receive()
-            body += message.get("body", b"")
-            more = message.get("more_body", False)
-        token = parse_qs(body[:_LONGEST_LOGIN].decode("latin-1")).get("token", [""])[0]
-        if not self._access.token_is_right(token):
-            await _answer(send, 403, _PAGE.format(words="This is not the token."))
-            return
-        cookie = f"{COOKIE}={self._session}; Path=/; HttpOnly; SameSite=Strict"
-        await _answer(send, 303, "", (b"location", b"/"), (b"set-cookie", cookie.encode()))
 
 
 def _forbid_framing(send: _Send) -> _Send:
@@ -113,22 +68,10 @@ def _header(scope: _Scope, name: bytes) -> str:
     return ""
 
 
-async def _refuse(scope: _Scope, send: _Send, status: int, why: str) -> None:
+async def _refuse(scope: _Scope, send: _Send, why: str) -> None:
     if scope["type"] == "websocket":
-        await send({"type": "websocket.close", "code": 1008, "reason": why[:100]})
-    else:
-        await _answer(send, status, f"<!doctype html><p>Refused: {_plain(why)}</p>")
-
-
-async def _answer(send: _Send, status: int, page: str, *headers: tuple[bytes, bytes]) -> None:
-    more = [
-        (b"content-type", b"text/html; charset=utf-8"),
-        (b"cache-control", b"no-store"),
-        *headers,
-    ]
-    await send({"type": "http.response.start", "status": status, "headers": more})
-    await send({"type": "http.response.body", "body": page.encode()})
-
-
-def _plain(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;")
+        await send({"type": "websocket.close", "code": 1008, "reason": why})
+        return
+    headers = [(b"content-type", b"text/plain"), (b"cache-control", b"no-store")]
+    await send({"type": "http.response.start", "status": 403, "headers": headers})
+    await send({"type": "http.response.body", "body": f"Refused: {why}\n".encode()})

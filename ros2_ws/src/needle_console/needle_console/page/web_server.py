@@ -16,7 +16,7 @@ from nicegui import app, ui
 from needle_console.access.access import Access
 from needle_console.console_parameters import ConsoleParameters
 from needle_console.hold.hold_server import HoldServer
-from needle_console.page.console_page import ConsolePage, HoldLink
+from needle_console.page.console_page import ConsolePage
 from needle_console.page.desk import Desk
 from needle_console.page.gate import Gate
 from needle_console.view.camera_feed import SIDES
@@ -41,7 +41,7 @@ class WebServer:
         Where to listen.
     port : int
         0 takes any that is free.
-    hold : HoldLink
+    hold_port : int
         Where the page's hold connects to.
 
     Raises
@@ -51,7 +51,7 @@ class WebServer:
     """
 
     def __init__(
-        self, desk: Desk, access: Access, *, address: str, port: int, hold: HoldLink
+        self, desk: Desk, access: Access, *, address: str, port: int, hold_port: int
     ) -> None:
         self._socket = _listen(address, port)
         self.port = int(self._socket.getsockname()[1])
@@ -65,7 +65,7 @@ class WebServer:
 
         server.get("/view/{side}.jpg")(picture)
         app.add_static_files("/static", str(STATIC), max_cache_age=0)
-        ui.page("/", title="Needle console")(lambda: ConsolePage(desk, hold))
+        ui.page("/", title="Needle console")(lambda: ConsolePage(desk, hold_port))
         ui.run_with(server, dark=None, show_welcome_message=False, reconnect_timeout=3.0)
         server.add_middleware(Gate, access=access)
         self._server = uvicorn.Server(
@@ -113,12 +113,17 @@ class ServedDesk(Desk):
         super().__init__(settings)
         self._at = f"http://{settings.address}:{settings.port}/"
         access = settings.access()
-        self._hold_server = HoldServer(access, settings.hold_port, self.hold, self.notice)
+        self._hold_server = HoldServer(
+            access, settings.hold_port, self.why_no_hold, self.hold, self.notice
+        )
         self.refused = self._hold_server.counts
-        link = HoldLink(settings.hold_port, settings.token())
         try:
             self._page_server = WebServer(
-                self, access, address=settings.address, port=settings.port, hold=link
+                self,
+                access,
+                address=settings.address,
+                port=settings.port,
+                hold_port=settings.hold_port,
             )
         except UserError:
             self._hold_server.close()

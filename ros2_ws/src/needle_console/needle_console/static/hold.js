@@ -1,12 +1,12 @@
-// Hold to run over a WebSocket of its own: what the server sends is echoed with the state of the
-// button, 50 times a second. The server alone decides what counts (docs/safety.md).
+// Hold to run over a WebSocket of its own: the server's count is echoed with the state of the
+// button, 50 times a second; a release is said at once. The server alone decides what counts
+// (docs/safety.md).
 //
 // Elements with data-hold="insert" or data-hold="retract" are the buttons; they may come and go.
 
 const RETRY = 1000; // [ms]
 const SILENCE = 500; // Without a word for so long the link is not called open [ms].
-const WRONG_TOKEN = "wrong token";
-const FRAMED = "inside another page";
+const UNCONNECTED = "no hold: not connected";
 const HIDDEN = "the page is hidden";
 const UNFOCUSED = "the window lost the focus";
 const OTHER_POINTER = "a second finger or mouse button";
@@ -16,31 +16,25 @@ const STYLE =
 
 class Hold {
   #address;
-  #token;
   #speed = 0;
   #socket = null;
-  #nonce = "";
-  #sequence = 0;
-  // The press under way: { mode, button, pointer (null: the space bar), sequence (of its first
-  // message), counted (whether it was a hold) }.
+  // The server's newest count, which each message echoes; 0: none on this connection.
+  #count = 0;
+  // The press under way: { mode, button, pointer (null: the space bar), after (the newest count when
+  // it began: an echo above it has told of it), counted (whether it was a hold) }.
   #press = null;
   // Why the last press ended by itself, until a new one begins; empty: it did not.
   #ended = "";
-  #told = { held: false, owner: "nobody", why: "" };
+  #told = { held: false, bar: "", why: "" };
   #heardAt = 0;
-  #refusal = "";
   #shown = "";
 
-  constructor(port, token, speed) {
+  constructor(port, speed) {
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     this.#address = `${scheme}://${location.hostname}:${port}/hold`;
-    this.#token = token;
     this.setSpeed(speed);
-    // Another page must not lay this one under a finger that means something else.
-    if (window.top === window) {
-      this.#listen();
-      this.#connect();
-    } else this.#refusal = FRAMED;
+    this.#listen();
+    this.#connect();
     setInterval(() => this.#show(), SILENCE / 2);
     this.#show();
   }
@@ -58,14 +52,13 @@ class Hold {
   }
 
   get status() {
-    const open = this.#nonce !== "" && performance.now() - this.#heardAt < SILENCE;
-    const told = open ? this.#told : { held: false, owner: "nobody", why: "" };
+    const open = this.#count > 0 && performance.now() - this.#heardAt < SILENCE;
     return {
-      link: open ? "open" : this.#refusal ? "refused" : "connecting",
-      owner: told.owner,
-      held: told.held && this.#press !== null,
+      // Why this page may only watch, and stop; empty: it may hold.
+      bar: open ? this.#told.bar : UNCONNECTED,
+      held: open && this.#told.held && this.#press !== null,
       mode: this.#press ? this.#press.mode : "insert",
-      why: open ? this.#ended : this.#refusal,
+      why: open ? this.#ended : "",
     };
   }
 
@@ -74,24 +67,20 @@ class Hold {
   #connect() {
     const socket = new WebSocket(this.#address);
     this.#socket = socket;
-    socket.onopen = () => socket.send(JSON.stringify({ token: this.#token }));
     socket.onmessage = (event) => this.#hear(JSON.parse(event.data));
-    socket.onclose = (event) => {
+    socket.onclose = () => {
       this.#drop("connection to the console lost");
-      this.#nonce = "";
-      this.#sequence = 0;
-      this.#refusal = event.reason;
+      this.#count = 0;
       this.#show();
-      if (event.reason !== WRONG_TOKEN) setTimeout(() => this.#connect(), RETRY);
+      setTimeout(() => this.#connect(), RETRY);
     };
   }
 
   #hear(told) {
-    this.#nonce = told.nonce;
+    this.#count = told.count;
     this.#told = told;
     this.#heardAt = performance.now();
-    this.#refusal = "";
-    if (this.#press && told.heard >= this.#press.sequence) {
+    if (this.#press && told.heard > this.#press.after) {
       // Once lost, a press is over, whatever the finger does.
       if (told.held) this.#press.counted = true;
       else this.#drop(told.why || "press again");
@@ -103,12 +92,10 @@ class Hold {
   }
 
   #send() {
-    if (this.#nonce === "" || this.#socket.readyState !== WebSocket.OPEN) return;
-    this.#sequence += 1;
+    if (this.#count === 0 || this.#socket.readyState !== WebSocket.OPEN) return;
     this.#socket.send(
       JSON.stringify({
-        nonce: this.#nonce,
-        sequence: this.#sequence,
+        count: this.#count,
         pressed: this.#press !== null,
         speed: this.#speed,
         mode: this.#press ? this.#press.mode : "insert",
@@ -126,9 +113,9 @@ class Hold {
 
   #begin(button, pointer) {
     this.#ended = "";
-    const sequence = this.#sequence + 1;
-    this.#press = { mode: button.dataset.hold, button, pointer, sequence, counted: false };
-    this.#send();
+    // The next count is answered with it: an echo must be above the last one to count.
+    const after = this.#count;
+    this.#press = { mode: button.dataset.hold, button, pointer, after, counted: false };
     this.#show();
   }
 
@@ -221,8 +208,8 @@ class Hold {
     if (shown === this.#shown) return;
     this.#shown = shown;
     let state = "ready";
-    if (status.link !== "open") state = "offline";
-    else if (status.owner === "other") state = "other";
+    if (status.bar === UNCONNECTED) state = "offline";
+    else if (status.bar) state = "other";
     else if (status.held) state = "held";
     else if (this.#ended) state = "again";
     document.documentElement.dataset.holdState = state;
@@ -246,6 +233,6 @@ function focused() {
 }
 
 // Connect to the hold's server, and make the page's hold buttons work.
-export function startHold({ port, token = "", speed }) {
-  return new Hold(port, token, speed);
+export function startHold({ port, speed }) {
+  return new Hold(port, speed);
 }

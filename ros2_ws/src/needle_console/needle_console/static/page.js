@@ -13,24 +13,22 @@ export function startPage(options) {
   loop();
 }
 
-let toldOwner = "";
+let toldBar = null;
 
 function showHold(status) {
   const words = document.getElementById("hold-words");
   if (words) words.textContent = holdWords(status);
   // NiceGUI takes no event before it has drawn the page: its elements are there then.
-  if (words && status.owner !== toldOwner) {
-    toldOwner = status.owner;
-    window.emitEvent("hold_owner", status.owner);
+  if (words && status.bar !== toldBar) {
+    toldBar = status.bar;
+    window.emitEvent("hold_bar", status.bar);
   }
 }
 
 function holdWords(status) {
   if (status.why) return status.why;
-  if (status.link === "refused") return "no hold: refused";
-  if (status.link !== "open") return "no hold: not connected";
+  if (status.bar) return status.bar;
   if (status.held) return "held: let go to stop";
-  if (status.owner === "other") return "another page steers";
   return "pointer, touch or space bar";
 }
 

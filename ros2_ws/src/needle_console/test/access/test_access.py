@@ -5,10 +5,7 @@ from __future__ import annotations
 import pytest
 
 from needle_console.access.access import Access
-from needle_console.access.rate_limit import RateLimit
 from needle_core.errors import UserError
-
-TOKEN = "correct horse battery"
 
 
 def test_loopback_is_known_by_its_own_names_only() -> None:
@@ -54,42 +51,17 @@ def test_only_the_page_of_the_same_port_is_no_foreign_page() -> None:
 
 
 def test_a_default_port_needs_not_be_said() -> None:
-    access = Access("192.168.1.5", 80, TOKEN, ["rig.lab"])
+    access = Access("192.168.1.5", 80, ["rig.lab"])
     assert access.why_not_origin("http://rig.lab") == ""
     assert access.why_not_origin("https://rig.lab") == "foreign Origin"
 
 
-def test_beyond_this_machine_it_takes_a_token_and_a_name() -> None:
-    with pytest.raises(UserError, match="a token is needed"):
-        Access("192.168.1.5", 8080)
-    with pytest.raises(UserError, match="16 to 100 are needed"):
-        Access("192.168.1.5", 8080, "short")
-    with pytest.raises(UserError, match="16 to 100 are needed"):
-        Access("192.168.1.5", 8080, "x" * 101)
+def test_beyond_this_machine_it_takes_a_name() -> None:
     with pytest.raises(UserError, match="hosts must name"):
-        Access("0.0.0.0", 8080, TOKEN)
+        Access("0.0.0.0", 8080)
     with pytest.raises(UserError, match="neither an IP address"):
-        Access("rig.lab", 8080, TOKEN)
+        Access("rig.lab", 8080)
     # What is listened on is a name of its own; loopback's names are another machine's here.
-    access = Access("192.168.1.5", 8080, TOKEN)
+    access = Access("192.168.1.5", 8080)
     assert access.why_not_host("192.168.1.5:8081") == ""
     assert access.why_not_host("localhost:8081") == "foreign Host"
-
-
-def test_the_token_is_right_to_the_letter() -> None:
-    access = Access("192.168.1.5", 8080, TOKEN)
-    assert access.needs_token
-    assert access.token_is_right(TOKEN)
-    for wrong in ("", TOKEN[:-1], TOKEN + " ", TOKEN.upper(), "\ud800", "naïve token, wrong"):
-        assert not access.token_is_right(wrong)
-    assert Access("127.0.0.1", 8080).token_is_right("")
-    assert not Access("127.0.0.1", 8080).needs_token
-
-
-def test_a_rate_is_let_through_and_no_more() -> None:
-    limit = RateLimit(100.0, 50)
-    assert sum(limit.lets_through(5.0) for _ in range(1000)) == 50
-    assert sum(limit.lets_through(5.0 + 0.001 * i) for i in range(1, 1001)) == 100
-    # Time that goes back gives nothing.
-    assert not limit.lets_through(0.0)
-    assert sum(limit.lets_through(100.0) for _ in range(1000)) == 50

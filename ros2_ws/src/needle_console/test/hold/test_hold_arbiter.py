@@ -9,10 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hold_scene import Scene
-from needle_console.hold.hold_arbiter import IDLE, MOST_PAGES, SILENCE
+from needle_console.hold.hold_arbiter import IDLE, OTHER_PAGE, SILENCE
 from needle_console.hold.hold_state import RELEASED, HoldState, Mode
 from needle_console.hold.hold_talk import PERIOD
-from needle_console.hold.nonces import Nonces
 from needle_console.hold.page_session import ECHO_AGE_LIMIT
 from needle_console.hold.refusals import Refusal
 from needle_core.messages import HOLD_LIFETIME
@@ -59,7 +58,7 @@ def test_a_hold_goes_on_while_it_is_confirmed_and_ends_with_silence() -> None:
     scene.press(page)
 
 
-def test_a_hold_counts_from_its_nonce_however_late_the_message_comes() -> None:
+def test_a_hold_counts_from_its_echo_however_late_the_message_comes() -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
@@ -78,7 +77,7 @@ def test_a_burst_after_a_stall_does_not_count() -> None:
     page = scene.page()
     scene.press(page)
     held_up = []
-    for _ in range(Nonces.MOST - 1):
+    for _ in range(12):
         scene.wait(0.02)
         held_up.append(scene.message(page, True))
     scene.wait(ECHO_AGE_LIMIT)
@@ -96,11 +95,9 @@ def test_a_page_that_stalls_for_almost_the_limit_goes_on() -> None:
     held_up = []
     while scene.now + PERIOD < 100.0 + ECHO_AGE_LIMIT:
         scene.wait(PERIOD)
-        nonce = scene.arbiter.issue(page, scene.now)
-        assert nonce is not None, "no nonce while an echo may still count"
-        held_up.append(nonce)
-    for nonce in held_up:
-        assert scene.say(page, True, nonce=nonce) is None
+        held_up.append(scene.count(page))
+    for count in held_up:
+        assert scene.say(page, True, count=count) is None
         assert scene.pressed
     # The last of them counts from when it was sent.
     scene.wait(ECHO_AGE_LIMIT + 1e-6)
@@ -128,7 +125,6 @@ def test_the_bound_of_a_page_is_kept_and_its_message_promises_no_more_than_any_o
     # A web page's hold ends within 300 ms, transport and cycle included; what a hold message
     # promises is another thing.
     assert ECHO_AGE_LIMIT + PERIOD < 0.3
-    assert Nonces.MOST * PERIOD >= ECHO_AGE_LIMIT
     assert HOLD_LIFETIME == 0.1
 
 
@@ -154,31 +150,69 @@ def test_a_press_that_is_too_old_when_it_comes_does_not_count_later() -> None:
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
 
-def test_replayed_messages_do_not_count() -> None:
+def test_an_echo_counts_once_and_a_release_may_repeat_the_last() -> None:
     scene = Scene()
     page = scene.page()
-    release, press = scene.message(page, False), scene.message(page, True)
-    for data in (release, press):
-        assert scene.arbiter.receive(page, data, scene.now) is None
-    assert scene.pressed
-    scene.say(page, False)
-    assert scene.arbiter.receive(page, release, scene.now) is Refusal.REPEATED
-    assert scene.arbiter.receive(page, press, scene.now) is Refusal.REPEATED
-    # With a higher number, but the nonce of an earlier one.
-    again = json.dumps({**json.loads(press), "sequence": 1000})
-    assert scene.arbiter.receive(page, again, scene.now) is Refusal.NONCE
-    # To another page.
-    other = scene.page()
-    assert scene.arbiter.receive(other, release, scene.now) is Refusal.NONCE
-    assert scene.arbiter.receive(other, press, scene.now) is Refusal.NONCE
+    scene.press(page)
+    count = scene.count(page)
+    assert scene.say(page, True, count=count) is None
+    assert scene.say(page, True, count=count) is Refusal.ECHO
+    assert scene.say(page, False, count=count) is None
     assert not scene.pressed
+    assert scene.say(page, True, count=count) is Refusal.ECHO
+    # A press that did not count when it came does not count later.
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+    assert scene.say(page, False, count=count) is Refusal.ECHO
+    scene.press(page)
+
+
+def test_an_echo_of_another_connection_does_not_count() -> None:
+    scene = Scene()
+    page, other = scene.page(), scene.page()
+    scene.say(page, False)
+    counts = [scene.count(which) for which in (page, other, page)]
+    assert counts == sorted(set(counts))
+    assert scene.say(page, True, count=counts[1]) is Refusal.ECHO
+    assert scene.say(page, False, count=counts[2]) is None
+    # One that comes again begins with counts of its own.
+    scene.arbiter.close(page)
+    again = scene.page()
+    before = scene.count(again)
+    assert scene.say(again, False, count=counts[2]) is Refusal.ECHO
+    assert scene.say(again, True, count=before) is Refusal.NEW_PRESS
+    assert not scene.pressed
+
+
+def test_an_echo_above_the_newest_count_does_not_count_and_spoils_nothing() -> None:
+    scene = Scene()
+    page = scene.page()
+    assert scene.say(page, False, count=1) is Refusal.ECHO, "nothing was sent"
+    scene.press(page)
+    count = scene.count(page)
+    assert scene.say(page, True, count=count + 1) is Refusal.ECHO
+    assert scene.say(page, True, count=count) is None
+
+
+@pytest.mark.parametrize("is_local", [True, False])
+def test_a_barred_page_holds_nothing_and_is_told_why(is_local: bool) -> None:
+    scene = Scene()
+    page = scene.page(is_local=is_local)
+    scene.press(page)
+    scene.bars[is_local] = "only watching"
+    scene.say(page, True)
+    assert not scene.pressed
+    told = scene.arbiter.tell(page, scene.now)
+    assert (told["bar"], told["why"]) == ("only watching", "only watching")
+    scene.bars[is_local] = ""
+    assert scene.say(page, True) is Refusal.NEW_PRESS
+    scene.press(page)
 
 
 def test_a_release_ends_a_hold_even_if_it_does_not_count() -> None:
     scene = Scene()
     page = scene.page()
     scene.press(page)
-    assert scene.say(page, False, nonce="unknown") is Refusal.NONCE
+    assert scene.say(page, False, count=10**6) is Refusal.ECHO
     assert not scene.pressed
     assert scene.say(page, True) is Refusal.NEW_PRESS
 
@@ -212,10 +246,10 @@ def test_one_page_owns_the_hold_until_it_is_gone_or_idle() -> None:
     first, second = scene.page(), scene.page()
     scene.press(first)
     scene.say(first, False)
-    assert scene.arbiter.tell(first, scene.now)["owner"] == "you"
-    assert scene.arbiter.tell(second, scene.now)["owner"] == "other"
+    assert scene.arbiter.tell(first, scene.now)["bar"] == ""
+    assert scene.arbiter.tell(second, scene.now)["bar"] == OTHER_PAGE
     scene.say(second, False)
-    assert scene.say(second, True) is Refusal.OTHER_PAGE
+    assert scene.say(second, True) is Refusal.BARRED
     assert scene.arbiter.tell(second, scene.now)["why"] == "another page steers"
     scene.arbiter.close(first)
     # The finger that is still there counts for nothing.
@@ -224,9 +258,9 @@ def test_one_page_owns_the_hold_until_it_is_gone_or_idle() -> None:
     scene.say(second, False)
     third = scene.page()
     scene.wait(IDLE + 1e-6)
-    assert scene.arbiter.tell(third, scene.now)["owner"] == "nobody"
+    assert scene.arbiter.tell(third, scene.now)["bar"] == ""
     scene.press(third)
-    assert scene.arbiter.tell(second, scene.now)["owner"] == "other"
+    assert scene.arbiter.tell(second, scene.now)["bar"] == OTHER_PAGE
     # What the earlier owner says or does is nothing to the hold.
     scene.say(second, False)
     scene.arbiter.close(second)
@@ -241,11 +275,8 @@ def test_a_page_that_goes_takes_its_hold_along() -> None:
     assert not scene.pressed
 
 
-def test_pages_are_few_and_not_silent() -> None:
+def test_a_page_is_gone_when_it_is_silent() -> None:
     scene = Scene()
-    pages = [scene.page() for _ in range(MOST_PAGES)]
-    assert scene.arbiter.open(scene.now) is None
-    scene.arbiter.close(pages[3])
     page = scene.page()
     scene.wait(SILENCE)
     assert not scene.arbiter.is_silent(page, scene.now)
@@ -255,28 +286,17 @@ def test_pages_are_few_and_not_silent() -> None:
     assert not scene.arbiter.is_silent(page, scene.now)
 
 
-def test_a_page_that_does_not_answer_is_sent_no_more_than_a_burst() -> None:
-    scene = Scene()
-    page = scene.page()
-    for _ in range(3):
-        nonces = [scene.arbiter.issue(page, scene.now) for _ in range(2 * Nonces.MOST)]
-        assert sum(nonce is not None for nonce in nonces) == Nonces.MOST
-        assert nonces[Nonces.MOST :] == [None] * Nonces.MOST
-        scene.say(page, False, nonce=nonces[Nonces.MOST - 1])
-
-
 # ---- whatever comes ------------------------------------------------------------------------------
 
 PAGES = 2
 ACTIONS = st.one_of(
-    # An honest page: a nonce goes out, its echo comes back after so long.
+    # An honest page: a count goes out, its echo comes back after so long.
     st.tuples(st.just("echo"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.05)),
     st.tuples(st.just("echo"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.3)),
     st.tuples(st.just("wait"), st.integers(0, 0), st.booleans(), st.floats(0.0, 0.3)),
     # A message is written, but comes at some later time, more than once, to any page.
     st.tuples(st.just("write"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
     st.tuples(st.just("replay"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 1.0)),
-    st.tuples(st.just("renumber"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 1.0)),
     st.tuples(st.just("garbage"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
     st.tuples(st.just("reload"), st.integers(0, PAGES - 1), st.booleans(), st.floats(0.0, 0.0)),
 )
@@ -289,9 +309,9 @@ class Witness(Scene):
         super().__init__()
         self.pages = [self.page() for _ in range(PAGES)]
         self.written: list[str] = []
-        # Nonce -> the page that it went to, and when.
-        self._sent: dict[str, tuple[int, float]] = {}
-        # By page: highest number heard; when the newest nonce of a pressed message was sent; at
+        # Count -> the page that it went to, and when.
+        self._sent: dict[int, tuple[int, float]] = {}
+        # By page: highest count echoed; when the newest count of a pressed message was sent; at
         # which event a fresh release was heard, and at which a hold was over.
         self._heard: dict[int, int] = {}
         self._proof: dict[int, float] = {}
@@ -300,25 +320,24 @@ class Witness(Scene):
         self._event = 0
         self._holder: int | None = None
 
-    def write(self, page: int, pressed: bool) -> str | None:
-        nonce = self.arbiter.issue(page, self.now)
-        if nonce is None:
-            return None
-        self._sent[nonce] = page, self.now
-        data = self.message(page, pressed, nonce)
+    def write(self, page: int, pressed: bool) -> str:
+        count = self.count(page)
+        self._sent[count] = page, self.now
+        data = self.message(page, pressed, count)
         self.written.append(data)
         return data
 
     def deliver(self, page: int, data: str) -> None:
         self.look()
         fields = json.loads(data)
-        to_page, sent = self._sent[fields["nonce"]]
-        if to_page == page and fields["sequence"] > self._heard.get(page, -1):
-            if fields["pressed"]:
+        to_page, sent = self._sent[fields["count"]]
+        before = self._heard.get(page, 0)
+        if to_page == page and fields["count"] >= before:
+            if fields["pressed"] and fields["count"] > before:
                 self._proof[page] = max(self._proof.get(page, -1.0), sent)
-            elif self.now - sent <= ECHO_AGE_LIMIT:
+            elif not fields["pressed"] and self.now - sent <= ECHO_AGE_LIMIT:
                 self._released[page] = self._event
-        self._heard[page] = max(self._heard.get(page, -1), fields["sequence"])
+            self._heard[page] = fields["count"]
         self.arbiter.receive(page, data, self.now)
         self.look()
 
@@ -357,10 +376,8 @@ def test_nothing_resumes_by_itself_whatever_comes(
             scene.wait(amount)
         elif action == "write":
             scene.write(page, pressed)
-        elif action in ("replay", "renumber") and scene.written:
+        elif action == "replay" and scene.written:
             data = scene.written[int(amount * (len(scene.written) - 1))]
-            if action == "renumber":
-                data = json.dumps({**json.loads(data), "sequence": 2 * len(scene.written)})
         elif action == "garbage":
             scene.arbiter.receive(page, "{", scene.now)
         elif action == "reload":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 from typing import Any
 
@@ -17,24 +16,18 @@ class Scene:
     """A talk with one page, in a time of its own."""
 
     def __init__(self) -> None:
-        numbers = itertools.count()
         self.states: list[HoldState] = []
-        self.talk = HoldTalk(lambda: f"n{next(numbers)}", self.states.append, lambda _: None, 0.0)
-        page = self.talk.open(0.0)
-        assert page is not None
-        self.page = page
-        self._sequence = itertools.count()
+        self.talk = HoldTalk(lambda _: "", self.states.append, lambda _: None, 0.0)
+        self.page = self.talk.open(0.0, is_local=True)
 
     def told(self, now: float) -> dict[str, Any]:
-        word = self.talk.word_for(self.page, now)
-        assert word is not None
-        told: dict[str, Any] = json.loads(word)
+        told: dict[str, Any] = json.loads(self.talk.word_for(self.page, now))
         return told
 
     def say(self, pressed: bool, now: float) -> None:
-        fields = {"nonce": self.told(now)["nonce"], "sequence": next(self._sequence)}
-        message = {**fields, "pressed": pressed, "speed": 0.5, "mode": "insert"}
-        assert self.talk.hear(self.page, json.dumps(message), now)
+        count = self.told(now)["count"]
+        message = {"count": count, "pressed": pressed, "speed": 0.5, "mode": "insert"}
+        self.talk.hear(self.page, json.dumps(message), now)
 
 
 @pytest.mark.parametrize("first", ["word", "message", "look"])

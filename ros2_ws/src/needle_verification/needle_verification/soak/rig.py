@@ -157,7 +157,7 @@ class SoakRig:
             "stereo_tracker": self._make_tracker,
             "joy_node": lambda: Joystick(Hand() if at_page else self.hand),
             CONSOLE: lambda: Console(ConsoleParameters()),
-            HoldServer.name: lambda: HoldServer(timeline.stream("nonces")),
+            HoldServer.name: HoldServer,
             PAGE: self._make_page,
             RECORDER: self._make_recorder,
             SECOND_OPERATOR: lambda: Operator(_operator_settings(), SECOND_OPERATOR, _SECOND_JOY),

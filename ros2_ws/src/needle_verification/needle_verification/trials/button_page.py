@@ -17,8 +17,6 @@ from needle_console.hold.hold_state import HoldState
 BUTTON = (100.0, 50.0)
 """Middle of the page's button [px]."""
 
-TOKEN = "known to this page alone"
-
 _ADDRESS = "127.0.0.1"
 _PAGE = """<!doctype html>
 <title>hold</title>
@@ -30,7 +28,7 @@ _PAGE = """<!doctype html>
 <script type="module">
   import { startHold } from "/hold.js";
   const port = Number(new URLSearchParams(location.search).get("port"));
-  window.needleHold = startHold({ port, token: "TOKEN", speed: 1.0 });
+  window.needleHold = startHold({ port, speed: 1.0 });
   // When it lost sight or focus, system clock [ms].
   const lost = (event) => {
     window.lostAt ??= performance.timeOrigin + event.timeStamp;
@@ -38,7 +36,7 @@ _PAGE = """<!doctype html>
   document.addEventListener("visibilitychange", lost);
   window.addEventListener("blur", lost);
 </script>
-""".replace("TOKEN", TOKEN)
+"""
 
 
 @contextlib.contextmanager
@@ -55,7 +53,8 @@ def serving_button(
     with http.server.ThreadingHTTPServer((_ADDRESS, 0), _Page) as pages:
         serving = threading.Thread(target=pages.serve_forever)
         serving.start()
-        hold = HoldServer(Access(_ADDRESS, pages.server_port, TOKEN), 0, on_state, on_notice)
+        access = Access(_ADDRESS, pages.server_port)
+        hold = HoldServer(access, 0, lambda _: "", on_state, on_notice)
         hold.start()
         try:
             yield pages.server_port, hold

@@ -189,12 +189,3 @@ def test_what_is_no_press_does_not_hold(scene: Scene) -> None:
     tab.run("document.querySelector('[data-hold]').ariaDisabled = 'false'")
     assert scene.never_pressed(lambda: tab.press_pointer(*ELSEWHERE))
     tab.release_pointer(*ELSEWHERE)
-
-
-def test_a_page_inside_another_page_does_not_connect(scene: Scene) -> None:
-    scene.tab.run(
-        "const frame = document.createElement('iframe'); frame.src = location.href;"
-        " document.body.append(frame)"
-    )
-    status = "JSON.stringify(frames[1].needleHold && frames[1].needleHold.status)"
-    scene.until(lambda: "inside another page" in str(scene.tab.run(status)), "it says why")

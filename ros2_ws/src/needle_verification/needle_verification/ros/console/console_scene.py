@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import random
-import re
 import signal
 import subprocess
 import sys
@@ -162,8 +161,7 @@ class _Console:
     """
 
     def __init__(self, folder: Path, domain: int) -> None:
-        self._log = folder / "console_stand_in.log"
-        with self._log.open("wb") as log:
+        with (folder / "console_stand_in.log").open("wb") as log:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "needle_verification.ros.console.console_stand_in"],
                 env={**os.environ, "ROS_DOMAIN_ID": str(domain)},
@@ -177,10 +175,6 @@ class _Console:
         if not said:
             raise UserError("the console's stand-in does not start")
         self.ports: dict[str, int] = json.loads(said)
-
-    def refusals(self) -> list[str]:
-        """Return what it has said that it refuses, or has lost."""
-        return re.findall(r"hold: ([\w ]*\w)", self._log.read_text("utf-8"))
 
     def signal(self, number: signal.Signals) -> None:
         """Send it a signal."""

@@ -25,7 +25,7 @@ WATCHDOG_BOUND = 0.2
 # Who is new is heard so long after it began to speak, and that counts as its press (docs/safety.md,
 # hold_new_press) [s].
 DISCOVERED_WITHIN = 0.2
-# So long after the finger is off a page's hold may still be said [s]: a nonce counts for 0.25 s
+# So long after the finger is off a page's hold may still be said [s]: an echo counts for 0.25 s
 # (docs/safety.md, hold's end), and the hand is looked at every 0.005 s.
 PAGE_LIFETIME = 0.26
 # How long a status may be behind the motors [s].

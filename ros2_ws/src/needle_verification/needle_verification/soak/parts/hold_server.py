@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import random
 from collections.abc import Sequence
 
 from needle_console.console import PAGE, Hand
@@ -11,31 +9,23 @@ from needle_console.hold.hold_state import HoldState
 from needle_console.hold.hold_talk import PERIOD, HoldTalk
 from needle_core.component import Action, Actions, Component, Log, Moment, Port, Send, Timer
 from needle_verification.soak.faults import PAGE_LINE
-from needle_verification.soak.parts.page import Said
+from needle_verification.soak.parts.page import CONNECT, Said
 
 _LOOK = 0.005
 
 
 class HoldServer(Component):
-    """Serves the hold as `hold.hold_server` does; the console hears it at its port.
-
-    Parameters
-    ----------
-    chance : Random
-        Draws nonces.
-    """
+    """Serves the hold as `hold.hold_server` does; the console hears it at its port."""
 
     name = "hold_server"
 
-    def __init__(self, chance: random.Random) -> None:
+    def __init__(self) -> None:
         self._actions: list[Action] = []
-        self._talk = HoldTalk(
-            lambda: f"{chance.getrandbits(64):016x}", self._tell, self._notice, 0.0
-        )
+        self._talk = HoldTalk(lambda _: "", self._tell, self._notice, 0.0)
         # Connection to the page's number.
         self._pages: dict[int, int] = {}
         self.ports = (Port(PAGE_LINE, self._take), Port(PAGE, lambda *_: ()))
-        self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_nonces))
+        self.timers = (Timer(_LOOK, self._look), Timer(PERIOD, self._send_counts))
 
     def _tell(self, state: HoldState) -> None:
         self._actions.append(Send(PAGE, (Hand(state, self._talk.refusals.counts()),)))
@@ -63,23 +53,19 @@ class HoldServer(Component):
             if page is not None:
                 self._close(said.connection, now)
         elif page is not None:
-            if not self._talk.hear(page, said.text, now):
-                yield self._abort(said.connection, now)
-        elif said.text == json.dumps({"token": ""}):
-            opened = self._talk.open(now)
-            if opened is None:
-                yield self._abort(said.connection, now)
-            else:
-                self._pages[said.connection] = opened
+            self._talk.hear(page, said.text, now)
+        elif said.text == CONNECT:
+            self._pages[said.connection] = self._talk.open(now, is_local=True)
         else:
             # Of a connection that nobody knows, as after a restart.
             yield self._abort(said.connection, now)
 
-    def _send_nonces(self, at: Moment) -> Actions:
+    def _send_counts(self, at: Moment) -> Actions:
         for connection, page in tuple(self._pages.items()):
             if self._talk.has_lost(page, at.steady):
                 yield self._abort(connection, at.steady)
-            elif (word := self._talk.word_for(page, at.steady)) is not None:
+            else:
+                word = self._talk.word_for(page, at.steady)
                 yield Send(PAGE_LINE, (Said(connection, word),))
         yield from self._told()
 

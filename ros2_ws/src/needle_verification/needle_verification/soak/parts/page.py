@@ -17,8 +17,10 @@ _RETRY = 1.0
 _SILENCE = 0.5
 # So often the page looks for the finger, and sends what it is made to [s].
 _LOOK = 0.01
-_GARBAGE = ("", "{}", "[1]", '{"nonce": 1}', "\x00", '{"pressed": true, "speed": 1e999}')
+_GARBAGE = ("", "{}", "[1]", '{"count": 1}', "\x00", '{"pressed": true, "speed": 1e999}')
 _KEPT = 50
+CONNECT = "connect"
+"""First word on a connection, in place of a WebSocket's request."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,8 +42,8 @@ class Said:
 @dataclasses.dataclass
 class _Press:
     mode: str
-    # Number of its first message.
-    sequence: int
+    # The newest count when it began.
+    after: int
 
 
 class Page(Component):
@@ -72,8 +74,7 @@ class Page(Component):
         # When it connects again: where nobody answers, too.
         self._retry_at = 0.0
         self._is_cut = False
-        self._nonce = ""
-        self._sequence = 0
+        self._count = 0
         self._press: _Press | None = None
         self._lost = False
         self._heard_at = -_SILENCE
@@ -109,25 +110,23 @@ class Page(Component):
 
     def _lose_connection(self, now: float) -> None:
         self._drop()
-        self._nonce, self._sequence, self._is_cut = "", 0, False
+        self._count, self._is_cut = 0, False
         self._retry_at = now + _RETRY
 
     def _hear(self, told: dict[str, object], at: Moment) -> Actions:
         self._retry_at = math.inf
-        self._nonce = str(told["nonce"])
+        self._count = int(str(told["count"]))
         self._heard_at = at.steady
         # Once lost, a press is over, whatever the finger does.
-        if self._press and int(str(told["heard"])) >= self._press.sequence and not told["held"]:
+        if self._press and int(str(told["heard"])) > self._press.after and not told["held"]:
             self._drop()
         yield from self._tell()
 
     def _tell(self) -> Actions:
-        if not self._nonce:
+        if not self._count:
             return
-        self._sequence += 1
         message = {
-            "nonce": self._nonce,
-            "sequence": self._sequence,
+            "count": self._count,
             "pressed": self._press is not None,
             "speed": 1.0,
             "mode": self._press.mode if self._press else "insert",
@@ -148,7 +147,7 @@ class Page(Component):
         if at.steady >= self._retry_at:
             self._retry_at = at.steady + _RETRY
             self._connection = self._chance.getrandbits(32)
-            yield self._send(json.dumps({"token": ""}))
+            yield self._send(CONNECT)
         if self.sends_garbage:
             yield self._send(self._chance.choice(_GARBAGE))
         if self.repeats and self._sent:
@@ -163,8 +162,8 @@ class Page(Component):
             yield from self._tell()
         self._lost = False
         if self._under_finger and not before:
-            self._press = _Press(self._under_finger, self._sequence + 1)
-            yield from self._tell()
+            # The next count is answered with it.
+            self._press = _Press(self._under_finger, self._count)
 
     def _drop(self) -> None:
         if self._press:

@@ -40,7 +40,7 @@ def page_says(held: list[tuple[float, float]], fingers: list[tuple[float, float]
     return {violation.invariant for violation in watch.violations}
 
 
-def test_a_page_holds_for_no_longer_than_a_nonce_counts() -> None:
+def test_a_page_holds_for_no_longer_than_an_echo_counts() -> None:
     in_time, late = 2.0 + PAGE_LIFETIME - 0.005, 2.0 + PAGE_LIFETIME + 0.02
     assert page_says([(1.0, in_time)], [(1.0, 2.0)]) == set()
     assert page_says([(1.0, late)], [(1.0, 2.0)]) == {"hold_is_of_now"}
