@@ -98,8 +98,9 @@ class HoldState:
     @staticmethod
     def split_sender(sender: str) -> tuple[str, str]:
         """Return source and session; a source in a namespace has slashes of its own."""
-        before, slash, after = sender.rpartition("/")
-        return (before, after) if slash else (sender, "")
+        before, _, after = sender.rpartition("/")
+        # No source is empty: "/me" is a source that somebody typed as nodes are named.
+        return (before, after) if before else (sender, "")
 
 
 @dataclass(frozen=True)

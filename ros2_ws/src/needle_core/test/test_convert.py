@@ -120,6 +120,24 @@ def test_a_plain_marker_looks_like_an_obstacle() -> None:
     assert (stamp.sec, stamp.nanosec, list(marker.points)) == (0, 0, [])
 
 
+@pytest.mark.parametrize(
+    ("frame_id", "source", "session"),
+    [
+        ("operator/18a3f0", "operator", "18a3f0"),
+        ("rig1/operator/18a3f0", "rig1/operator", "18a3f0"),
+        ("operator", "operator", ""),
+        ("/by_hand", "/by_hand", ""),
+        ("", "", ""),
+    ],
+)
+def test_a_hold_s_frame_is_its_source_and_session(frame_id: str, source: str, session: str) -> None:
+    joy = rclpy_types().make("sensor_msgs/msg/Joy")()
+    joy.header.frame_id = frame_id
+    joy.header.stamp.nanosec = 7
+    hold = from_ros(m.HoldState, joy)
+    assert (hold.source, hold.session, hold.count) == (source, session, 7)
+
+
 def test_a_hold_without_button_or_axis_is_a_release() -> None:
     joy = rclpy_types().make("sensor_msgs/msg/Joy")()
     hold = from_ros(m.HoldState, joy)

@@ -11,8 +11,8 @@ from needle_core.messages import HoldState
 from needle_device_driver.rules import Rule
 
 MAX_SOURCES = 16
-# Sessions of a source that are remembered as over. One name cannot be told from another by its age:
-# clocks are set back. A message is late by seconds at most, and meanwhile nobody starts as often.
+# Sessions of a source that are remembered as over. They cannot be told by their order: the clock
+# that names them may be set back. A message is late by seconds, and nobody restarts as often then.
 _MAX_REPLACED = 16
 # Below every count.
 _NOTHING_HEARD = -1
