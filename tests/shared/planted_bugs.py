@@ -18,6 +18,7 @@ from needle_console.hold.page_session import PageSession
 from needle_controller.controller_status import controller_status
 from needle_controller.laws.roll_law import RollLaw
 from needle_core.messages import HoldState
+from needle_device_driver import device_driver
 from needle_device_driver.cia402 import cia402_axis, drive_upkeep
 from needle_device_driver.cia402.drive_machine import DriveMachine
 from needle_device_driver.cia402.drive_monitor import Feedback
@@ -306,7 +307,15 @@ def _judge_of_drives_never_behind(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(limit_witness, "_SET_POINTS_BEHIND", 1)
 
 
+def _loss_within_set_up_is_no_answer(patch: pytest.MonkeyPatch) -> None:
+    # What nobody raises.
+    patch.setattr(device_driver, "LinkError", KeyboardInterrupt)
+
+
 MENDED = {
+    "an_adapter_lost_as_drives_say_who_they_are": MendedBug(
+        "no_node_crashes", _loss_within_set_up_is_no_answer
+    ),
     "an_emergency_stop_while_drives_are_waited_for": MendedBug(
         "the_way_goes_on", _emergency_stop_ends_the_search
     ),

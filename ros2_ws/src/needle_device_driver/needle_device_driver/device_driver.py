@@ -27,7 +27,7 @@ from needle_device_driver.cia402.cycle_times import CycleTimes
 from needle_device_driver.cia402.drive_cycle import DriveCycle
 from needle_device_driver.cia402.drive_identity import are_emulated
 from needle_device_driver.device import DeviceRows
-from needle_device_driver.link.frame_link import FrameLink
+from needle_device_driver.link.frame_link import FrameLink, LinkError
 from needle_device_driver.parameters import DriverParameters
 from needle_device_driver.procedure import Procedure, Running
 from needle_device_driver.supervisor.reports import Reply
@@ -258,8 +258,10 @@ class DeviceDriver(Component):
             if not reply.success:
                 return reply
         nodes = [self.settings.drive(name).node_id for name in ("insertion", "rotation")]
-        emulated = yield from are_emulated(self.link, nodes)
-        self._device.simulated = emulated
+        try:
+            self._device.simulated = yield from are_emulated(self.link, nodes)
+        except LinkError as error:
+            return Reply(False, str(error))
         reply = yield from self.supervisor.configure(now)
         # Drives that are there may refuse: asking again would not help.
         self._refusal = "" if reply.success else reply.message
