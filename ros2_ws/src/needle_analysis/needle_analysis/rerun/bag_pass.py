@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import array
 import dataclasses
 import functools
 import sys
@@ -20,6 +19,8 @@ from needle_analysis.run.run_summary import estimate_error
 from needle_bags.reading.bag_images import TOPICS as IMAGE_TOPICS
 from needle_bags.reading.bag_order import Reorder, SentMessage, messages_as_sent
 from needle_bags.reading.bag_reader import Run, Series, nanoseconds
+from needle_core.convert import Converter
+from needle_core.message_types import rosbags_types
 
 POSE = "needle/tip_pose"
 TIP_TOPICS = ("needle/tip", POSE)
@@ -37,6 +38,8 @@ TYPES: Mapping[str, str] = {
 # What was asked so shortly before the bag's end may not have its answer in it [ns].
 _LAST_ANSWERS = 500_000_000
 _STORE = get_typestore(Stores.ROS2_JAZZY)
+CONVERTER = Converter(rosbags_types(_STORE))
+"""Makes messages as rosbags has them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,18 +67,6 @@ class Output:
     def data(self) -> bytes:
         """The message as CDR."""
         return bytes(_STORE.serialize_cdr(self.message, TYPES[self.topic]))
-
-
-def stored(value: Any) -> Any:
-    """Return a message of rclpy as rosbags has it (rclpy's own CDR has a tail of chance bytes)."""
-    if hasattr(value, "get_fields_and_field_types"):
-        kind = type(value)
-        name = f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
-        fields = value.get_fields_and_field_types()
-        return _STORE.types[name](**{field: stored(getattr(value, field)) for field in fields})
-    if isinstance(value, array.array):
-        return np.array(value)
-    return [stored(element) for element in value] if isinstance(value, list) else value
 
 
 class Stage(Protocol):

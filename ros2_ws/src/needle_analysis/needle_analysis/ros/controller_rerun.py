@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from needle_analysis.rerun.bag_pass import Output, stored
+from needle_analysis.rerun.bag_pass import CONVERTER, Output
 from needle_bags.reading.bag_order import SentMessage, messages_as_sent
 from needle_bags.ros.parameter_snapshots import plain_value
 from needle_controller.plane_controller import (
@@ -23,9 +23,9 @@ from needle_controller.presets.steering_settings import SteeringSettings
 from needle_controller.protocol.joint_history import JointSample
 from needle_controller.protocol.steering_types import SteeringState
 from needle_core.component import Actions, Input, Moment, Publish
-from needle_core.convert import Converter, from_ros
+from needle_core.convert import from_ros
 from needle_core.errors import UserError
-from needle_core.message_types import rclpy_types, to_nanoseconds
+from needle_core.message_types import to_nanoseconds
 from needle_core.messages import JointState
 from needle_core.ros.conversions import values_of
 
@@ -68,7 +68,6 @@ class ControllerStage:
         self.name = settings.controller
         self._controller = PlaneController(settings)
         self._steering = self._controller.steering
-        self._converter = Converter(rclpy_types())
         self._ends = ends
         self._steady = 0.0
         self._recorded_trips = 0
@@ -97,7 +96,7 @@ class ControllerStage:
             if not isinstance(action, Publish) or action.topic == STATUS:
                 continue
             self.tips += action.topic == "needle/estimate"
-            content = stored(self._converter.to_ros(action.message))
+            content = CONVERTER.to_ros(action.message)
             outputs.append(Output(action.topic, sent.log_time, action.message.stamp_ns, content))
         return outputs
 

@@ -6,12 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from needle_analysis.rerun.bag_pass import Output, stored
+from needle_analysis.rerun.bag_pass import CONVERTER, Output
 from needle_bags.reading.bag_images import TOPICS, plain_image
 from needle_bags.reading.bag_order import SentMessage
 from needle_core.component import Actions, Moment, Publish
-from needle_core.convert import Converter, from_ros
-from needle_core.message_types import rclpy_types
+from needle_core.convert import from_ros
 from needle_tracker.answers.tracker_parameters import StereoTrackerParameters
 from needle_tracker.optics.calibration import StereoCalibration
 from needle_tracker.stereo_tracker import TIP_POSE, StereoTipTracker, image_topic
@@ -35,7 +34,6 @@ class TrackerStage:
 
     def __init__(self, calibration: StereoCalibration, parameters: StereoTrackerParameters) -> None:
         self._tracker = StereoTipTracker(parameters, calibration)
-        self._converter = Converter(rclpy_types())
         self.pairs = 0
         self._rows = {row.topic: row for row in self._tracker.inputs}
         self._rows |= {topic: self._rows[image_topic(side)] for topic, side in TOPICS.items()}
@@ -62,6 +60,6 @@ class TrackerStage:
         for action in actions:
             if isinstance(action, Publish):
                 self.pairs += action.topic == TIP_POSE
-                content = stored(self._converter.to_ros(action.message))
+                content = CONVERTER.to_ros(action.message)
                 outputs.append(Output(action.topic, log_time, action.message.stamp_ns, content))
         return outputs

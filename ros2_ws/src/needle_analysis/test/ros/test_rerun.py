@@ -11,12 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from builtin_interfaces.msg import Time
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.parameter import Parameter
 from rosbags.typesys import Stores, get_typestore
 
-from needle_analysis.rerun.bag_pass import stored
 from needle_analysis.rerun.rerun_bag import TABLE
 from needle_analysis.ros import rerun as rerun_node
 from needle_bags.format.bag_copy import BagCopy, standard_text, standard_topic
@@ -189,14 +186,22 @@ def test_the_calibration_that_the_tracker_told_is_used(tmp_path: Path, capsys: C
 
 def event(node: str, parameters: dict[str, Any]) -> bytes:
     """A node's ParameterEvent of its start, as CDR."""
-    time = Time(sec=1)
-    new = [Parameter(name, value=value).to_parameter_msg() for name, value in parameters.items()]
-    message = stored(ParameterEvent(stamp=time, node=node, new_parameters=new))
-    for parameter in message.new_parameters:
-        # rclpy has lists where rosbags wants arrays.
-        parameter.value.byte_array_value = np.empty(0, np.uint8)
-        parameter.value.bool_array_value = np.empty(0, np.bool_)
-    return bytes(STORE.serialize_cdr(message, EVENT))
+    types = STORE.types
+    kinds = {"byte": np.uint8, "bool": np.bool_, "integer": np.int64, "double": np.float64}
+
+    def value(content: Any) -> Any:
+        message = Parameter("", value=content).get_parameter_value()
+        fields = {name: getattr(message, name) for name in message.get_fields_and_field_types()}
+        for kind, numbers in kinds.items():
+            # rclpy has lists where rosbags wants arrays.
+            name = f"{kind}_array_value"
+            fields[name] = np.array(fields[name], numbers)
+        return types["rcl_interfaces/msg/ParameterValue"](**fields)
+
+    parameter = types["rcl_interfaces/msg/Parameter"]
+    new = [parameter(name, value(content)) for name, content in parameters.items()]
+    stamp = types["builtin_interfaces/msg/Time"](1, 0)
+    return bytes(STORE.serialize_cdr(types[EVENT](stamp, node, new, [], []), EVENT))
 
 
 BAD: list[tuple[list[str], str]] = [
