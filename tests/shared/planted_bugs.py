@@ -198,7 +198,7 @@ PLANTED = {
         "no_motion_by_another", _press_beside_the_owner_waits, 235
     ),
     "a hold that anybody keeps": PlantedBug(
-        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 3, faults_of=466
+        "no_motion_by_another", _anybody_keeps_a_hold_fresh, 16, faults_of=466
     ),
     "a page's hold that outlives its words": PlantedBug(
         "hold_is_of_now", _hold_of_a_page_outlives_its_words, 73
