@@ -312,7 +312,15 @@ def _loss_within_set_up_is_no_answer(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(device_driver, "LinkError", KeyboardInterrupt)
 
 
+def _stuck_fault_is_not_set_up_again(patch: pytest.MonkeyPatch) -> None:
+    # What nobody raises.
+    patch.setattr(cia402_axis, "StuckFaultError", KeyboardInterrupt)
+
+
 MENDED = {
+    "a_set_up_on_a_bus_that_repeats": MendedBug(
+        "the_way_goes_on", _stuck_fault_is_not_set_up_again
+    ),
     "an_adapter_lost_as_drives_say_who_they_are": MendedBug(
         "no_node_crashes", _loss_within_set_up_is_no_answer
     ),

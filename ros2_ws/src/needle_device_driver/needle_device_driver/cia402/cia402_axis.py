@@ -21,6 +21,7 @@ from needle_device_driver.cia402.drive_monitor import DriveMonitor
 from needle_device_driver.cia402.drive_settings import DriveSettings
 from needle_device_driver.cia402.drive_setup import NO_INPUTS, set_up, write_homing, write_limits
 from needle_device_driver.cia402.drive_upkeep import (
+    StuckFaultError,
     arm_watchdog,
     await_operational,
     await_start,
@@ -36,6 +37,8 @@ from needle_device_driver.rules import Rule
 
 # In cycles without an answer: a drive that is switched off at the end is given up.
 _SILENT = 15
+# Of no opening of the link.
+_TO_BE_SET_UP = -1
 
 
 class Cia402Axis(Axis):
@@ -186,7 +189,12 @@ class Cia402Axis(Axis):
             if not survived or self._opening != self._link.openings:
                 yield from self._set_up(survived=survived)
             self.monitor.emergency = None
-            yield from reset_fault(self._link, self._settings)
+            try:
+                yield from reset_fault(self._link, self._settings)
+            except StuckFaultError:
+                # What it was told in its set-up may have got lost: the next reset tells it again.
+                self._opening = _TO_BE_SET_UP
+                raise
             yield from self._refresh()
 
     def poll(self, now: float) -> AxisSnapshot:

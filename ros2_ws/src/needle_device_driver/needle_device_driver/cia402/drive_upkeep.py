@@ -17,6 +17,10 @@ _START_WAIT = 1.0
 _FAULT_RESET_WAIT = 1.0
 
 
+class StuckFaultError(DriveError):
+    """A drive does not leave its fault."""
+
+
 def await_operational(
     link: FrameLink, monitor: DriveMonitor, period: float, timeout: float = _HEARTBEAT_WAIT
 ) -> Procedure[bool]:
@@ -80,8 +84,10 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
 
     Raises
     ------
+    StuckFaultError
+        If the drive stays in its fault.
     DriveError
-        If the drive does not answer, stays in its fault or still has power: it is stopping.
+        If it does not answer, or still has power: it is stopping.
     LinkError
         If the link is lost.
     """
@@ -107,5 +113,5 @@ def reset_fault(link: FrameLink, settings: DriveSettings) -> Procedure[None]:
         if link.now > until:
             code = yield from access.ask(od.ERROR_CODE)
             why = "" if code is None else f": {describe_error(code)}"
-            raise DriveError(f"the drive does not leave its fault{why}")
+            raise StuckFaultError(f"the drive does not leave its fault{why}")
     yield from order(DriveCommand.DISABLE_VOLTAGE)

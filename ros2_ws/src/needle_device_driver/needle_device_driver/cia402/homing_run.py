@@ -16,9 +16,10 @@ from needle_device_driver.cia402.drive_monitor import Feedback
 from needle_device_driver.cia402.drive_settings import HERE, INDEX_PULSE, DriveSettings
 from needle_device_driver.link import objects as od
 
-# A homing where the axis stands ends within a cycle; so many later its end is believed although
-# the drive never took the end of the one before back.
-_INSTANT = 5
+# A homing that ends within a cycle, as where the axis stands or on the edge of its switch, is never
+# seen under way on a drive that says that it attained the one before. Its end is believed after so
+# many cycles in which the axis stands at its home: where it stands, and at a switch.
+_INSTANT, _AT_SWITCH = 5, 25
 # Share of its travel over which an axis searches for its home.
 _SEARCH = 1.2
 # Methods that end at a limit switch: its direction in counts, its bit of the digital inputs.
@@ -62,7 +63,7 @@ class HomingRun:
         turn = (method in INDEX_PULSE) * settings.counts_per_turn
         self._longest = _SEARCH * settings.travel + turn / settings.counts_per_unit
         self._towards, self._switch = _TOWARDS.get(method * switches, (0, 0))
-        self._way = self._cycles = 0
+        self._way = self._at_home = 0
         self.trouble = ""
         self._stale = False
         self.step = HomingStep.PREPARING
@@ -81,7 +82,6 @@ class HomingRun:
             return
         if self.step is not HomingStep.RUNNING:
             return
-        self._cycles += 1
         if at.statusword & HOMING_ERROR:
             self.step = HomingStep.FAILED
             self.trouble = "reports that homing failed"
@@ -91,8 +91,9 @@ class HomingRun:
         self._stale = self._stale and ended
         if self._stale:
             near = abs(at.position) <= self._settings.magnitude(self._settings.tolerance)
+            self._at_home = self._at_home + 1 if near else 0
             here = self._settings.homing_method in HERE
-            ended = here and near and self._cycles >= _INSTANT
+            ended = self._at_home >= (_INSTANT if here else _AT_SWITCH)
         if ended:
             self.step = HomingStep.DONE
 

@@ -92,6 +92,20 @@ def test_a_homing_from_before_does_not_count(drive_bench: DriveBench) -> None:
     assert bench.insertion.position == 0
 
 
+def test_a_homing_that_nobody_saw_under_way_ends_at_the_switch(drive_bench: DriveBench) -> None:
+    """On the edge of its switch a drive is through between two answers."""
+    bench = drive_bench
+    bench.homed()
+    bench.insertion.home_after, bench.insertion.stale_homing = 0, True
+    bench.insertion.more_status = 0x1400
+    bench.supervisor.confirm_needle_out(True)
+    assert bench.run(bench.supervisor.home(bench.clock())).success
+    bench.cycle(15)
+    assert not bool(bench.status.homed)
+    bench.cycle(20)
+    assert bench.status.homed
+
+
 def test_a_homing_where_it_stands_ends_on_a_drive_that_never_takes_its_end_back(
     drive_bench: DriveBench,
 ) -> None:
