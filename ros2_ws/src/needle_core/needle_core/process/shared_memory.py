@@ -3,7 +3,8 @@
 A port is a file that every process of a domain opens. Who is killed never closes it: the count of
 its users stays wrong for good, and the next run in that domain inherits the file. Who is killed
 while making one leaves a file for which whoever opens it waits for ever, as every node of this
-machine does for that of port 7000.
+machine does for that of port 7000. Without this module one of 36 restarts after `kill -9` heard
+nothing any more.
 """
 
 from __future__ import annotations
